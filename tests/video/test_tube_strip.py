@@ -1,4 +1,4 @@
-"""What a front leaves behind is a tube where it is of one width along one line; else only its arrival is followed."""
+"""What a front leaves behind is a tube where one front passes along the middle of it; else only arrival is followed."""
 
 from __future__ import annotations
 
@@ -6,53 +6,59 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import ORDERLY, Axis
+from vinetrack.video.curved_strip import order_by_axis
 from vinetrack.video.follow import follow
-from vinetrack.video.tube_strip import LIKE_A_TUBE, tube_strip
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.tube_strip import tube_strip
 
-AXIS = Axis((0.0, 60.0), (299.0, 60.0), 70.0)
-
-
-def pictures(half_px: np.ndarray, seed: int) -> np.ndarray:
-    """A bright front that passes 5 columns a frame over noise, and half the width of what stays, by column, px."""
-    n, rows, columns = 72, 121, len(half_px)
-    luma = np.random.default_rng(seed).normal(60, 2, (n, rows, columns))
-    across = np.abs(np.arange(rows) - rows // 2)[:, None]
-    for i in range(n):
-        luma[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & (across <= half_px))
-    return np.clip(luma, 0, 255).astype(np.uint8)
+AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
+"""Six rows beside the middle of the tube."""
+TRIAL = Trial(name="t", capture_fps=1000.0, m_per_px=1.0)
 
 
 def tube() -> np.ndarray:
-    return pictures(np.full(300, 20), 81)
+    """A bright front that passes 5 columns a frame over noise and leaves 41 rows changed behind it."""
+    n, rows, columns = 72, 121, 300
+    luma = np.random.default_rng(81).normal(60, 2, (n, rows, columns))
+    across = np.abs(np.arange(rows) - rows // 2)[:, None]
+    for i in range(n):
+        luma[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & (across <= 20))
+    return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def blots() -> np.ndarray:
-    """Widths from 8 to 60 px, hardly two of twelve stretches alike."""
-    return pictures(np.repeat([4, 30, 9, 24, 15, 6, 28, 12, 21, 5, 26, 17], 25), 82)
+def order_is(share_beside: float, share_on_axis: float = 1.0):
+    """Order along the axis given, and along any other."""
+    return lambda axis: share_on_axis if axis is AXIS else share_beside
 
 
-def test_a_tube_is_one_even_where_little_of_the_change_is_its_front():
-    about = tube_strip(tube(), AXIS, LIKE_A_TUBE)
-    assert about is not None
-    assert about[1].alike == 1.0
-    assert about[1].width_px == pytest.approx(41, abs=2)
+def test_the_strip_is_centred_on_the_tube():
+    luma = tube()
+    order = order_by_axis(SmallPictures(luma), luma)
+    strip, sides = tube_strip(luma, AXIS, order)
+    assert sides.width_px == pytest.approx(41, abs=2)
+    assert strip.axis.from_px[1] == pytest.approx(60, abs=0.8)
+    assert order(strip.axis) > 0.9
 
 
-def test_what_is_of_no_width_is_no_tube_unless_all_its_change_is_in_order():
-    assert tube_strip(blots(), AXIS, 0.5) is None
+def test_it_is_a_tube_though_hardly_most_of_the_change_is_its_front():
+    assert tube_strip(tube(), AXIS, order_is(ORDERLY, ORDERLY)) is not None
 
 
-@pytest.mark.parametrize(("luma", "is_edge"), [(tube(), True), (blots(), False)], ids=["tube", "blots"])
-def test_of_what_is_no_tube_the_arrival_is_followed(luma, is_edge):
-    trial = Trial(name="t", capture_fps=1000.0, m_per_px=1.0)
-    _, positions = follow(luma, trial, AXIS, 0.1, 0.5)
-    assert positions.is_edge == is_edge
-    moving = slice(14, 60)
-    expected = 5.0 * (np.arange(len(luma)) - 8)
-    assert np.abs(positions.edge_px - expected)[moving].max() < (3 if is_edge else 12)
-
-
-def test_a_front_that_hardly_any_change_belongs_to_is_not_asked_for_its_sides():
-    _, positions = follow(tube(), Trial(name="t", capture_fps=1000.0, m_per_px=1.0), AXIS, 0.1, 0.3)
+@pytest.mark.parametrize(
+    "order", [order_is(1.0, ORDERLY - 0.01), order_is(ORDERLY - 0.01)], ids=["along the axis", "along the middle"]
+)
+def test_where_no_front_passes_only_the_arrival_is_followed(order):
+    luma = tube()
+    assert tube_strip(luma, AXIS, order) is None
+    _, positions = follow(luma, TRIAL, AXIS, 0.1, order)
     assert not positions.is_edge
+    moving = slice(14, 60)
+    assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3
+
+
+def test_the_edge_of_a_tube_is_followed():
+    luma = tube()
+    _, positions = follow(luma, TRIAL, AXIS, 0.1, order_is(1.0))
+    assert positions.is_edge
+    assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[14:60].max() < 3

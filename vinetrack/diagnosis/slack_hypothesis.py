@@ -44,7 +44,6 @@ PUSHES = 0.02
 """Part of the drive ½PA by which a tail must push to count. Chosen: the numbers of a fit are good to about 1 %; at half
 of it their errors ask for a fit in vain, at twice a push of 4 % of the drive goes untried."""
 
-
 REFUTED = 1.0
 """By how much −2 ln L of a point rises on one trial of every condition where the rule is refuted without a refit, of
 trials that scatter much. Derived: −2 ln L of n points with noise s is n ln s², so their misfit is √e times as large.
@@ -95,8 +94,8 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through.
 
     A fit that has bent its trials to do without the rule may have bent them until no tail pushes. So where they scatter
-    much the rule is also tried from other exponents, with nothing of the deviations: of one trial of every condition
-    first, and where it misses those far worse (REFUTED) of no others.
+    much the rule is also tried from other exponents, with nothing of the deviations, on one trial of every condition
+    first: where it fits those far worse (REFUTED), nothing is fitted to all trials.
 
     The model is compiled alone: with all candidates and tails that may go slack that takes the better part of a minute,
     for a rule that is mostly refuted.
@@ -117,10 +116,12 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
     slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
-    slope = SubsetFitter(slack)
-    climb = best_subset_fit(slope, other_exponents(slack), math.inf) if bent else None
-    if climb is not None and climb.deviance > SubsetFitter(fit).here() + REFUTED * slope.points:
-        return None
+    climb = None
+    if bent:
+        slope = SubsetFitter(slack)
+        climb = best_subset_fit(slope, other_exponents(slack), math.inf)
+        if climb is not None and climb.deviance > SubsetFitter(fit).here() + REFUTED * slope.points:
+            return None
     fits = []
     with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
         fits.append(refit(slack, thorough=False))

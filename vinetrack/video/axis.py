@@ -7,6 +7,7 @@ how much change a monotone path along it collects; the best is refined by the pi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,6 +104,10 @@ class Axis:
         """
         a, b = self.from_px, self.to_px
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
+
+
+OrderAlong = Callable[[Axis], float]
+"""How much of what changes along an axis is a front that passes once; see `order_along`."""
 
 
 def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:

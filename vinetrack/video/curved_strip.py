@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_APART_PX
-from vinetrack.video.axis import Axis, order_along
+from vinetrack.video.axis import Axis, OrderAlong, order_along
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
@@ -173,6 +173,21 @@ def order_along_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
     """
     straight = laid_straight(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
     return order_along(SmallPictures(straight.luma), straight.axis)
+
+
+def order_by_axis(small: SmallPictures, luma: NDArray[Any]) -> OrderAlong:
+    """How much of what changes along an axis is a front that passes once, as a function of the axis.
+
+    Parameters
+    ----------
+    small : the small pictures made from `luma`, for straight axes.
+    luma : grey levels, shape (n_frames, height, width), for curved ones.
+
+    Returns
+    -------
+    order : its share, 0 to 1, along a straight or curved axis; see `axis.order_along`.
+    """
+    return lambda axis: order_along_curve(luma, axis) if isinstance(axis, CurvedAxis) else order_along(small, axis)
 
 
 def refuse_poor_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:

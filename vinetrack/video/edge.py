@@ -172,8 +172,7 @@ class Outline:
     `shift_px` and `slope` (px a px) are of the centreline across the strip; `half_px` is half of what holds all of the
     width, with room for its blur; `width_px` the width between the sides and `width_sigma_px` its standard error.
     `path_px`, shape (n_frames,), is a first path of the front and `passed` the first and last column passed.
-    `middles_px`, shape (n_parts,), is where the middle lies across at `places_px` along, of the parts of usual width,
-    and `alike` the share that those are of all parts.
+    `middles_px`, shape (n_parts,), is where the middle lies across at `places_px` along, of the parts of usual width.
     """
 
     shift_px: float
@@ -185,7 +184,6 @@ class Outline:
     passed: tuple[int, int]
     places_px: Floats
     middles_px: Floats
-    alike: float
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
@@ -223,14 +221,13 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     width = side[:, 1] - side[:, 0]
     alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     alike |= ~alike.any()  # two kinds of width, as many of each: neither is the usual one
-    share = float(alike.mean())
     place, centre = place[alike], side[alike].mean(axis=1)
     slope, begin = _robust_line(place, centre)
     middle = float(np.median(width))
     scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
     faint = FAINT_PART * middle if float(np.median(contrasts)) < FAINT else 0.0
     sigma = float(np.linalg.norm([scatter, SIDES_PX, faint]))
-    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed, place, centre, share)
+    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed, place, centre)
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Trial
-from vinetrack.video.axis import ORDERLY, Axis
+from vinetrack.video.axis import Axis, OrderAlong
 from vinetrack.video.curved_strip import cut_along
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
@@ -59,7 +59,7 @@ class Positions:
 
 
 def follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, order: float
+    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, order: OrderAlong
 ) -> tuple[Strip, Positions]:
     """Follow what moves along an axis: a body (travel ratio 1), the edge of a tube, or else whatever arrives.
 
@@ -83,9 +83,7 @@ def follow(
     try:
         if trial.travel_ratio == 1:
             return _body(luma, axis, exposure_frames)
-        return (_edge(luma, axis, exposure_frames, order) if order >= ORDERLY else None) or _arrival(
-            luma, axis, exposure_frames
-        )
+        return _edge(luma, axis, exposure_frames, order) or _arrival(luma, axis, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
 
@@ -99,7 +97,7 @@ def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip
     return strip, Positions(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
 
 
-def _edge(luma: NDArray[Any], axis: Axis, exposure_frames: float, order: float) -> tuple[Strip, Positions] | None:
+def _edge(luma: NDArray[Any], axis: Axis, exposure_frames: float, order: OrderAlong) -> tuple[Strip, Positions] | None:
     """The edge of a tube; None where there is no tube along the axis."""
     from vinetrack.video.edge import track_edge
     from vinetrack.video.tube_strip import tube_strip

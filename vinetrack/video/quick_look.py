@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import ORDERLY, Axis, order_along
+from vinetrack.video.axis import Axis
 from vinetrack.video.curve_search import find_growth_axis
-from vinetrack.video.curved_axis import CurvedAxis
+from vinetrack.video.curved_strip import order_by_axis
 from vinetrack.video.edge import rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
 from vinetrack.video.small_pictures import SmallPictures
@@ -68,8 +68,7 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
     luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
     try:
         axis_found, order = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
-        grows = trial.travel_ratio == 2 and order >= ORDERLY
-        about = tube_strip(luma, axis_found, order) if grows else None
+        about = tube_strip(luma, axis_found, order) if trial.travel_ratio == 2 else None
         if about is None:
             return Look(axis_found)
         strip, sides = about
@@ -100,9 +99,8 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     """
     small = SmallPictures(luma)
     axis = find_growth_axis(small, luma)
-    order = 1.0 if isinstance(axis, CurvedAxis) else order_along(small, axis)
     try:
-        about = tube_strip(luma, axis, order) if order >= ORDERLY else None
+        about = tube_strip(luma, axis, order_by_axis(small, luma))
     except ValueError:
         return axis
     return axis if about is None else about[0].axis

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, centred_on_motion, find_axis, order_along
+from vinetrack.video.axis import Axis, OrderAlong, centred_on_motion, find_axis
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
     curve_found,
     order_along_curve,
+    order_by_axis,
     path_error_px,
     refuse_poor_curve,
     shake_along,
@@ -240,8 +242,8 @@ def track_frames(
     )  # fmt: skip
 
 
-def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, float]:
-    """The axis, with a width, and how much of what changes along it is one front that passes once and stays.
+def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, OrderAlong]:
+    """The axis, with a width, and how to ask how much of what changes along it is one front that passes once and stays.
 
     Parameters
     ----------
@@ -252,8 +254,8 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
 
     Returns
     -------
-    axis, px; and its share of what changes along it: less than `axis.ORDERLY` where the vine bends or sweeps away, 1
-    for a body.
+    axis, px; and a function of an axis of its kind, straight or curved: the share of what changes along it that is one
+    front, less than `axis.ORDERLY` where the vine bends or sweeps away.
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
@@ -263,26 +265,24 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
         axis = find_growth_axis(small, luma)
     axis = axis if axis is not None else find_axis(small, grows=False)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
-    if isinstance(axis, CurvedAxis):
-        return axis, 1.0  # see `find_growth_axis`, which has asked the same
-    if given:
+    if given and not axis.bends:
         # Room for an axis that is a few degrees off; it is centred on what moves, here or by `tube_strip`.
         axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
         if trial.travel_ratio == 1:
             axis = centred_on_motion(small, axis)
-    return axis, 1.0 if trial.travel_ratio == 1 else order_along(small, axis)
+    return axis, order_by_axis(small, luma)
 
 
 def _along_given_curve(
     luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
-) -> tuple[CurvedAxis, float]:
-    """A given curve with a width, that of its strip at most; and how much of what changes along it is one front."""
+) -> tuple[CurvedAxis, OrderAlong]:
+    """A given curve with a width, that of its strip at most; see `whereabouts`."""
     half = _half_width(axis, trial, m_per_px)
     known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
     refuse_poor_curve(axis, half if known else math.nan, luma.shape[1:])
     wide = min(2 * half + ROOM * axis.length_px, 2 * axis.largest_half_px)
     axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
-    return axis, 1.0 if trial.travel_ratio == 1 else order_along_curve(luma, axis)
+    return axis, partial(order_along_curve, luma)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.axis import Axis
+from vinetrack.video.axis import ORDERLY, Axis, OrderAlong
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import SETTLED_PX, beside_curve, curve_parts, cut_along
 from vinetrack.video.edge import Outline, outline
+from vinetrack.video.frames import RecordingError
 from vinetrack.video.strip import Strip, recut, squared
 
 CENTRINGS = 3
@@ -19,42 +20,44 @@ while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
 OFF_CENTRE_PX = 0.8
 """Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it.
 Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
-LIKE_A_TUBE = 0.3
-"""Share of what changes along the axis that is a front passing once, times the share of the stretches behind it that
-are of one width, from which it is a tube along the axis. Measured: 0.41 at least of 40 tubes beside long doors
-(`benchmarks/long_doors.py`, seeds 71001-71040); 0.05 to 0.23 of a real vine that sweeps to and fro, its axis moved by a
-pixel or its pictures by one grey level in twenty. At half such a vine is followed as a tube, wrongly, where rounding
-has it so; at twice a few of the tubes with doors are followed to about a pixel."""
 
 
-def tube_strip(luma: NDArray[Any], axis: Axis, order: float) -> tuple[Strip, Outline] | None:
+def tube_strip(luma: NDArray[Any], axis: Axis, order: OrderAlong) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis.
+
+    Sides of what a front left behind are found for anything that changes in order. Where it is no tube, they lie
+    nowhere in particular, and the strip is centred on nothing: no front passes along its axis.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width).
     axis : roughly along the tube, with a width that holds it, px.
-    order : share of what changes along the axis that is a front passing once, see `axis.order_along`.
+    order : share of what changes along an axis that is a front passing once, see `axis.order_along`.
 
     Returns
     -------
-    the strip, centred on the tube, and the tube's outline in it; None where what the front leaves behind is no tube
-    along the axis.
+    the strip, centred on the tube, and the tube's outline in it; None where no one front passes along the axis, or none
+    along the middle of what it leaves behind.
 
     Raises
     ------
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    strip = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
-    for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
-        before, sides = strip, outline(strip, curve_parts(axis))
-        strip = centred(luma, strip, sides)
-        if strip is before:
-            break
-    else:
-        sides = outline(strip, curve_parts(axis))
-    return (strip, sides) if order * sides.alike >= LIKE_A_TUBE else None
+    if order(axis) < ORDERLY:
+        return None
+    strip = first = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
+    sides = outline(strip, curve_parts(axis))
+    try:
+        for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
+            before, strip = strip, centred(luma, strip, sides)
+            if strip is before:
+                break
+            sides = outline(strip, curve_parts(axis))
+        astray = strip is not first and order(strip.axis) < ORDERLY
+    except (RecordingError, ValueError):
+        return None
+    return None if astray else (strip, sides)
 
 
 def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
