@@ -51,7 +51,7 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "pressure_gauge": ({}, {"delta": 900.0}),
     "area_scale": ({}, {"eps": -0.03}),
     "film_mass": ({}, {"eps": 0.08}),
-    "payload_mass": ({}, {"delta": 6e-3}),
+    "payload_mass": ({}, {"delta": -12e-3}),
     "perspective": ({}, {"k": 0.2}),
 }
 """Sizes by effect: as the generator names them, and as the catalogue does."""

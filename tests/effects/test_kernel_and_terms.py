@@ -162,3 +162,17 @@ def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
     rest = np.zeros(1)
     compiled = accelerations(model, vine.trial(), rest, np.array([vine.L]), rest)
     np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delta", [-20e-3, -LOADED.payload], ids=["in part", "all of it"])
+def test_what_a_payload_lacks_is_not_taken_from_the_film(delta: float) -> None:
+    vine = LOADED
+    model = base_model() + catalogue()["payload_mass"]
+    model = model.with_values({"eversion_damping.B": vine.B, "eversion_damping.n": 0.37, "payload_mass.delta": delta})
+    x, v = np.array([0.0, 0.5, 2.0]) * vine.L, np.full(3, 0.3)
+    terms = evaluate(model, vine.trial(), np.zeros(3), x / 2, v / 2)
+    lighter = Vine(**{**vine.__dict__, "payload": vine.payload + delta})
+    floor = evaluate(base_model().with_values({"eversion_damping.B": 1.0}), lighter.trial(), np.zeros(3), x / 2, v / 2)
+    np.testing.assert_allclose(terms.inertia_kg, floor.inertia_kg, rtol=1e-9)
+    compiled = accelerations(model, vine.trial(), np.zeros(3), x / 2, v / 2)
+    np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)

@@ -81,8 +81,8 @@ def evaluate(
     state = state._replace(damping_gain=ask("damping_gain", state, rig, state.damping_gain, "damping_gain"))
     tip, tail = ask.each("tip_force", state, rig), ask.each("tail_force", state, rig)
     tip_sum = sum(tip.values(), np.zeros_like(motion[0]))
-    film_mass = sum(ask.each("added_mass", state, rig).values(), film_mass)
-    moved = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
+    added = sum(ask.each("added_mass", state, rig).values(), np.zeros_like(motion[0]))
+    moved = inertia_kg(film_mass, added, rig)
     tail_sum = sum(tail.values(), np.zeros_like(motion[0]))
     tension = tip_sum / rig.travel_ratio
     return Terms(
@@ -96,6 +96,28 @@ def evaluate(
         inertia_kg=np.asarray(moved),
         state=state,
     )
+
+
+def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Floats:
+    """All that moves with the tail.
+
+    The floor that the film's mass comes to is fold and gas: what effects add to the tail counts in it. What they take
+    away is no film, which goes to nothing on the way, but of the payload; fold and gas are left.
+
+    Parameters
+    ----------
+    film_mass : array, shape (n,), kg
+        Of the film that has not everted.
+    added_mass : array, shape (n,), kg
+        What effects add to it; less than nothing where they take away.
+    rig : TrialInputs
+
+    Returns
+    -------
+    array, shape (n,), kg
+    """
+    tail = np.maximum(film_mass + np.maximum(added_mass, 0.0), rig.least_mass)
+    return np.asarray(np.maximum(tail + np.minimum(added_mass, 0.0) + rig.payload_mass, rig.least_mass))
 
 
 class _Asker:

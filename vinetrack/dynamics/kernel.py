@@ -133,10 +133,11 @@ class _Writer:
         return lines
 
     def inertia(self) -> list[str]:
-        """All that moves with the tail; what effects add counts in the floor that the mass comes to."""
+        """All that moves with the tail; see `force_terms.inertia_kg`."""
         added = self.calls("added_mass", "added += {call}")
-        total = "mass = max(film_mass + added, rig.least_mass) + rig.payload_mass"
-        return ["added = 0.0", *added, total] if added else []
+        tail = "mass = max(film_mass + max(added, 0.0), rig.least_mass)"
+        total = "mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"
+        return ["added = 0.0", *added, tail, total] if added else []
 
     def forces(self) -> list[str]:
         lines = self.calls("damping_gain", "gain = {call}")
