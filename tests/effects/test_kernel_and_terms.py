@@ -7,11 +7,13 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
+from numba import njit
 
 import vinetrack
 from vinetrack.core.records import Bend, Trial
@@ -20,7 +22,7 @@ from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs
-from vinetrack.effects import catalogue
+from vinetrack.effects import Effect, catalogue
 
 PACKAGE = Path(vinetrack.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
@@ -30,17 +32,25 @@ def sizes_of(name: str) -> dict[str, float]:
     return {f"{name}.{parameter.name}": parameter.default for parameter in catalogue()[name].parameters}
 
 
+@lru_cache
+def callable_parts(effects: tuple[Effect, ...]) -> tuple:
+    """Pressure of the chamber at release and acceleration of the tail; a model's own functions Python cannot call."""
+    rates, first_chamber = kernel(effects).rates, kernel(effects).first_chamber
+    acceleration = njit(lambda t, x, v, p, arrays: rates(t, x, v, p, arrays)[0])
+    return njit(lambda arrays: first_chamber(arrays)), acceleration
+
+
 def accelerations(
     model: Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
 ) -> list[float]:
     """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
-    compiled = kernel(model.effects)
+    chamber_at_release, acceleration = callable_parts(model.effects)
     theta = model.parameters_for(trial.vine)
     on, rig = effects_on(model, theta[None])[0], np.array(trial_inputs(trial))
     bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
     arrays = TrialArrays(on, rig, theta, np.empty(0), np.empty(0), bends)
-    pressures = np.full(time.size, compiled.first_chamber(arrays)) if chamber is None else chamber
-    return [compiled.rates(t, 2 * a, 2 * b, p, arrays)[0] for t, a, b, p in zip(time, y, v, pressures, strict=True)]
+    pressures = np.full(time.size, chamber_at_release(arrays)) if chamber is None else chamber
+    return [acceleration(t, 2 * a, 2 * b, p, arrays) for t, a, b, p in zip(time, y, v, pressures, strict=True)]
 
 
 @pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])

@@ -19,17 +19,20 @@ from numba.extending import infer_getattr, models, register_model, typeof_impl
 
 from vinetrack.core.records import Floats
 
-_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_UNWRAPPED: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, **_UNWRAPPED}
 
-compiled: Any = njit(**_FLAGS)
+compiled: Any = njit(**_FLAGS, forceinline=False)
 inlined: Any = njit(**_FLAGS, forceinline=True)
 """How every function of the integrator is compiled: outside the interpreter's lock, dividing by zero as NumPy does, and
 without counting references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two together make it three
-times as fast; in return no function may make an array.
+times as fast; in return no function may make an array. Python cannot call them, for none has a way in from there but
+`integrate_many` of `vinetrack.dynamics.kernel`: a quarter of the time to compile a model went into those of the others.
 
-`inlined` is for the steps of the integrator, so that it costs nothing to have them in functions of their own. Measured
-on the 8 trials of `benchmarks/catalogue_speed.py` in one thread, µs a trajectory of the base model and of the whole
-catalogue: 25 and 32 without, 11 and 14 with it, 21 and 28 for the same steps written out in one long function."""
+`inlined` is for the model and the steps of the integrator, so that it costs nothing to have them in functions of their
+own: on 36 trials a trajectory of the base model takes 1.8 times as long without, of a catalogue of 36 effects 1.8 too.
+Either is said of every function: numba takes what is not said from whichever caller it compiles first, so that the same
+model was up to twice as slow in a process that had asked for its rates alone."""
 
 
 class TrialArrays(NamedTuple):
@@ -120,7 +123,7 @@ RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4
 TAUT: a slack tail has pulled tight and the integrator goes on."""
 
 
-@compiled
+@inlined
 def trace_at(time, trial):
     """The measured pressure: linear between its samples, constant before the first and after the last.
 
@@ -144,7 +147,7 @@ def trace_at(time, trial):
     return trial.trace_pressure[k - 1] + fraction * (trial.trace_pressure[k] - trial.trace_pressure[k - 1])
 
 
-@compiled
+@inlined
 def next_slope_change(k, time, trial):
     """Index of the first sample of the measured pressure after `time`, from index k on, where its slope changes.
 
@@ -176,7 +179,7 @@ def next_slope_change(k, time, trial):
     return k
 
 
-@compiled
+@inlined
 def angle_passed(y, trial):
     """Angle of the bends that the tip has passed.
 
@@ -196,19 +199,19 @@ def angle_passed(y, trial):
     return angle
 
 
-@compiled
+@inlined
 def yes():
     """True, as a function that the compiler sees through."""
     return True
 
 
-@compiled
+@inlined
 def no():
     """False, as a function that the compiler sees through."""
     return False
 
 
-@compiled
+@inlined
 def not_averaged(trial):  # noqa: ARG001
     """Stands for `averaged_over` where a position is that of one instant.
 
@@ -223,7 +226,7 @@ def not_averaged(trial):  # noqa: ARG001
     return 0.0
 
 
-@compiled
+@inlined
 def no_row_delay(trial):  # noqa: ARG001
     """Stands for `row_delay` where all rows of a picture are read at once.
 
@@ -238,7 +241,7 @@ def no_row_delay(trial):  # noqa: ARG001
     return 0.0
 
 
-@compiled
+@inlined
 def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
     """Stands for `tip_tension` where no tail may go slack.
 
@@ -254,7 +257,7 @@ def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
     return 0.0, 0.0
 
 
-@compiled
+@inlined
 def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
     """Stands for `free_fall` where no tail may go slack.
 
@@ -269,7 +272,7 @@ def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
     return 0.0
 
 
-@compiled
+@inlined
 def never_slack(equations, trial, h, start, end):  # noqa: ARG001
     """Stands for `slack_fraction` where no tail may go slack: beyond the end of every step.
 
@@ -284,7 +287,7 @@ def never_slack(equations, trial, h, start, end):  # noqa: ARG001
     return 2.0
 
 
-@compiled
+@inlined
 def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
     """Stands for `slack_at_rest` where no tail may go slack.
 
@@ -299,7 +302,7 @@ def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
     return False
 
 
-@compiled
+@inlined
 def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
     """Stands for `follow_slack` where no tail may go slack.
 

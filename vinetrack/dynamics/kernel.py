@@ -34,7 +34,7 @@ _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vi
 from numba import njit
 
 from vinetrack.dynamics.equations import (
-    Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
+    Equations, angle_passed, inlined, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
     not_averaged, not_slack_at_rest, trace_at, yes,
 )
 from vinetrack.dynamics.integrator import integrate_trials
@@ -48,13 +48,13 @@ EQUATIONS = Equations(__name__, {fields})
 
 
 # Only the outermost function is called from Python; what it calls is compiled into it, and kept with it.
-@njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
+@njit(nogil=True, error_model="numpy", _nrt=False, no_cfunc_wrapper=True, cache=True)
 def integrate_many({batch}):
     integrate_trials(EQUATIONS, {batch})
 """
 
 _SUM = """
-@compiled
+@inlined
 def {name}({arguments}):
     on, theta = trial.on, trial.theta
     rig = TrialInputs({rig_fields})
@@ -100,7 +100,7 @@ class _Writer:
                 continue
             arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
-            self.loads[name] = f"{name} = compiled(EFFECTS[{i}].functions[{hook!r}])"
+            self.loads[name] = f"{name} = inlined(EFFECTS[{i}].functions[{hook!r}])"
             # A measured trace already holds what happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
             lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
