@@ -9,7 +9,7 @@ import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
-from vinetrack.tracks.frame_timing import correct_frames, lost_for_sure
+from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 from vinetrack.tracks.step_gaps import count_missing
 
 FRAME_S = 1 / CAPTURE_FPS
@@ -61,11 +61,11 @@ def test_a_jump_that_only_the_nearest_points_tell_is_sure_where_noise_is_far_bel
 ):
     out = correct_frames(dropped(steady_track(noise_m), row))
     assert flags(out) == {row: "gap;retimed"}
-    assert lost_for_sure(out) is sure
+    assert frames_surely_missing(out) is sure
 
 
 def test_nothing_is_lost_of_a_track_whose_times_nobody_moved():
-    assert not lost_for_sure(steady_track())
+    assert not frames_surely_missing(steady_track())
 
 
 def test_a_stale_copy_is_flagged_and_times_stay():

@@ -8,8 +8,8 @@ from vine_truth import Vine, ar1, make_track, record
 
 from vinetrack.tracks.position_noise import (
     common_rounding_noise,
-    noise_but_for_faults,
     rest_points,
+    robust_position_noise,
     rounding_noise,
     track_noise,
 )
@@ -138,4 +138,4 @@ def test_rounding_that_few_tracks_share_is_not_that_of_all():
 def test_noise_of_rounded_positions_is_not_kept_below_rounding():
     """Most points are at rest: the median third difference is zero, and hides that the others are rounded."""
     y = np.concatenate([np.full(200, 0.01), rounded(1)])
-    assert noise_but_for_faults(np.arange(y.size) / 267, y)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)
+    assert robust_position_noise(np.arange(y.size) / 267, y)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)

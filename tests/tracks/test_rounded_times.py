@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vinetrack.tracks.importers import TrackError, read_track
-from vinetrack.tracks.rounded_times import without_rounding
+from vinetrack.tracks.rounded_times import unrounded_times
 
 
 @pytest.mark.parametrize(
@@ -18,12 +18,12 @@ def test_rounded_times_of_even_frames_become_even(rate_hz: float, digits: int) -
     for seed in range(5):
         begin_s = float(np.random.default_rng(seed).uniform(0, 0.3))
         true_s = begin_s + np.arange(150) / rate_hz
-        restored_s, note = without_rounding(np.round(true_s, digits))
+        restored_s, note = unrounded_times(np.round(true_s, digits))
         # Less than a fifth of what rounding does, but for a shift of them all.
         off_s = restored_s - true_s
         assert np.max(np.abs(off_s - off_s.mean())) < 0.1 * 10.0**-digits
         assert note.startswith(f"Times are rounded to {10.0 ** (3 - digits):g} ms")
-        cut_s, _ = without_rounding(np.floor(true_s * 10**digits) / 10**digits)
+        cut_s, _ = unrounded_times(np.floor(true_s * 10**digits) / 10**digits)
         off_s = cut_s - true_s
         assert np.max(np.abs(off_s - off_s.mean())) < 0.1 * 10.0**-digits
 
@@ -42,7 +42,7 @@ def test_rounded_times_of_even_frames_become_even(rate_hz: float, digits: int) -
     ids=["even to the digit", "not rounded", "to the microsecond", "frames are missing", "uneven", "few", "standing"],
 )
 def test_other_times_stay_as_they_are(time_s: np.ndarray) -> None:
-    kept_s, note = without_rounding(time_s)
+    kept_s, note = unrounded_times(time_s)
     assert kept_s is time_s
     assert note == ""
 

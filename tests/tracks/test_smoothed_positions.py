@@ -16,7 +16,7 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.pipeline.check_stage import check_folder
 from vinetrack.tracks.position_noise import ar1_noise
-from vinetrack.tracks.smoothed_positions import Smoothing, smoothing_of
+from vinetrack.tracks.smoothed_positions import Smoothing, detect_smoothing
 
 TIME_S = np.arange(150) / 1000.0
 TRIAL = Trial(name="t", capture_fps=1000.0)
@@ -36,12 +36,12 @@ def tracks(seed: int, rho: float = 0.0, count: int = 8, smooth=lambda y: y) -> l
 
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6, 0.85])
 def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
-    assert all(smoothing_of(tracks(seed, rho)) is None for seed in range(351, 371))
+    assert all(detect_smoothing(tracks(seed, rho)) is None for seed in range(351, 371))
 
 
 @pytest.mark.parametrize("frames", [3, 5, 9])
 def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
-    found = smoothing_of(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
+    found = detect_smoothing(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
     assert found is not None
     assert (found.window, found.degree, found.alike) == (frames, 0, frames)
     assert f"a moving average over {frames} frames" in found.note
@@ -49,24 +49,24 @@ def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
 
 @pytest.mark.parametrize("frames", [7, 11])
 def test_a_polynomial_is_told_from_a_moving_average(frames: int) -> None:
-    found = smoothing_of(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
+    found = detect_smoothing(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
     assert found is not None
     assert (found.window, found.degree) == (frames, 2)
     assert 1 < found.alike < frames
 
 
 def test_digits_that_were_rounded_afterwards_hide_nothing() -> None:
-    found = smoothing_of(tracks(354, smooth=lambda y: np.round(uniform_filter1d(y, 5), 5)))
+    found = detect_smoothing(tracks(354, smooth=lambda y: np.round(uniform_filter1d(y, 5), 5)))
     assert found == Smoothing(5, 0, 5)
 
 
 def test_nothing_is_said_of_frames_that_are_unevenly_apart_nor_of_recordings(tmp_path: Path) -> None:
     smoothed = tracks(355, smooth=lambda y: uniform_filter1d(y, 5))
     uneven_s = TIME_S + 3e-4 * np.sin(np.arange(TIME_S.size))
-    assert smoothing_of([(trial, as_track(uneven_s, track.lead_position_m)) for trial, track in smoothed]) is None
+    assert detect_smoothing([(trial, as_track(uneven_s, track.lead_position_m)) for trial, track in smoothed]) is None
     filmed = Trial(name="t", video=tmp_path / "t.mp4", capture_fps=1000.0)
-    assert smoothing_of([(filmed, track) for _, track in smoothed]) is None
-    assert smoothing_of([]) is None
+    assert detect_smoothing([(filmed, track) for _, track in smoothed]) is None
+    assert detect_smoothing([]) is None
 
 
 def test_a_model_is_smoothed_as_its_positions_were(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.body import hops_about, track_body
+from vinetrack.video.body import hops_between_bodies, track_body
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
 from vinetrack.video.strip import cut_strip
 from vinetrack.video.track import track_frames
@@ -98,17 +98,17 @@ def test_places_that_hop_between_bodies_are_no_motion():
     number = np.arange(30.0)
     seen = np.ones(30, dtype=bool)
     fall = 0.3 * number**2
-    assert not hops_about(fall + np.random.default_rng(309).normal(0, 0.1, 30), seen)
+    assert not hops_between_bodies(fall + np.random.default_rng(309).normal(0, 0.1, 30), seen)
     neighbour = fall + 25
     turns = np.random.default_rng(310).random(30) < 0.5
-    assert hops_about(np.where(turns, neighbour, fall), seen)
+    assert hops_between_bodies(np.where(turns, neighbour, fall), seen)
 
 
 def test_a_bounce_or_a_stop_is_no_hop():
     number = np.arange(40.0)
     seen = np.ones(40, dtype=bool)
-    assert not hops_about(np.minimum(9 * number, 180), seen)
-    assert not hops_about(180 - np.abs(9 * number - 180), seen)
+    assert not hops_between_bodies(np.minimum(9 * number, 180), seen)
+    assert not hops_between_bodies(180 - np.abs(9 * number - 180), seen)
 
 
 def tipping_block(seed, spin_deg, n=130):

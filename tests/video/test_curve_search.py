@@ -13,7 +13,7 @@ from plain_scene import HARDER, Plan, plain_scene, write_images
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import find_axis
-from vinetrack.video.curve_search import find_curve, find_growth_axis, share_in_order
+from vinetrack.video.curve_search import find_curve, find_growth_axis, front_share_of_picture
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.frames import Frames, Recording
 from vinetrack.video.measure import measure_recording
@@ -66,7 +66,7 @@ def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(
     small = SmallPictures(bent.frames)
     curve = find_curve(small)
     assert curve is not None
-    assert share_in_order(small, curve) > 0.95
+    assert front_share_of_picture(small, curve) > 0.95
     along, across = curve.along_and_across(bent.places(np.array([100.0, 300.0, 500.0])))
     assert (np.diff(along) > 150).all()
     assert np.abs(across).max() < 8

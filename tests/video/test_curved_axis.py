@@ -14,7 +14,7 @@ from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import PlaneCalibration
 from vinetrack.video.curved_axis import CurvedAxis, axis_entry, axis_of_entry, axis_through, curve_complaint
-from vinetrack.video.curved_strip import cut_along, laid_straight
+from vinetrack.video.curved_strip import cut_along, straightened
 from vinetrack.video.frames import Frames, Recording, RecordingError
 from vinetrack.video.plane_map import PlaneMap
 from vinetrack.video.still_ground import picture_shake
@@ -102,7 +102,7 @@ def test_rings_about_the_circles_middle_become_level_lines() -> None:
 
 def test_room_beside_the_strip_is_taken_only_where_the_picture_has_it() -> None:
     luma = np.zeros((2, SIDE, SIDE), np.uint8)
-    wide = laid_straight(luma, quarter(), 10.0)
+    wide = straightened(luma, quarter(), 10.0)
     assert wide.axis.from_px[1] == 30.0  # the middles of the uppermost pixels are 30 px away
     assert wide.luma.shape[1] == 30 + 59 + 1
 

@@ -12,7 +12,7 @@ from vinetrack.core.records import FLAGS, Trial, with_flag
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
-from vinetrack.video.point_quality import calibrated_sigma, judge, moving_range
+from vinetrack.video.point_quality import assess_points, calibrated_sigma, moving_range
 from vinetrack.video.track import track_frames, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -245,6 +245,6 @@ def test_a_lost_point_among_moving_ones_is_flagged():
     edge[12] = np.nan
     nothing = np.zeros(30, dtype=bool)
     masks = {"unsure": nothing, "repeated": nothing}
-    verdict = judge(edge, np.full(30, 0.1), np.arange(30), np.arange(30), **masks, end_px=99)
+    verdict = assess_points(edge, np.full(30, 0.1), np.arange(30), np.arange(30), **masks, end_px=99)
     assert verdict.flag[12] == "lost"
     assert any("lost in 1 moving frames" in note for note in verdict.notes)

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_repair import BANDS, band_fits, disagreement
+from vinetrack.video.edge_repair import BANDS, band_disagreement, band_fits
 from vinetrack.video.edge_state import EdgeState
 from vinetrack.video.strip import Strip
 
@@ -40,7 +40,7 @@ def test_each_band_finds_its_own_edge():
 @pytest.mark.parametrize("sd_px", [0.2, 0.6])
 def test_disagreement_is_the_error_of_the_mean(sd_px):
     strip, state, own = jittered(sd_px)
-    found, slow_px = disagreement(strip, state, state.edge, np.ones(N, dtype=bool))
+    found, slow_px = band_disagreement(strip, state, state.edge, np.ones(N, dtype=bool))
     true = float(np.std(own.mean(axis=1) - state.edge))
     assert float(np.sqrt(np.mean(found**2))) == pytest.approx(true, rel=0.35)
     # It is another one in every frame.
@@ -51,6 +51,6 @@ def test_a_band_that_always_lags_is_no_error():
     strip, state, _ = jittered(0.0)
     lagging = np.repeat([0.0, 0.0, 1.5, 0.0], ROWS // BANDS)
     tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.pictures, state.inflation)
-    error_px, slow_px = disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool))
+    error_px, slow_px = band_disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool))
     assert error_px.max() < 0.1
     assert slow_px < 0.05

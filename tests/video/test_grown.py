@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from vinetrack.video.motion_end import is_grown
-from vinetrack.video.point_quality import Judgement
+from vinetrack.video.point_quality import PointQuality
 
 EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
 
 
-def verdict(first_moving: int = 10, last_moving: int = 49) -> Judgement:
+def verdict(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
     slot = np.arange(EDGE_PX.size)
     unseen = np.zeros(slot.size, dtype=bool)
     flag = np.full(slot.size, "", dtype="<U64")
-    return Judgement(flag, slot, (), first_moving, last_moving, None, unseen, np.zeros(slot.size))
+    return PointQuality(flag, slot, (), first_moving, last_moving, None, unseen, np.zeros(slot.size))
 
 
 @pytest.mark.parametrize(("length_px", "grown"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
@@ -24,7 +24,7 @@ def test_travel_is_held_against_the_length(length_px: float, grown: bool) -> Non
 
 
 @pytest.mark.parametrize("judged", [verdict(first_moving=0), verdict(last_moving=EDGE_PX.size - 1), verdict(-1, -1)])
-def test_without_rest_or_end_nobody_knows(judged: Judgement) -> None:
+def test_without_rest_or_end_nobody_knows(judged: PointQuality) -> None:
     assert not is_grown(EDGE_PX, judged, 400.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plain_scene import Plan, plain_scene
 
-from vinetrack.video.axis import ORDERLY, Axis, find_axis, order_along
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.resample import sample
 from vinetrack.video.strip import cut_strip, squared
@@ -89,7 +89,7 @@ def test_axis_is_found_in_any_direction_of_growth(angle):
     axis = find_axis(scene.frames)
     assert np.degrees(np.arccos(axis.direction @ direction)) < 1.5
     assert abs((start - axis.from_px) @ axis.normal) < 4
-    assert order_along(scene.frames, axis) >= ORDERLY
+    assert front_share(scene.frames, axis) >= LEAST_FRONT_SHARE
 
 
 def test_nothing_moves_is_said():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import ORDERLY, Axis
-from vinetrack.video.curved_strip import order_by_axis
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
+from vinetrack.video.curved_strip import front_share_function
 from vinetrack.video.follow import follow
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.tube_strip import tube_strip
@@ -34,7 +34,7 @@ def order_is(share_beside: float, share_on_axis: float = 1.0):
 
 def test_the_strip_is_centred_on_the_tube():
     luma = tube()
-    order = order_by_axis(SmallPictures(luma), luma)
+    order = front_share_function(SmallPictures(luma), luma)
     strip, sides = tube_strip(luma, AXIS, order)
     assert sides.width_px == pytest.approx(41, abs=2)
     assert strip.axis.from_px[1] == pytest.approx(60, abs=0.8)
@@ -42,11 +42,13 @@ def test_the_strip_is_centred_on_the_tube():
 
 
 def test_it_is_a_tube_though_hardly_most_of_the_change_is_its_front():
-    assert tube_strip(tube(), AXIS, order_is(ORDERLY, ORDERLY)) is not None
+    assert tube_strip(tube(), AXIS, order_is(LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)) is not None
 
 
 @pytest.mark.parametrize(
-    "order", [order_is(1.0, ORDERLY - 0.01), order_is(ORDERLY - 0.01)], ids=["along the axis", "along the middle"]
+    "order",
+    [order_is(1.0, LEAST_FRONT_SHARE - 0.01), order_is(LEAST_FRONT_SHARE - 0.01)],
+    ids=["along the axis", "along the middle"],
 )
 def test_where_no_front_passes_only_the_arrival_is_followed(order):
     luma = tube()

@@ -47,7 +47,7 @@ from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.narrative.verdict_text import explain
-from vinetrack.tracks.wild_points import listed_wild_points
+from vinetrack.tracks.wild_points import rejected_points_note
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -127,7 +127,7 @@ def diagnose(
         questioned = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
         pairs, missing = frames_put_right(pairs)
-        wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
+        wild = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
         fit = initial_fit(model, pairs, questioned, profile=False)
         fit = replace(fit, left_out={**left_out, **fit.left_out})

@@ -9,7 +9,7 @@ from vinetrack.diagnosis.result import ARTEFACT, DROPPED_FRAMES, Diagnosis, Roun
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_text import dropped_in_words, perhaps_dropped_in_words
-from vinetrack.tracks.frame_timing import correct_frames, lost_for_sure
+from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LostFrames:
         """
         if not with_flag(track.flag, "retimed").any():
             return self
-        sure = (trial,) if lost_for_sure(track) else ()
+        sure = (trial,) if frames_surely_missing(track) else ()
         return LostFrames((*self.trials, trial), (*self.sure, *sure))
 
 

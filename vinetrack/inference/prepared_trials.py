@@ -14,7 +14,7 @@ from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_tria
 from vinetrack.inference.gauge_noise import quiet_traces
 from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
 from vinetrack.tracks.position_noise import common_rounding_noise
-from vinetrack.tracks.smoothed_positions import smoothing_of
+from vinetrack.tracks.smoothed_positions import detect_smoothing
 
 
 def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
@@ -38,7 +38,7 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
     rounding_m = common_rounding_noise(
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
-    smoothing = smoothing_of(pairs, rounding_m)
+    smoothing = detect_smoothing(pairs, rounding_m)
     for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
             data.append(prepare_trial(trial, track, quiet, smoothing, rounding_m))

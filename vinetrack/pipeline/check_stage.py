@@ -53,7 +53,7 @@ def check_folder(folder: Path) -> Checked:
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
     from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.tracks.position_noise import common_rounding_noise
-    from vinetrack.tracks.smoothed_positions import smoothing_of
+    from vinetrack.tracks.smoothed_positions import detect_smoothing
     from vinetrack.video.recording_facts import axis_notes, direction_notes, facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
 
@@ -82,7 +82,7 @@ def check_folder(folder: Path) -> Checked:
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
     notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank), *axis_notes(seen, trials)]
     rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in handed_in])
-    smoothing = smoothing_of(handed_in, rounding_m)
+    smoothing = detect_smoothing(handed_in, rounding_m)
     if smoothing is not None:
         notes.append(smoothing.note)
     if rounding_m > 0:

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags, with_flag
-from vinetrack.tracks.position_noise import THIRD_DIFFERENCE, noise_but_for_faults
-from vinetrack.tracks.wild_points import reject_wild_points, running_noise
+from vinetrack.tracks.position_noise import THIRD_DIFFERENCE, robust_position_noise
+from vinetrack.tracks.wild_points import local_noise, reject_wild_points
 
 CLEAR_STEP_SIGMAS = 8.0
 """Motion is well above noise where one frame's step exceeds this many standard deviations of a position."""
@@ -147,7 +147,7 @@ def _corrected(track: Track) -> Track:
     return out
 
 
-def lost_for_sure(track: Track) -> bool:
+def frames_surely_missing(track: Track) -> bool:
     """Whether frames are missing from a track beyond doubt: one jump at least that more than the nearest points tell.
 
     Parameters
@@ -182,10 +182,10 @@ def _noise(track: Track) -> tuple[Floats, float]:
     """
     usable = track.usable
     y = track.lead_position_m[usable]
-    whole_m, rho = noise_but_for_faults(track.time_s[usable], y)
+    whole_m, rho = robust_position_noise(track.time_s[usable], y)
     noise_m = np.full(usable.size, whole_m)
     if y.size > 2 * WIDE_SIDE_POINTS:
-        around_m = running_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
+        around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
         noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
     return noise_m, rho
 

@@ -16,7 +16,7 @@ from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import Table, TableError, parse_table, read_text
 from vinetrack.tracks.body_end import flag_end_of_body
 from vinetrack.tracks.physics_tracker import is_export_header, read_export, read_project
-from vinetrack.tracks.rounded_times import without_rounding
+from vinetrack.tracks.rounded_times import unrounded_times
 from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_pressure, check_times, new_track
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
@@ -121,7 +121,7 @@ def _read_positions(table: Table) -> Track:
     """The project's own table of positions; every row of it is a row of the track."""
     _require(table, "time_s", "position_m")
     time_s, position_m = table.numbers("time_s"), table.numbers("position_m")
-    time_s, note = without_rounding(time_s)
+    time_s, note = unrounded_times(time_s)
     check_times(time_s, table.lines)
     sigma_m, notes = np.full(len(time_s), np.nan), [note] if note else []
     if "sigma_m" in table.columns:

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.tracks.position_noise import noise_but_for_faults
-from vinetrack.tracks.wild_points import FEWEST_POINTS, LEAST_SHARE, local_fit, running_noise
+from vinetrack.tracks.position_noise import robust_position_noise
+from vinetrack.tracks.wild_points import FEWEST_POINTS, LEAST_SHARE, local_fit, local_noise
 
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 """Weights of a fourth difference; for white noise of variance 1 it has the variance 70."""
@@ -127,14 +127,14 @@ def correlated_gain(rho: float) -> float:
 
 
 def _local(time_s: Floats, position_m: Floats) -> _Local:
-    noise_m, _ = noise_but_for_faults(time_s, position_m)
+    noise_m, _ = robust_position_noise(time_s, position_m)
     fit = local_fit(time_s, position_m, noise_m)
     distance_m = np.zeros(time_s.size)
     distance_m[2:-2] = np.abs(np.convolve(position_m, FOURTH, "valid")) / np.linalg.norm(FOURTH)
     spacing = np.diff(time_s) / np.median(np.diff(time_s))
     even = np.zeros(time_s.size, dtype=bool)
     even[2:-2] = np.lib.stride_tricks.sliding_window_view(np.abs(spacing - 1) < UNEVEN, 4).all(axis=1)
-    around_m = running_noise(distance_m)
+    around_m = local_noise(distance_m)
     # At a corner of the motion the difference is no noise.
     use = even & (fit.share >= LEAST_SHARE) & (around_m > 0)
     return _Local(np.minimum(distance_m, WINSORISED * around_m), use, _smooth(np.abs(fit.speed_m_s)))

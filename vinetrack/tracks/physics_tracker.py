@@ -17,7 +17,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.tables import Table
-from vinetrack.tracks.rounded_times import without_rounding
+from vinetrack.tracks.rounded_times import unrounded_times
 from vinetrack.tracks.track_checks import LARGEST_NUMBER, TrackError, check_times, new_track
 
 if TYPE_CHECKING:
@@ -255,7 +255,7 @@ def read_export(table: Table) -> Track:
         columns.setdefault(name, (column, unit))
     if "t" not in columns or not {"x", "y"} & columns.keys():
         raise TrackError("has no columns t and x or y: export them from Tracker with one separator throughout")
-    time_s, rounded = without_rounding(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
+    time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
     check_times(time_s, table.lines)
     axes = [
         table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name], METRES)

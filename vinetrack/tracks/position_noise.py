@@ -103,7 +103,7 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
     return noise_m, correlation, rounding_noise(position_m)
 
 
-def noise_but_for_faults(time_s: Floats, position_m: Floats) -> tuple[float, float]:
+def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     """`position_noise`, kept down where a fault in a short track would itself pass for noise.
 
     The median third difference hardly knows of one fault, and is at most `OF_THIRD` times too small; of positions that

@@ -29,7 +29,7 @@ MOST_DIGITS = 7
 """Decimals from which a time is not taken for rounded. Chosen: a tenth of a microsecond, 6 µm at 60 m/s."""
 
 
-def without_rounding(time_s: Floats) -> tuple[Floats, str]:
+def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     """Times of evenly spaced frames before they were rounded, and what was done, in words.
 
     Parameters
@@ -45,7 +45,7 @@ def without_rounding(time_s: Floats) -> tuple[Floats, str]:
 
     Examples
     --------
-    >>> without_rounding(np.round(np.arange(100) / 240, 3))[1]
+    >>> unrounded_times(np.round(np.arange(100) / 240, 3))[1]
     'Times are rounded to 1 ms; evenly spaced ones, 4.17 ms apart, are taken instead.'
     """
     digit_s = _last_digit_s(time_s) if time_s.size >= FEWEST else 0.0

@@ -96,7 +96,7 @@ def _weights(window: int, degree: int) -> Floats:
     return np.asarray(np.linalg.pinv(np.vander(places, degree + 1))[-1])
 
 
-def smoothing_of(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
+def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
     """How the positions of a campaign were smoothed; None where they were not.
 
     Parameters

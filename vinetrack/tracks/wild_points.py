@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, hand_corrected, join_flags
-from vinetrack.tracks.position_noise import noise_but_for_faults
+from vinetrack.tracks.position_noise import robust_position_noise
 
 HALF_WIDTH = 6
 """Neighbours on either side. Chosen: twelve leave eight degrees of freedom beside a cubic. With three on either side
@@ -146,7 +146,7 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     )
 
 
-def running_noise(distance_m: Floats, half_width: int = SCALE_HALF_WIDTH) -> Floats:
+def local_noise(distance_m: Floats, half_width: int = SCALE_HALF_WIDTH) -> Floats:
     """Estimate the standard deviation around each point by a running median, 0.6745 of it for normal noise.
 
     Parameters
@@ -222,7 +222,7 @@ def reject_wild_points(track: Track, *, spare_copies: bool = False) -> Track:
     return replace(rejected, notes=(*track.notes, note))
 
 
-def listed_wild_points(tracks: Mapping[str, Track]) -> str:
+def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     """A sentence that names the rejected points of tracks by trial; blank where there are none.
 
     Parameters
@@ -263,9 +263,9 @@ def _places(track: Track, wild: NDArray[np.int_]) -> list[str]:
 
 def _far_off(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
     """Points beyond the limit that are the worst among their neighbours."""
-    noise_m, _ = noise_but_for_faults(time_s, position_m)
+    noise_m, _ = robust_position_noise(time_s, position_m)
     fit = local_fit(time_s, position_m, noise_m)
-    sigma_m = np.maximum(np.maximum(running_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
+    sigma_m = np.maximum(np.maximum(local_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
     size = np.abs(fit.residual_m)
     step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
     behind = fit.residual_m * fit.speed_m_s < 0

@@ -20,7 +20,7 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
 from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
 
-ORDERLY = 0.45
+LEAST_FRONT_SHARE = 0.45
 """Share of all change that one front explains where nothing else of weight goes on. Chosen: a swinging door takes a
 fifth; by reasoning, at half it is taken for the axis, at twice payloads make a recording disorderly."""
 MOST_TURN_DEG = 8.0
@@ -106,8 +106,8 @@ class Axis:
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-OrderAlong = Callable[[Axis], float]
-"""How much of what changes along an axis is a front that passes once; see `order_along`."""
+FrontShare = Callable[[Axis], float]
+"""How much of what changes along an axis is a front that passes once; see `front_share`."""
 
 
 def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
@@ -134,21 +134,23 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
     best = _line_of(small, seen.grown) if grows else _NO_LINE
     if best.collected <= 0:
         best = _line_of(small, seen.changed, insist=True)
-    if best.order < ORDERLY:
+    if best.order < LEAST_FRONT_SHARE:
         # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
         stays = grows and seen.grown is not seen.changed
         for part in PREFIXES:
             count = max(3, int(part * len(small)))
             shorter = _line_of(small, _until(part, seen.grown) if stays else changed_pixels(small, count), patient=True)
             worth = shorter.order * shorter.collected
-            if shorter.order >= ORDERLY and (best.order < ORDERLY or worth > best.order * best.collected):
+            if shorter.order >= LEAST_FRONT_SHARE and (
+                best.order < LEAST_FRONT_SHARE or worth > best.order * best.collected
+            ):
                 best = shorter
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
     return _to_picture(best, seen.factor, seen.shape)
 
 
-def order_along(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
+def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
     """How much of what grows along `axis` is a front that passes once.
 
     Where hardly any of what changes along it stays (LEAST_GROWN), all that changes there is asked instead.
@@ -160,7 +162,7 @@ def order_along(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
 
     Returns
     -------
-    its share, 0 to 1: less than ORDERLY where the vine bends or sweeps away.
+    its share, 0 to 1: less than LEAST_FRONT_SHARE where the vine bends or sweeps away.
 
     Raises
     ------
@@ -177,7 +179,7 @@ def order_along(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
         raise RecordingError("nothing moves along the axis")
     if len(grown[0]) >= max(12, LEAST_GROWN * len(line[0])):
         line = grown
-    agree, _, _ = agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
+    agree, _, _ = pixels_on_front(*line, n_times, angle, np.array(scaled.from_px), band)
     return float(line[3][agree].sum() / line[3].sum())
 
 
@@ -334,7 +336,7 @@ def _best_line(
     return chosen
 
 
-def agreeing(
+def pixels_on_front(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
     """Find the pixels that change when the best ordered path along a line passes them.
@@ -377,7 +379,7 @@ def _refine(
 ) -> tuple[float, Floats, float, tuple[float, float], float]:
     """Line through the pixels that agree with a path: direction, point, half width, ends along it, their worth."""
     along_unit = np.array([np.cos(angle), np.sin(angle)])
-    agree, _, _ = agreeing(x, y, time, weight, n_times, angle, middle, band)
+    agree, _, _ = pixels_on_front(x, y, time, weight, n_times, angle, middle, band)
     if agree.sum() < 8:
         raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
     w = weight[agree]

@@ -63,7 +63,7 @@ half sides of tumbling bodies are cut off, at twice a neighbour 10 px beside is 
 
 
 @dataclass(frozen=True)
-class EndOfWay:
+class BodyEnd:
     """Last frame of a body's way along the strip, where the recording goes on; `turns_back` or is not seen again."""
 
     last_frame: int
@@ -88,7 +88,7 @@ class BodyFit:
     unsure: NDArray[np.bool_]
     half_px: float
     unseen: NDArray[np.bool_]
-    end: EndOfWay | None = None
+    end: BodyEnd | None = None
 
 
 def track_body(strip: Strip) -> BodyFit:
@@ -133,7 +133,7 @@ def track_body(strip: Strip) -> BodyFit:
     end = _end_of_way(place[:, 0], error, match, unseen)
     if end is not None:
         unseen |= np.arange(len(unseen)) > end.last_frame
-    if hops_about(place[:, 0], ~unseen):
+    if hops_between_bodies(place[:, 0], ~unseen):
         raise RecordingError(
             "what is followed hops between several bodies that move along the axis: give the axis, with a smaller width"
         )
@@ -141,7 +141,7 @@ def track_body(strip: Strip) -> BodyFit:
     return BodyFit(place[:, 0], place[:, 1], error, match, unsure, float(half), unseen, end)
 
 
-def hops_about(along: Floats, seen: NDArray[np.bool_]) -> bool:
+def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
     """Whether places scatter about any smooth motion by as much as they move on.
 
     Fourth differences cancel a cubic motion, and have 70 times the variance of single places.
@@ -194,7 +194,7 @@ def _body_rows(rows: int, width_px: float) -> NDArray[np.float32]:
     return (1 / (1 + (np.clip(beyond, 0, None) / BESIDE_PX) ** 2)).astype(np.float32)[:, None]
 
 
-def _end_of_way(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> EndOfWay | None:
+def _end_of_way(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
     """Where the body's way along the strip ends, None where the recording ends first.
 
     It ends where the body turns back (a bounce), and where it is not recognised again (it tips over, or is gone).
@@ -207,9 +207,9 @@ def _end_of_way(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.
     back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[known], nan=0.0))
     turned = np.flatnonzero(back[:-1] & back[1:])
     if len(turned):
-        return EndOfWay(int(known[int(np.argmax(y[: turned[0]]))]), turns_back=True)
+        return BodyEnd(int(known[int(np.argmax(y[: turned[0]]))]), turns_back=True)
     last = int(known[-1])
-    return EndOfWay(last, turns_back=False) if last < len(along) - 2 else None
+    return BodyEnd(last, turns_back=False) if last < len(along) - 2 else None
 
 
 def _coarse_path(

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.axis import ORDERLY, Axis, agreeing, find_axis
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, pixels_on_front
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
-from vinetrack.video.curved_strip import order_along_curve
+from vinetrack.video.curved_strip import front_share_on_curve
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -65,13 +65,13 @@ def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
     except RecordingError as error:
         straight, complaint = None, error
     band = _band(small)
-    explained = 0.0 if straight is None else share_in_order(small, straight)
+    explained = 0.0 if straight is None else front_share_of_picture(small, straight)
     wide = straight is not None and band is not None and straight.width_px > WIDER * band.width * small.factor
     # No curve can explain more than all: along a straight vine none is sought.
     curve = find_curve(small, band) if wide or explained * BETTER < 1 else None
     if curve is not None:
-        enough = max(ORDERLY, explained * (AS_MUCH if wide else BETTER))
-        if share_in_order(small, curve) >= enough and _orderly(luma, curve):
+        enough = max(LEAST_FRONT_SHARE, explained * (AS_MUCH if wide else BETTER))
+        if front_share_of_picture(small, curve) >= enough and _orderly(luma, curve):
             return curve
     if straight is None:
         assert complaint is not None
@@ -79,7 +79,7 @@ def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
     return straight
 
 
-def share_in_order(seen: SmallPictures, axis: Axis) -> float:
+def front_share_of_picture(seen: SmallPictures, axis: Axis) -> float:
     """Share of all growth in the picture that is a front passing once along an axis, straight or curved.
 
     Parameters
@@ -103,7 +103,7 @@ def share_in_order(seen: SmallPictures, axis: Axis) -> float:
     if not (np.abs(across) < band * seen.factor).any():
         return 0.0
     line = along / seen.factor, across / seen.factor, time, weight
-    agree, _, _ = agreeing(*line, n_times, 0.0, np.zeros(2), band)
+    agree, _, _ = pixels_on_front(*line, n_times, 0.0, np.zeros(2), band)
     return float(weight[agree].sum() / weight.sum())
 
 
@@ -168,7 +168,7 @@ def _band(small: SmallPictures) -> Band | None:
 
 def _orderly(luma: NDArray[Any], curve: CurvedAxis) -> bool:
     try:
-        return order_along_curve(luma, curve) >= ORDERLY
+        return front_share_on_curve(luma, curve) >= LEAST_FRONT_SHARE
     except RecordingError:
         return False
 

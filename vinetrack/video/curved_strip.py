@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_APART_PX
-from vinetrack.video.axis import Axis, OrderAlong, order_along
+from vinetrack.video.axis import Axis, FrontShare, front_share
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
@@ -46,14 +46,16 @@ and 0.78 times along found ones. At half or twice the slow error of curves is so
 
 
 @dataclass(frozen=True)
-class LaidStraight:
+class StraightenedPictures:
     """Pictures along a curve: `luma`, shape (n_frames, n_across, n_along), and the level `axis` along its middle."""
 
     luma: NDArray[Any]
     axis: Axis
 
 
-def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None) -> LaidStraight:
+def straightened(
+    luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None
+) -> StraightenedPictures:
     """Lay pictures straight along a curve, by bicubic interpolation.
 
     Parameters
@@ -79,7 +81,7 @@ def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px
     moved = np.zeros((len(luma), 2)) if shake_px is None else shake_px
     for frame, straight, (dx, dy) in zip(luma, out, moved.astype(np.float32), strict=True):
         cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
-    return LaidStraight(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
+    return StraightenedPictures(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
 
 
 def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
@@ -100,7 +102,7 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
         return cut_strip(luma, axis, half_px)
     half = min(half_px, max(axis.largest_half_px - 1, 2.0))
     shake_px = picture_shake(luma, axis, half) if before is None else before.shake_px
-    straight = laid_straight(luma, axis, half, shake_px)
+    straight = straightened(luma, axis, half, shake_px)
     strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
     return strip if shake_px is None else replace(strip, shift_px=shake_px, steadied=True)
 
@@ -119,7 +121,7 @@ def path_error_px(axis: Axis) -> float:
     return SLOW_PX_PER_RAD * axis.bent_rad if isinstance(axis, CurvedAxis) else 0.0
 
 
-def curve_found(axis: CurvedAxis) -> str:
+def curve_note(axis: CurvedAxis) -> str:
     """Say that the axis of growth was found to be a curve.
 
     Parameters
@@ -154,8 +156,8 @@ def shake_along(strip: Strip, edge_px: Floats) -> Floats:
     return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(known), axis=1))
 
 
-def order_along_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
-    """How much of what changes along a curve is a front that passes once; see `axis.order_along`.
+def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
+    """How much of what changes along a curve is a front that passes once; see `axis.front_share`.
 
     Parameters
     ----------
@@ -171,11 +173,11 @@ def order_along_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
     RecordingError
         Where nothing moves along the curve.
     """
-    straight = laid_straight(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
-    return order_along(SmallPictures(straight.luma), straight.axis)
+    straight = straightened(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
+    return front_share(SmallPictures(straight.luma), straight.axis)
 
 
-def order_by_axis(small: SmallPictures, luma: NDArray[Any]) -> OrderAlong:
+def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare:
     """How much of what changes along an axis is a front that passes once, as a function of the axis.
 
     Parameters
@@ -185,12 +187,12 @@ def order_by_axis(small: SmallPictures, luma: NDArray[Any]) -> OrderAlong:
 
     Returns
     -------
-    order : its share, 0 to 1, along a straight or curved axis; see `axis.order_along`.
+    order : its share, 0 to 1, along a straight or curved axis; see `axis.front_share`.
     """
-    return lambda axis: order_along_curve(luma, axis) if isinstance(axis, CurvedAxis) else order_along(small, axis)
+    return lambda axis: front_share_on_curve(luma, axis) if isinstance(axis, CurvedAxis) else front_share(small, axis)
 
 
-def refuse_poor_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
+def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
     """Refuse a curve that leaves the picture or bends more sharply than its strip is wide.
 
     Parameters
@@ -209,7 +211,7 @@ def refuse_poor_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> Non
         raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
 
 
-def curve_parts(axis: Axis) -> int:
+def outline_stretches(axis: Axis) -> int:
     """Stretches in which the sides of a tube along a curve are told.
 
     Parameters
@@ -223,7 +225,7 @@ def curve_parts(axis: Axis) -> int:
     return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
 
 
-def beside_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
+def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
     """A curve along the middle of the tube, and how far from the one before that lies.
 
     Parameters

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, dwell_error_px, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, band_disagreement, dwell_error_px, repair_jumps
 from vinetrack.video.edge_state import (
     EdgeState,
     blur_lengths,
@@ -148,11 +148,11 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
         state = find_shape(strip, state, fit, turn == 0)
         if turn > 0:
             state = find_shading(strip, state, fit)
-        fit = mend_jumps(strip, state, _fit_some(strip, state, seen), seen)
+        fit = repair_jumps(strip, state, _fit_some(strip, state, seen), seen)
         if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
             break
     alone = _fit_some(strip, state, ~seen)
-    fit = mend_jumps(strip, state, np.where(seen[:, None], fit, alone), np.ones(len(fit), dtype=bool))
+    fit = repair_jumps(strip, state, np.where(seen[:, None], fit, alone), np.ones(len(fit), dtype=bool))
     finished = _finish(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
         return finished
@@ -340,7 +340,7 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     trouble = float(np.clip((np.mean(misfit_ratio[close]) - 1) / FULL_TROUBLE, 0, 1)) if close.any() else 0.0
     door = DOOR_PX * disturbed_start(strip, state) * trouble
     start_error = (START_PX + door) * near_start
-    bands, shared = disagreement(strip, state, edge_now, core)
+    bands, shared = band_disagreement(strip, state, edge_now, core)
     bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
     seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
     apart = hidden_errors(fit, misfit_ratio, edge_now, seen)

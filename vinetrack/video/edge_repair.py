@@ -35,7 +35,7 @@ LONG_REST = 8
 at rest a search from one start is enough."""
 
 
-def mend_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
+def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
 
     From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
@@ -166,7 +166,7 @@ MEDIAN_TO_MEAN = 1.27
 """Mean over median of χ² with three degrees of freedom. Derived: 3/2.366."""
 
 
-def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
+def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
     """Error of the edge by how far the bands disagree, and the part of it that neighbouring frames share.
 
     The weighted mean of K independent bands errs by Σ w (y − ȳ)² / ((K − 1) Σ w). What a band is ahead or behind

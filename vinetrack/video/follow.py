@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Trial
-from vinetrack.video.axis import Axis, OrderAlong
+from vinetrack.video.axis import Axis, FrontShare
 from vinetrack.video.curved_strip import cut_along
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
 from vinetrack.video.strip import Strip
 
 if TYPE_CHECKING:
-    from vinetrack.video.body import EndOfWay
+    from vinetrack.video.body import BodyEnd
     from vinetrack.video.edge import EdgeFit
 
 APART_PX = 1.0
@@ -52,14 +52,14 @@ class Positions:
     apart_sigma_px: Floats | float = 0.0
     bands_sigma_px: Floats | float = 0.0
     slow_px: Floats | float = SLOW_PX
-    end: EndOfWay | None = None
+    end: BodyEnd | None = None
     width_px: tuple[float, float] = (math.nan, math.nan)
     seen_exposure: tuple[float, float] = (math.nan, math.nan)
     is_edge: bool = True
 
 
 def follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, order: OrderAlong
+    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, order: FrontShare
 ) -> tuple[Strip, Positions]:
     """Follow what moves along an axis: a body (travel ratio 1), the edge of a tube, or else whatever arrives.
 
@@ -69,7 +69,7 @@ def follow(
     trial : its travel ratio.
     axis : with the width of what moves along it, px.
     exposure_frames : exposure over frame period; NaN where unknown.
-    order : share of what changes along the axis that is a front passing once, see `axis.order_along`.
+    order : share of what changes along the axis that is a front passing once, see `axis.front_share`.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip
     return strip, Positions(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
 
 
-def _edge(luma: NDArray[Any], axis: Axis, exposure_frames: float, order: OrderAlong) -> tuple[Strip, Positions] | None:
+def _edge(luma: NDArray[Any], axis: Axis, exposure_frames: float, order: FrontShare) -> tuple[Strip, Positions] | None:
     """The edge of a tube; None where there is no tube along the axis."""
     from vinetrack.video.edge import track_edge
     from vinetrack.video.tube_strip import tube_strip

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.point_quality import Judgement
+from vinetrack.video.point_quality import PointQuality
 
 if TYPE_CHECKING:
-    from vinetrack.video.body import EndOfWay
+    from vinetrack.video.body import BodyEnd
 
 GROWN_TOLERANCE = 0.03
 """Part of a vine's length by which travel and length may differ, for the vine to have grown whole. Chosen: lengths are
@@ -25,7 +25,7 @@ STILL_CHANGING = 0.3
 noise, 0, and motion, 1. At half a hand that lets go counts, at twice only film that goes on sliding does."""
 
 
-def is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
+def is_grown(edge_px: Floats, verdict: PointQuality, length_px: float) -> bool:
     """Whether the edge stops where the whole vine has grown, as it should; no where its length or rest is unknown.
 
     Parameters
@@ -46,7 +46,7 @@ def is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
     return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
 
 
-def end_of_body(end: EndOfWay, number: NDArray[np.int_]) -> str:
+def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
     """What is to be said of a body that goes its way no further.
 
     Parameters
@@ -64,8 +64,8 @@ def end_of_body(end: EndOfWay, number: NDArray[np.int_]) -> str:
     return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
 
 
-def end_of_growth(
-    luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str, number: NDArray[np.int_]
+def growth_end_notes(
+    luma: NDArray[Any], verdict: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
 ) -> list[str]:
     """What is to be said of an edge that stops before the recording does.
 
@@ -100,7 +100,7 @@ def end_of_growth(
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 
 
-def cut_short(edge_px: Floats, verdict: Judgement, length_px: float, name: str) -> list[str]:
+def truncation_notes(edge_px: Floats, verdict: PointQuality, length_px: float, name: str) -> list[str]:
     """What is to be said of a recording that ends while the edge is on its way.
 
     Parameters

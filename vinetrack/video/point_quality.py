@@ -56,7 +56,7 @@ at half a kick at the stop counts, at twice payloads pass."""
 
 
 @dataclass(frozen=True)
-class Judgement:
+class PointQuality:
     """Flags (n_frames,), time slots (n_frames,) with missing frames counted in, and sentences for a person.
 
     `departure_px`, shape (n_frames,), is how far a point lies off its neighbours' curve where no error explains it;
@@ -154,7 +154,7 @@ def _stops_dead(y: Floats, tolerance: float) -> bool:
     return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > STOPS_DEAD * tolerance
 
 
-def judge(
+def assess_points(
     edge_px: Floats,
     sigma_px: Floats,
     slot: Indices,
@@ -163,7 +163,7 @@ def judge(
     unsure: Bools,
     repeated: Bools,
     end_px: float,
-) -> Judgement:
+) -> PointQuality:
     """Flag every frame and mend the times.
 
     Parameters
@@ -176,7 +176,7 @@ def judge(
 
     Returns
     -------
-    Judgement
+    PointQuality
     """
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
@@ -210,7 +210,7 @@ def judge(
     astray = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
     if astray.any():
         notes.append(f"the leading edge is lost in {int(astray.sum())} moving frames, first frame {number[astray][0]}")
-    return Judgement(
+    return PointQuality(
         np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last, left if left < n else None, unseen,
         departure,
     )  # fmt: skip

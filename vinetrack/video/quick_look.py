@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.curve_search import find_growth_axis
-from vinetrack.video.curved_strip import order_by_axis
+from vinetrack.video.curved_strip import front_share_function
 from vinetrack.video.edge import rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.track import whereabouts
+from vinetrack.video.track import locate_axis
 from vinetrack.video.tube_strip import tube_strip
 
 LOOKED_AT = 100
@@ -67,7 +67,7 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
     every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
     luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
     try:
-        axis_found, order = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        axis_found, order = locate_axis(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
         about = tube_strip(luma, axis_found, order) if trial.travel_ratio == 2 else None
         if about is None:
             return Look(axis_found)
@@ -100,7 +100,7 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     small = SmallPictures(luma)
     axis = find_growth_axis(small, luma)
     try:
-        about = tube_strip(luma, axis, order_by_axis(small, luma))
+        about = tube_strip(luma, axis, front_share_function(small, luma))
     except ValueError:
         return axis
     return axis if about is None else about[0].axis

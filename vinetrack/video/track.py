@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, OrderAlong, centred_on_motion, find_axis
+from vinetrack.video.axis import Axis, FrontShare, centred_on_motion, find_axis
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
-    curve_found,
-    order_along_curve,
-    order_by_axis,
+    check_curve,
+    curve_note,
+    front_share_function,
+    front_share_on_curve,
     path_error_px,
-    refuse_poor_curve,
     shake_along,
 )
 from vinetrack.video.event_frames import read_event
@@ -29,15 +29,15 @@ from vinetrack.video.follow import Positions, follow
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
 from vinetrack.video.hand_corrections import corrected_by_hand
-from vinetrack.video.motion_end import cut_short, end_of_body, end_of_growth, is_grown
+from vinetrack.video.motion_end import body_end_note, growth_end_notes, is_grown, truncation_notes
 from vinetrack.video.point_quality import (
     FLOOR_PX,
     LARGEST_BODY_FACTOR,
     LARGEST_FACTOR,
     LOST_SIGMA_PX,
-    Judgement,
+    PointQuality,
+    assess_points,
     calibrated_sigma,
-    judge,
 )
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.sound_frames import sound_stretch
@@ -173,7 +173,7 @@ def track_frames(
     kept = np.flatnonzero(sound & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
-        given, (axis, order) = axis is not None, whereabouts(luma, axis, trial, m_per_px)
+        given, (axis, order) = axis is not None, locate_axis(luma, axis, trial, m_per_px)
         strip, edge_fit = follow(luma, trial, axis, exposure_s * capture_fps, order)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
@@ -186,7 +186,7 @@ def track_frames(
     sigma = np.maximum(np.hypot(noise, FLOOR_PX), np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
-    verdict = judge(
+    verdict = assess_points(
         edge_fit.edge_px, sigma, frames.slot[kept], number[kept], unsure=edge_fit.unsure, repeated=repeated,
         end_px=end_px,
     )  # fmt: skip
@@ -208,13 +208,13 @@ def track_frames(
         scale, position_m = along.m_per_px, along.position_m
     notes = [*frames.notes, *verdict.notes]
     if edge_fit.end is not None:
-        notes.append(f"{name}: {end_of_body(edge_fit.end, number[kept])}")
+        notes.append(f"{name}: {body_end_note(edge_fit.end, number[kept])}")
     elif not is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
-        notes += end_of_growth(luma, verdict, edge_fit.edge_px, name, number[kept])
+        notes += growth_end_notes(luma, verdict, edge_fit.edge_px, name, number[kept])
         if trial.travel_ratio == 2 and trial.frames_used is None and number[kept[-1]] == frames.n_recorded - 1:
-            notes += cut_short(edge_fit.edge_px, verdict, trial.length_m / scale, name)
+            notes += truncation_notes(edge_fit.edge_px, verdict, trial.length_m / scale, name)
     if isinstance(strip.axis, CurvedAxis) and not given:
-        notes.append(f"{name}: {curve_found(strip.axis)}")
+        notes.append(f"{name}: {curve_note(strip.axis)}")
     if not edge_fit.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -242,7 +242,7 @@ def track_frames(
     )  # fmt: skip
 
 
-def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, OrderAlong]:
+def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, FrontShare]:
     """The axis, with a width, and how to ask how much of what changes along it is one front that passes once and stays.
 
     Parameters
@@ -255,7 +255,7 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     Returns
     -------
     axis, px; and a function of an axis of its kind, straight or curved: the share of what changes along it that is one
-    front, less than `axis.ORDERLY` where the vine bends or sweeps away.
+    front, less than `axis.LEAST_FRONT_SHARE` where the vine bends or sweeps away.
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
@@ -270,19 +270,19 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
         axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
         if trial.travel_ratio == 1:
             axis = centred_on_motion(small, axis)
-    return axis, order_by_axis(small, luma)
+    return axis, front_share_function(small, luma)
 
 
 def _along_given_curve(
     luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
-) -> tuple[CurvedAxis, OrderAlong]:
-    """A given curve with a width, that of its strip at most; see `whereabouts`."""
+) -> tuple[CurvedAxis, FrontShare]:
+    """A given curve with a width, that of its strip at most; see `locate_axis`."""
     half = _half_width(axis, trial, m_per_px)
     known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
-    refuse_poor_curve(axis, half if known else math.nan, luma.shape[1:])
+    check_curve(axis, half if known else math.nan, luma.shape[1:])
     wide = min(2 * half + ROOM * axis.length_px, 2 * axis.largest_half_px)
     axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
-    return axis, partial(order_along_curve, luma)
+    return axis, partial(front_share_on_curve, luma)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
@@ -296,8 +296,8 @@ def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
 
 
 def _assemble(
-    frames: Frames, kept: NDArray[np.int_], edge_fit: Positions, errors_px: tuple[Floats, Floats], verdict: Judgement,
-    capture_fps: float, exposure_s: float, notes: list[str],
+    frames: Frames, kept: NDArray[np.int_], edge_fit: Positions, errors_px: tuple[Floats, Floats],
+    verdict: PointQuality, capture_fps: float, exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
     """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""
     n = len(frames)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.axis import ORDERLY, Axis, OrderAlong
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, FrontShare
 from vinetrack.video.curved_axis import CurvedAxis
-from vinetrack.video.curved_strip import SETTLED_PX, beside_curve, curve_parts, cut_along
+from vinetrack.video.curved_strip import SETTLED_PX, cut_along, outline_stretches, recentred_curve
 from vinetrack.video.edge import Outline, outline
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.strip import Strip, recut, squared
@@ -22,7 +22,7 @@ OFF_CENTRE_PX = 0.8
 Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
 
 
-def tube_strip(luma: NDArray[Any], axis: Axis, order: OrderAlong) -> tuple[Strip, Outline] | None:
+def tube_strip(luma: NDArray[Any], axis: Axis, order: FrontShare) -> tuple[Strip, Outline] | None:
     """Cut the strip about the tube that grows along an axis.
 
     Sides of what a front left behind are found for anything that changes in order. Where it is no tube, they lie
@@ -32,7 +32,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, order: OrderAlong) -> tuple[Strip
     ----------
     luma : brightness, shape (n_frames, height, width).
     axis : roughly along the tube, with a width that holds it, px.
-    order : share of what changes along an axis that is a front passing once, see `axis.order_along`.
+    order : share of what changes along an axis that is a front passing once, see `axis.front_share`.
 
     Returns
     -------
@@ -44,17 +44,17 @@ def tube_strip(luma: NDArray[Any], axis: Axis, order: OrderAlong) -> tuple[Strip
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    if order(axis) < ORDERLY:
+    if order(axis) < LEAST_FRONT_SHARE:
         return None
     strip = first = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
-    sides = outline(strip, curve_parts(axis))
+    sides = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
             before, strip = strip, centred(luma, strip, sides)
             if strip is before:
                 break
-            sides = outline(strip, curve_parts(axis))
-        astray = strip is not first and order(strip.axis) < ORDERLY
+            sides = outline(strip, outline_stretches(axis))
+        astray = strip is not first and order(strip.axis) < LEAST_FRONT_SHARE
     except (RecordingError, ValueError):
         return None
     return None if astray else (strip, sides)
@@ -78,7 +78,7 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
     shift, slope, half = sides.shift_px, sides.slope, sides.half_px
     room = (strip.values.shape[1] - 1) / 2 - half - 3
     if isinstance(strip.axis, CurvedAxis):
-        curve, away = beside_curve(strip.axis, sides)
+        curve, away = recentred_curve(strip.axis, sides)
         if away < SETTLED_PX and 0 <= room < 0.3 * half + 6:
             return strip
         return cut_along(luma, curve, half * 1.15 + 5, strip)
