@@ -12,7 +12,7 @@ from hidden.laboratory_rows import campaign
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.inference.parameters import group_names, groups_of, make_layout
-from vinetrack.inference.prediction_band import laid_over
+from vinetrack.inference.prediction_band import values_for_trial
 
 RATE = "time_base.eps"
 
@@ -76,6 +76,6 @@ def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(fitted):
 def test_a_band_around_a_prediction_takes_over_the_error_of_the_number_of_its_day(fitted):
     data = next(data for data in fitted.predictor.data if data.trial.day == "2")
     layout = make_layout(fitted.model, [data])
-    _, places = laid_over(fitted, layout, data)
+    _, places = values_for_trial(fitted, layout, data)
     place = places[layout.keys.index(RATE)]
     assert fitted.numbers[place].name == f"{RATE}[day 2]"

@@ -139,7 +139,7 @@ def test_errors_that_few_trials_feel_count_as_if_every_trial_had_a_column_for_th
     questioned = asked([*careful(20.0, 8), *careful(60.0, 9)])
     fitted, answers = questioned.fit, questioned.answers
     felt = systematics_of(fitted.predictor, fitted.solution, fitted.trials)
-    assert felt.n_felt < felt.count
+    assert felt.n_columns < felt.count
     wide = [np.zeros((len(columns), felt.count + 1)) for columns in felt.columns]
     for column, columns, places in zip(wide, felt.columns, felt.places, strict=True):
         column[:, places] = columns

@@ -16,7 +16,7 @@ from vinetrack.diagnosis.force_surface import Surface, curves, domains
 from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import ORIGIN, OWN, PRESSURE, RELEASE
+from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
     for _ in range(12):  # where a place far off the tracks is settled depends on where it begins
         settled = _as_driven(fit, settled)
     trial = 0
-    mine = place.theta.size + domain.size + trial * OWN + PRESSURE
+    mine = place.theta.size + domain.size + trial * N_TRIAL_EFFECTS + PRESSURE
     slope = normal_equations(fit, linear.fit, settled).slope[mine]
     costs = []
     for step in (-1e-4, 1e-4):

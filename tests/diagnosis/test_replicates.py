@@ -10,7 +10,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.replicates import align_replicates, replicates_of
-from vinetrack.inference.fit_data import VagueRest
+from vinetrack.inference.fit_data import ImpreciseRest
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
@@ -111,7 +111,9 @@ def test_motions_of_different_speed_are_not_slid_to_where_they_agree(vague):
     # bend is then all that is left, but it is no tenth of a millimetre.
     trials = [grown("slow", speed=0.93, rest=0), grown("fast", speed=1.07, rest=0)]
     if vague:
-        trials = [replace(trial, vague_rest=VagueRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4)) for trial in trials]
+        trials = [
+            replace(trial, imprecise_rest=ImpreciseRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4)) for trial in trials
+        ]
     aligned = align_replicates(trials)
     both = aligned.present > 1
     assert np.count_nonzero(both) > 0.79 * 151

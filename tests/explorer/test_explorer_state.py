@@ -49,7 +49,7 @@ def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> 
     table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
     curves = follow(door, sized(door, first_choice(door)))
     for seen, motion in zip(door.trials, curves, strict=True):
-        assert seen.data.vague_rest is not None
+        assert seen.data.imprecise_rest is not None
         assert motion.origin_m == seen.origin_m
     for condition, error in errors_m(door, curves).items():
         assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)

@@ -15,11 +15,11 @@ from vinetrack.inference.sensitivity import Predictor
 def test_a_step_into_the_unfollowable_ends_the_fit_where_it_was(monkeypatch: pytest.MonkeyPatch):
     whole, calls = Predictor.linearise, []
 
-    def breaks_later(self: Predictor, theta: Floats, own: Floats, *, own_only: bool = False) -> list[Floats]:
-        calls.append(own_only)
-        if not own_only and calls.count(False) > 2:
+    def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
+        calls.append(trial_effects_only)
+        if not trial_effects_only and calls.count(False) > 2:
             raise SimulationError("Trial slow0: the model could not be integrated beyond 0.3 s.")
-        return whole(self, theta, own, own_only=own_only)
+        return whole(self, theta, own, trial_effects_only=trial_effects_only)
 
     monkeypatch.setattr(Predictor, "linearise", breaks_later)
     fit = vt.fit(vt.base_model(), campaign()[:1], profile=False, thorough=False)

@@ -412,7 +412,7 @@ def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
     found = vt.fit(vt.base_model(), pairs, watch=steps.append)
     assert [step.iteration for step in steps][-1] == found.iterations
     assert steps[-1].values == pytest.approx({number.name: number.value for number in found.numbers}, rel=1e-6)
-    assert steps[-1].promised < 1e-2
+    assert steps[-1].predicted_decrease < 1e-2
 
     def enough(_: Step) -> None:
         raise TimeoutError

@@ -51,9 +51,9 @@ def campaign() -> list[tuple[Trial, Track]]:
 
 
 def test_a_pressure_that_rises_from_nothing_was_let_in():
-    assert prepare_trial(*campaign()[0]).let_in
+    assert prepare_trial(*campaign()[0]).pressurised_in_recording
     held = filmed(np.full(TIMES_S.size, 16e3), 1)
-    assert not prepare_trial(vine(), held).let_in
+    assert not prepare_trial(vine(), held).pressurised_in_recording
 
 
 def test_the_threshold_is_found_instead_of_a_release():

@@ -14,14 +14,14 @@ from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
-from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
+from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_between_trial_sd, marginal
 from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
     bounded_solve,
-    cross_products,
-    newton_step,
-    put_back,
+    sum_matrix_blocks,
+    levenberg_marquardt_step,
+    at_zero_deviations,
     spreads,
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
@@ -41,8 +41,8 @@ def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> Mixe
         index=np.tile(np.arange(keys), (n_trials, 1)),
         feels=np.tile([False, True], (n_trials, 1)),
         gauge_error=np.zeros(n_trials),
-        own_centre=np.zeros((n_trials, 2)),
-        own_precision=np.full((n_trials, 2), flat_sd**-2),
+        release_origin_mean=np.zeros((n_trials, 2)),
+        release_origin_precision=np.full((n_trials, 2), flat_sd**-2),
         prior_mean=np.zeros(keys),
         prior_precision=np.zeros(keys),
         lower=np.full(keys, -np.inf),
@@ -115,7 +115,9 @@ def test_what_deviations_explain_so_far_is_put_back() -> None:
     for column, effects in zip(whole, state.trial_effects, strict=True):
         column[:, -1] += column[:, 2:4] @ effects[2:]
     white = at_correlation(all_products(columns, first), RHO)
-    assert put_back(white, state, -1) == pytest.approx(at_correlation(all_products(whole, first), RHO), rel=1e-9)
+    assert at_zero_deviations(white, state, -1) == pytest.approx(
+        at_correlation(all_products(whole, first), RHO), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -218,12 +220,12 @@ def balanced(n_trials: int, count: int, spread: float, seed: int) -> tuple[list[
 
 def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Solution, np.ndarray]:
     columns, means = balanced(n_trials, count, spread, seed)
-    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
     frame = frame_of(n_trials, count, 1)
     state = state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
-    found = estimate_spreads(marginal(grams, frame, state), frame, state, (False, True))
+    found = estimate_between_trial_sd(marginal(cross_products, frame, state), frame, state, (False, True))
     state = FitState(state.theta, state.trial_effects, found, 0.0, state.variance)
-    return Solution(state, frame, grams, (), (False, True), True, 1), means
+    return Solution(state, frame, cross_products, (), (False, True), True, 1), means
 
 
 def test_the_spread_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
@@ -245,7 +247,7 @@ def test_two_spreads_are_found_from_wherever_the_fit_stands(start: tuple[float, 
     frame = replace(frame_of(n_trials, count, 1), feels=np.ones((n_trials, 2), dtype=bool))
     state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
     part = marginal(all_products(columns, [np.arange(count) == 0] * n_trials), frame, state)
-    pressure, damping = estimate_spreads(part, frame, state, (True, True))
+    pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
 
@@ -297,9 +299,9 @@ def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:
         flat = np.column_stack([line, np.ones(count)])
         noise -= flat @ np.linalg.lstsq(flat, noise, rcond=None)[0]
         columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
-    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    found, variance = estimate_noise(grams, frame, state)
+    found, variance = estimate_noise(cross_products, frame, state)
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
     assert found == pytest.approx(rho, abs=0.03)
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
@@ -314,9 +316,9 @@ def test_the_noise_of_short_trials_is_drawn_together_as_far_as_chance_explains_i
     n_trials, count = 40, 12
     sd = np.where(np.arange(n_trials) % 2, louder, 1.0)
     columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
-    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    cross_products = all_products(columns, [np.arange(count) == 0] * n_trials)
     frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
-    _, variance = estimate_noise(grams, frame, state, rho=0.0)
+    _, variance = estimate_noise(cross_products, frame, state, rho=0.0)
     alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
     assert lowest < np.std(np.log(variance)) / np.std(np.log(alone)) < highest
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
@@ -333,10 +335,12 @@ def test_one_step_solves_a_straight_problem() -> None:
     for c in columns:
         c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
     frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
-    step, own, promised = newton_step(all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0)
+    step, own, predicted_decrease = levenberg_marquardt_step(
+        all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0
+    )
     assert step == pytest.approx(truth, abs=1e-6)
     assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
-    assert promised > 0
+    assert predicted_decrease > 0
 
 
 def test_a_number_at_its_bound_does_not_leave_it() -> None:
@@ -345,7 +349,9 @@ def test_a_number_at_its_bound_does_not_leave_it() -> None:
         c[:, -1] = c[:, 4:6] @ np.array([0.3, -0.7])
     frame = frame_of(3, 25, 2)
     bounded = MixedProblem(**{**frame.__dict__, "lower": np.array([-np.inf, 0.0])})
-    step, _, _ = newton_step(all_products(columns, [np.arange(25) == 0] * 3), bounded, state_of(3, 2, 0.1), 0.0)
+    step, _, _ = levenberg_marquardt_step(
+        all_products(columns, [np.arange(25) == 0] * 3), bounded, state_of(3, 2, 0.1), 0.0
+    )
     assert step[1] == 0.0
     assert step[0] > 0
 
@@ -359,7 +365,7 @@ def test_two_numbers_that_move_the_trajectories_alike_are_found_out() -> None:
         True, 1,
     )  # fmt: skip
     found = precision(solution)
-    assert found.tied.tolist() == [False, True, True]
+    assert found.collinear.tolist() == [False, True, True]
     assert np.isinf(found.covariance[1, 1])
     assert np.isfinite(found.covariance[0, 0])
 
@@ -367,7 +373,7 @@ def test_two_numbers_that_move_the_trajectories_alike_are_found_out() -> None:
 def test_blocks_of_a_trial_go_to_the_numbers_it_feels() -> None:
     frame = frame_of(2, 5, 3)
     frame = MixedProblem(**{**frame.__dict__, "index": np.array([[0, 2], [1, -1]])})
-    total = cross_products(np.ones((2, 2, 2)), frame)
+    total = sum_matrix_blocks(np.ones((2, 2, 2)), frame)
     assert total.tolist() == [[1, 0, 1], [0, 1, 0], [1, 0, 1]]
 
 

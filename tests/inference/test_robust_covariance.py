@@ -59,7 +59,7 @@ def deviations(make: Callable[[int], Pairs], seeds: Iterable[int]) -> tuple[floa
             }
             truth = N_TRUE if number.title == "n" else known[number.vine.split("mm")[0]]
             free = found.predictor.layout.free[k]
-            by_noise.append((free.inside(number.value) - free.inside(truth)) / narrow[k])
+            by_noise.append((free.to_scaled(number.value) - free.to_scaled(truth)) / narrow[k])
             stated.append((number.value - truth) / number.sigma)
     return tuple(float(np.sqrt(np.mean(np.square(z)))) for z in (by_noise, stated))  # type: ignore[return-value]
 

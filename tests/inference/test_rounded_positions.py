@@ -45,12 +45,12 @@ def test_a_rest_that_shows_no_noise_counts_as_one_point():
     assert len(data) > 12
     for each in data:
         assert each.n_rest == 0
-        assert each.vague_rest.sigma_m == pytest.approx(STEP_M / np.sqrt(12))
+        assert each.imprecise_rest.sigma_m == pytest.approx(STEP_M / np.sqrt(12))
         assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
 
 
 def test_a_rest_whose_noise_shows_in_spite_of_rounding_is_kept():
-    assert all(each.n_rest > 5 and each.vague_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
+    assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 
 
 def test_origins_of_rounded_tracks_err_as_much_as_is_said():

@@ -20,7 +20,7 @@ from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures, systematics_of
-from vinetrack.inference.trace_errors import as_recorded, penalty, told_by_motion, with_errors_told
+from vinetrack.inference.trace_errors import as_recorded, penalty, trace_error_step, with_fitted_trace_errors
 
 SEED = 20602
 
@@ -44,7 +44,7 @@ def test_what_is_left_is_the_noise_of_the_positions_and_each_error_is_of_the_siz
 ):
     assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
     assert fit.chi2_per_dof < 1.1
-    told = np.concatenate([each.trace_told for each in fit.predictor.data if each.trace_told is not None])
+    told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
     assert told.size > 12
     assert 0.4 < np.sqrt(np.mean(told**2)) < 1.6
     assert penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
@@ -57,23 +57,23 @@ def test_an_error_that_a_trace_has_is_found(fit: vt.Fit):
     which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
     data = list(fit.predictor.data)
     clock_s, pressure_Pa = data[which].trace
-    errors_Pa, told = data[which].trace_errors_Pa, data[which].trace_told
+    errors_Pa, told = data[which].trace_errors_Pa, data[which].trace_error_sizes
     assert errors_Pa is not None
     assert told is not None
-    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * errors_Pa[:, 0]), trace_told=told)
+    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * errors_Pa[:, 0]), trace_error_sizes=told)
     moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
     solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
-    back, _ = with_errors_told(moved, solution, FixedTerms())
+    back, _ = with_fitted_trace_errors(moved, solution, FixedTerms())
     after = back.data[which]
-    assert after.trace_told is not None
-    assert after.trace_told[0] - told[0] == pytest.approx(-2.0, abs=0.5)
+    assert after.trace_error_sizes is not None
+    assert after.trace_error_sizes[0] - told[0] == pytest.approx(-2.0, abs=0.5)
     assert np.max(np.abs(after.trace[1] - pressure_Pa)) < 0.3 * np.max(np.abs(2.0 * errors_Pa[:, 0]))
 
 
 def test_a_model_far_off_bends_no_pressure(laboratory: tuple[Path, float]):
     held = vt.fit(vt.base_model(), laboratory[0], fixed=["n"], start={"eversion_damping.n": 0.9}, profile=False)
     assert held.chi2_per_dof > 3
-    assert all(each.trace_told is None for each in held.predictor.data)
+    assert all(each.trace_error_sizes is None for each in held.predictor.data)
 
 
 def test_no_vine_is_given_an_exponent_of_its_own_by_them(fit: vt.Fit):
@@ -83,7 +83,7 @@ def test_no_vine_is_given_an_exponent_of_its_own_by_them(fit: vt.Fit):
 
 
 def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
-    data = [replace(each, trace_told=None) for each in fit.predictor.data]
+    data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
     predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
     free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
     assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * penalty(fit.predictor.data))
@@ -93,7 +93,7 @@ def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
 def test_what_was_recorded_is_kept(fit: vt.Fit):
     recorded, _ = prepare(fit.pairs)
     for told, before in zip(map(as_recorded, fit.predictor.data), recorded, strict=True):
-        assert told.trace_told is None
+        assert told.trace_error_sizes is None
         np.testing.assert_allclose(told.trace[1], before.trace[1], rtol=1e-9)
 
 
@@ -102,7 +102,7 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
     recorded = Predictor(fit.predictor.layout, list(map(as_recorded, fit.predictor.data)), fit.predictor.host)
     there = recorded.residuals(state.theta, state.trial_effects)
     errors = systematics_of(fit.predictor, fit.solution, fit.trials)
-    seen = errors.put_back(fit.solution.columns)
+    seen = errors.at_zero_errors(fit.solution.columns)
     off = np.concatenate([columns[:, -1] - left for columns, left in zip(seen, there, strict=True)])
     moved = np.concatenate([columns[:, -1] - left for columns, left in zip(fit.solution.columns, there, strict=True)])
     assert np.sqrt(np.mean(moved**2)) > 1e-5
@@ -120,7 +120,7 @@ def test_left_out_trials_are_predicted_from_what_was_recorded(fit: vt.Fit, monke
     monkeypatch.setattr("vinetrack.diagnosis.ladder.predict_prepared", seen)
     left_out(fit)
     assert len(given) == len(fit.trials)
-    assert all(trial_data.trace_told is None for trial_data in given)
+    assert all(trial_data.trace_error_sizes is None for trial_data in given)
 
 
 def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
@@ -136,7 +136,7 @@ def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
         for model in (fit.model + "air_drag", fit.model):
             with pytest.raises(InterruptedError):
                 vt.refit(fit, model)
-    assert all(trial_data.trace_told is None for trial_data in begun[0])
+    assert all(trial_data.trace_error_sizes is None for trial_data in begun[0])
     assert begun[1] is fit.predictor.data
 
 
@@ -144,12 +144,14 @@ def test_errors_of_which_the_motion_tells_nothing_are_none(fit: vt.Fit):
     state = fit.solution.state
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
     far = [
-        each if each.trace_errors_Pa is None else replace(each, trace_told=np.full(each.trace_errors_Pa.shape[1], 3.0))
+        each
+        if each.trace_errors_Pa is None
+        else replace(each, trace_error_sizes=np.full(each.trace_errors_Pa.shape[1], 3.0))
         for each in fit.predictor.data
     ]
-    moved = told_by_motion(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
+    moved = trace_error_step(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
     for back, each in zip(moved, far, strict=True):
-        felt = 0 if each.trace_told is None else each.trace_told.size
+        felt = 0 if each.trace_error_sizes is None else each.trace_error_sizes.size
         np.testing.assert_allclose(back[:felt], -3.0, atol=0.05)
 
 
@@ -158,7 +160,7 @@ def test_errors_that_cannot_be_simulated_stay_as_they_were_told(fit: vt.Fit, mon
         raise SimulationError("the tube stands still")
 
     monkeypatch.setattr(Predictor, "run", fails)
-    assert told_by_motion(fit.predictor, fit.solution).shape == (len(fit.trials), 0)
-    same, solution = with_errors_told(fit.predictor, fit.solution, FixedTerms())
+    assert trace_error_step(fit.predictor, fit.solution).shape == (len(fit.trials), 0)
+    same, solution = with_fitted_trace_errors(fit.predictor, fit.solution, FixedTerms())
     assert same is fit.predictor
     assert solution is fit.solution

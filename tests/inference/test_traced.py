@@ -46,7 +46,7 @@ def test_what_the_gauge_leaves_wrong_in_a_pressure_bends_its_own_trial_alone(tra
     trace = predictor.data[3].trace
     assert trace is not None
     ramp = np.linspace(-100.0, 100.0, trace[0].size)
-    data = [replace(trial_data, trace_errors_Pa=None, trace_told=None) for trial_data in predictor.data]
+    data = [replace(trial_data, trace_errors_Pa=None, trace_error_sizes=None) for trial_data in predictor.data]
     data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
     errors = systematics_of(Predictor(predictor.layout, data, predictor.host), traced.solution, traced.trials)
     without = systematics_of(

@@ -18,7 +18,7 @@ from vinetrack.inference.mixed_effects import FitState
 from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
 from vinetrack.inference.position_errors import SmoothErrors
 from vinetrack.inference.release_kernels import products_at_releases
-from vinetrack.inference.trial_effects import LARGEST_DEVIATION, follow_trial_effects, residuals_in, trial_costs
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION, optimise_trial_effects, residuals_in, trial_costs
 from vinetrack.inference.whitening import products, whiten
 
 
@@ -111,7 +111,7 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
 
     monkeypatch.setattr(trial_effects, "_levels", level)
     monkeypatch.setattr(trial_effects, "trial_costs", cost)
-    monkeypatch.setattr(trial_effects, "follow_trial_effects", lambda *given: (given[-1], None))
+    monkeypatch.setattr(trial_effects, "optimise_trial_effects", lambda *given: (given[-1], None))
     monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_: elsewhere)
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
 
@@ -122,7 +122,7 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
     assert looked(+4.0) is not None
     # The next search finds the trials where they had been.
     assert looked(+4.0) is None
-    assert search.led_back.all()
+    assert search.returned.all()
     assert looked(-4.0) is not None
 
 
@@ -140,7 +140,7 @@ def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_t
     for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
         monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_, at=likelier: at)
         search.look(begins, residuals)
-    assert search.led_back.all()
+    assert search.returned.all()
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_residuals_of_several_ways_are_those_of_each(only_in_motion: Fit) -> Non
     there = solution.state.trial_effects.copy()
     there[:, 0] -= 0.004
     ways = [solution.state.trial_effects, there]
-    together = predictor.residuals_of_ways(solution.state.theta, ways)
+    together = predictor.residuals_of_each(solution.state.theta, ways)
     for way, left_m in zip(ways, together, strict=True):
         alone = predictor.residuals(solution.state.theta, way)
         assert all(np.array_equal(a, b) for a, b in zip(left_m, alone, strict=True))
@@ -173,12 +173,12 @@ def test_a_place_that_no_linear_answer_brings_low_enough_is_given_up_at_once(onl
     off = solution.state.trial_effects.copy()
     off[:, 1] += 1e-3
     state = replace(solution.state, trial_effects=off)
-    better, costs = follow_trial_effects(predictor, solution.problem, state)
+    better, costs = optimise_trial_effects(predictor, solution.problem, state)
     best = float(np.sum(trial_costs(predictor, solution.problem, solution.state)))
     assert float(np.sum(costs)) < best + 1.0
-    kept, _ = follow_trial_effects(predictor, solution.problem, state, 0.5 * best)
+    kept, _ = optimise_trial_effects(predictor, solution.problem, state, 0.5 * best)
     assert kept is state
-    followed, _ = follow_trial_effects(predictor, solution.problem, state, 1.1 * best)
+    followed, _ = optimise_trial_effects(predictor, solution.problem, state, 1.1 * best)
     assert np.array_equal(followed.trial_effects, better.trial_effects)
 
 

@@ -14,9 +14,9 @@ from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import (
     deviance,
-    deviance_left,
-    estimate_spreads,
-    left_to_keys,
+    profiled_deviance,
+    estimate_between_trial_sd,
+    deviations_eliminated,
     marginal,
     normal_equations,
 )
@@ -24,7 +24,7 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, Predictor
 from vinetrack.inference.systematics import Systematics, recorded_pressures, systematics_of
 
 
@@ -112,12 +112,12 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
     float
         Fall of −2 ln L.
     """
-    grams, problem, state = _widened(fit, base, difference)
-    before = marginal(base.grams, base.problem, base.state)
-    part = marginal(grams, problem, state)
+    cross_products, problem, state = _widened(fit, base, difference)
+    before = marginal(base.cross_products, base.problem, base.state)
+    part = marginal(cross_products, problem, state)
     if spread is None:
-        old = estimate_spreads(before, base.problem, base.state, base.estimable, restricted=False)
-        new = estimate_spreads(part, problem, state, base.estimable, restricted=False)
+        old = estimate_between_trial_sd(before, base.problem, base.state, base.estimable, restricted=False)
+        new = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
     else:
         old = new = spread
     plain = deviance(before, base.problem, base.state, old, restricted=False)
@@ -172,11 +172,11 @@ def beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     -------
     Solution
     """
-    if not errors.n_felt:
+    if not errors.n_columns:
         return base
     columns = [
         np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
-        for of_fit, systematic in zip(errors.put_back(base.columns), errors.columns, strict=True)
+        for of_fit, systematic in zip(errors.at_zero_errors(base.columns), errors.columns, strict=True)
     ]
     places = np.where(errors.places < errors.count, base.problem.prior_mean.size + errors.places, -1)
     problem = with_shapes(base.problem, errors.count)
@@ -184,7 +184,7 @@ def beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
         base,
         state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
         problem=replace(problem, index=np.column_stack([base.problem.index, places])),
-        grams=fit.predictor.products(columns),
+        cross_products=fit.predictor.products(columns),
         columns=tuple(columns),
     )
 
@@ -212,13 +212,15 @@ def gains_from_each(
     list of float
         Falls of −2 ln L.
     """
-    grams, problem, state = _widened(fit, base, difference)
+    cross_products, problem, state = _widened(fit, base, difference)
     spread = base.state.spread
-    plain = deviance(marginal(base.grams, base.problem, base.state), base.problem, base.state, spread, restricted=False)
-    part = marginal(grams, problem, state)
+    plain = deviance(
+        marginal(base.cross_products, base.problem, base.state), base.problem, base.state, spread, restricted=False
+    )
+    part = marginal(cross_products, problem, state)
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
     constant = square + log_det + part.log_constant
-    blocks, _ = left_to_keys(part, problem, spread)
+    blocks, _ = deviations_eliminated(part, problem, spread)
     places, shapes = problem.places, base.problem.index.shape[1] - len(fit.predictor.layout.keys)
     last = places.shape[1] - shapes
     of_term = np.zeros(places.shape[1], dtype=bool)
@@ -233,7 +235,7 @@ def gains_from_each(
             np.subtract.at(information, (places[i][:, None], places[i]), np.where(felt, blocks[i, :-1, :-1], 0.0))
             np.subtract.at(slope, places[i][of_term], blocks[i, :-1, -1][of_term])
         taken = begin
-        left = deviance_left(information[:-1, :-1], slope[:-1], constant, problem, state, restricted=False)
+        left = profiled_deviance(information[:-1, :-1], slope[:-1], constant, problem, state, restricted=False)
         gains.append(plain - left)
     return gains
 
@@ -247,12 +249,12 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
         shared={**options["shared"], **difference.shared}, between=(*old.between, *difference.terms),
     )  # fmt: skip
     problem = make_problem(Predictor(layout, data, fit.predictor.host), state.trial_effects)
-    problem = replace(problem, own_centre=base.problem.own_centre)
+    problem = replace(problem, release_origin_mean=base.problem.release_origin_mean)
     theta = layout.start
-    known = {number.name: number.outside(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
+    known = {number.name: number.from_scaled(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
     for k, number in enumerate(layout.free):
         value = known.get(number.name, known.get(number.key))
-        theta[k] = theta[k] if value is None else number.inside(value)
+        theta[k] = theta[k] if value is None else number.to_scaled(value)
     shapes = base.problem.index.shape[1] - len(old.keys)
     if shapes:
         further, beyond = state.theta[len(old.free) :], base.problem.index[:, len(old.keys) :]
@@ -260,8 +262,8 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
         problem = replace(with_shapes(problem, further.size), index=np.column_stack([problem.index, moved]))
         theta = np.append(theta, further)
     turn = _turn(old, layout, shapes)
-    grams = np.einsum("nka,nckl,nlb->ncab", turn, base.grams, turn, optimize=True)
-    return grams, problem, replace(state, theta=theta)
+    cross_products = np.einsum("nka,nckl,nlb->ncab", turn, base.cross_products, turn, optimize=True)
+    return cross_products, problem, replace(state, theta=theta)
 
 
 def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
@@ -269,11 +271,11 @@ def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
 
     Columns are those of the trials' own numbers, the keys, the shapes of smooth errors, the residual.
     """
-    count, size = len(old.keys), OWN + len(layout.keys) + shapes + 1
-    turn = np.zeros((len(layout.index), OWN + count + shapes + 1, size))
-    turn[:, range(OWN), range(OWN)] = 1.0
+    count, size = len(old.keys), N_TRIAL_EFFECTS + len(layout.keys) + shapes + 1
+    turn = np.zeros((len(layout.index), N_TRIAL_EFFECTS + count + shapes + 1, size))
+    turn[:, range(N_TRIAL_EFFECTS), range(N_TRIAL_EFFECTS)] = 1.0
     behind = np.arange(shapes + 1)
-    turn[:, OWN + count + behind, OWN + len(layout.keys) + behind] = 1.0
+    turn[:, N_TRIAL_EFFECTS + count + behind, N_TRIAL_EFFECTS + len(layout.keys) + behind] = 1.0
     before_scale = np.array([number.scale for number in old.free] + [1.0])
     scale = np.array([number.scale for number in layout.free] + [0.0])
     logarithmic = np.array([number.logarithmic for number in layout.free] + [False])
@@ -281,9 +283,9 @@ def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
         term, place = layout.term(key), layout.index[:, column]
         if term is not None and key not in old.keys:
             source = PRESSURE if term.pressure else DAMPING_DEVIATION
-            turn[:, source, OWN + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
+            turn[:, source, N_TRIAL_EFFECTS + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
             continue
         former = old.keys.index(key)
         ratio = scale[place] / before_scale[old.index[:, former]]
-        turn[:, OWN + former, OWN + column] = np.where(logarithmic[place], 1.0, ratio)
+        turn[:, N_TRIAL_EFFECTS + former, N_TRIAL_EFFECTS + column] = np.where(logarithmic[place], 1.0, ratio)
     return turn

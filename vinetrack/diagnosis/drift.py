@@ -28,7 +28,7 @@ from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.constancy_tests import CONDITIONS, Against, ConstancyTest, Sums, as_deviate, constancy, sums_of
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, lay, per_trial_estimates
-from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
+from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
@@ -368,7 +368,7 @@ def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
 
 def _alone(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
     """Every vine of several pressures fitted alone; trials scatter as replicates do."""
-    spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
+    spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
     state = replace(fit.solution.state, spread=spread)
     honest = replace(fit, solution=replace(fit.solution, state=state))
     for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):

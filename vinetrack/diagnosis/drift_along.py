@@ -94,7 +94,7 @@ def _halves(fit: Fit, laid: AlignedTrial, trial_effects: Floats) -> _Halves:
     deviation = np.full((len(data), 2), math.nan)
     for i, answers in enumerate(push_sensitivities(fit, trial_effects, motions, pushes)):
         others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
-        if laid.predictor.feels_damping[i] and np.all(np.ptp(answers, axis=0) > 0):
+        if laid.predictor.has_damping_deviation[i] and np.all(np.ptp(answers, axis=0) > 0):
             deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
     return _Halves(tuple(trial_data.trial for trial_data in data), deviation + trial_effects[:, [DAMPING_DEVIATION]])
 

@@ -62,7 +62,7 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
     -------
     EffectSensitivities
     """
-    plain = fit.predictor.unmoved(fit.solution.state.theta, fit.solution.state.trial_effects)
+    plain = fit.predictor.trajectories_at(fit.solution.state.theta, fit.solution.state.trial_effects)
     kept: list[tuple[CandidateShape, list[Floats]]] = []
     heard: set[str] = set()
     names = dict.fromkeys(shape.effect.name for shape in shapes)

@@ -26,9 +26,9 @@ from vinetrack.diagnosis.shape_products import Products, products_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import FitState, solve_each, trial_effect_prior
+from vinetrack.inference.mixed_effects import FitState, solve_per_trial, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.trajectory_jobs import Jobs
 from vinetrack.inference.whitening import at_correlation
@@ -171,7 +171,7 @@ def score_ratio(questions: MisfitTests, place: int, size: float, start: Noiseles
         systematics = systematics_of(after.predictor, after.solution, after.trials)
         # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
         scores = scores_of(
-            after, products_of(after, systematics.put_back(after.solution.columns), answers, systematics)
+            after, products_of(after, systematics.at_zero_errors(after.solution.columns), answers, systematics)
         )
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
@@ -214,14 +214,21 @@ def displacements(fit: Fit, sums: Products) -> Floats:
     problem, state, n_shapes = fit.solution.problem, fit.state, sums.n_shapes
     levers = np.vstack([projected(fit, sums, state).lever[:, :n_shapes], np.zeros((1, n_shapes))])[problem.index]
     precision = trial_effect_prior(problem, state)[1]
-    keys, shapes = slice(OWN, OWN + sums.n_keys), slice(OWN + sums.n_keys + 1, OWN + sums.n_keys + 1 + n_shapes)
+    keys, shapes = (
+        slice(N_TRIAL_EFFECTS, N_TRIAL_EFFECTS + sums.n_keys),
+        slice(N_TRIAL_EFFECTS + sums.n_keys + 1, N_TRIAL_EFFECTS + sums.n_keys + 1 + n_shapes),
+    )
     largest = []
     for part in sums.parts:
-        white = at_correlation(sums.grams(part), state.rho) / state.variance[part, None, None]
-        within_trial = white[:, :OWN, :OWN] + precision[part][:, :, None] * np.eye(OWN)
-        deviations = solve_each(within_trial, white[:, :OWN, shapes] - white[:, :OWN, keys] @ levers[part])
+        white = at_correlation(sums.cross_products(part), state.rho) / state.variance[part, None, None]
+        within_trial = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[part][:, :, None] * np.eye(
+            N_TRIAL_EFFECTS
+        )
+        deviations = solve_per_trial(
+            within_trial, white[:, :N_TRIAL_EFFECTS, shapes] - white[:, :N_TRIAL_EFFECTS, keys] @ levers[part]
+        )
         largest += [
-            np.max(np.abs(columns[:, shapes] - columns[:, :OWN] @ mine - columns[:, keys] @ shared), axis=0)
+            np.max(np.abs(columns[:, shapes] - columns[:, :N_TRIAL_EFFECTS] @ mine - columns[:, keys] @ shared), axis=0)
             for columns, mine, shared in zip(sums.columns[part], deviations, levers[part], strict=True)
         ]
     return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))

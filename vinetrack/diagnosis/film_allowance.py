@@ -11,7 +11,7 @@ from __future__ import annotations
 from vinetrack.diagnosis.between_gain import beside
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
+from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
 from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.systematics import film_errors
@@ -32,7 +32,7 @@ def film_gain(fit: Fit) -> float:
     if FILM in fit.model or is_poor_fit(fit.predictor, fit.solution):
         return 0.0
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    if not errors.n_felt:
+    if not errors.n_columns:
         return 0.0
     base = with_smooth_errors(fit)
     return max(_deviance(base, base) - _deviance(beside(fit, base, errors), base), 0.0)
@@ -40,6 +40,10 @@ def film_gain(fit: Fit) -> float:
 
 def _deviance(solution: Solution, base: Solution) -> float:
     """−2 ln L of a solution, its numbers and the spreads between trials that `base` estimates at their best."""
-    part, problem, state = marginal(solution.grams, solution.problem, solution.state), solution.problem, solution.state
-    spread = estimate_spreads(part, problem, state, base.estimable, restricted=False)
+    part, problem, state = (
+        marginal(solution.cross_products, solution.problem, solution.state),
+        solution.problem,
+        solution.state,
+    )
+    spread = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
     return deviance(part, problem, state, spread, restricted=False)

@@ -18,7 +18,7 @@ from vinetrack.diagnosis.force_refinement import Normal, Place
 from vinetrack.diagnosis.force_surface import AMPLITUDES, ANY, FOLLOWED, LENGTHS, Domain, Surface, standard_error
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
 
-SILENT = 1e-8
+LEAST_INFORMATION = 1e-8
 """Information below which a direction is not told apart from others, where each number alone has 1. Derived: sums of
 squares are rounded at 1e-14 of the largest, and the score of such a direction at its root."""
 
@@ -171,12 +171,12 @@ def posterior(place: Place, normal: Normal) -> Posterior:
     beside = np.concatenate([np.arange(p), np.arange(p + q, slope.size)])
     beside = beside[size[beside] > 0]
     values, directions = np.linalg.eigh(square[np.ix_(beside, beside)])
-    told = values > SILENT
+    told = values > LEAST_INFORMATION
     root = directions[:, told] / np.sqrt(values[told])
     cross, along = root.T @ square[np.ix_(beside, force)], root.T @ slope[beside]
     strength, ways = np.linalg.eigh(square[np.ix_(force, force)] - cross.T @ cross)
     # What other numbers do as well is known no better than numbers are rounded.
-    ways, strength = ways[:, strength > SILENT], strength[strength > SILENT]
+    ways, strength = ways[:, strength > LEAST_INFORMATION], strength[strength > LEAST_INFORMATION]
     scale = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)
     back = scale[:, None] * ways
     heard = ways.T @ (slope[force] - cross.T @ along)

@@ -11,12 +11,12 @@ from functools import cached_property
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
+from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.inference.fit_problem import floor, track_correlation
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import SPREAD_COLUMNS, FitState, trial_effect_prior
+from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, FitState, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import whiten
 
 PER_TRIAL = 10.0
@@ -26,7 +26,7 @@ times of a tenth of a recording; half or twice moves the error of a force by 1.4
 OWN_ITERATIONS = 8
 """Iterations of the trial effects at most. Chosen."""
 
-SILENT = 1e-9
+LEAST_INFORMATION = 1e-9
 """Part of the largest information below which a force moves nothing, or only what others move too. Chosen far below
 anything of weight."""
 
@@ -66,7 +66,7 @@ class ForceFit:
         rho = track_correlation(data)
         noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
         self.scatter = scatter
-        spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
+        spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
         before = fit.solution.state
         state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, floor(data)))
         still = replace(problem, free=np.zeros_like(problem.free))
@@ -88,12 +88,19 @@ class ForceFit:
         """Products of [keys, forces, residual] of every trial, its own numbers eliminated."""
         blocks = []
         for i, (columns, more) in enumerate(zip(self.columns, answers, strict=True)):
-            left = columns[:, -1] + columns[:, list(SPREAD_COLUMNS)] @ self.state.trial_effects[i, list(SPREAD_COLUMNS)]
+            left = (
+                columns[:, -1]
+                + columns[:, list(DEVIATION_COLUMNS)] @ self.state.trial_effects[i, list(DEVIATION_COLUMNS)]
+            )
             rows = np.column_stack([columns[:, :-1], more, left])
             white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
             gram = white.T @ white / self.state.variance[i]
-            within_trial = gram[:OWN, :OWN] + np.diag(self.precision[i])
-            blocks.append(gram[OWN:, OWN:] - gram[OWN:, :OWN] @ np.linalg.solve(within_trial, gram[:OWN, OWN:]))
+            within_trial = gram[:N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(self.precision[i])
+            blocks.append(
+                gram[N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:]
+                - gram[N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS]
+                @ np.linalg.solve(within_trial, gram[:N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:])
+            )
         return np.array(blocks)
 
     def _spread(self, blocks: Floats) -> tuple[Floats, Floats, Floats]:
@@ -139,11 +146,11 @@ class ForceFit:
     def _gain(self, blocks: Floats, lever: Floats, left: Floats, place: slice) -> Gain:
         information, score = left[place, place], left[place, -1]
         size = np.diag(information)
-        heard = size > SILENT * max(float(size.max()), 1e-300)
+        heard = size > LEAST_INFORMATION * max(float(size.max()), 1e-300)
         if not heard.any():
             return Gain(0.0, np.zeros(score.size), math.inf, np.zeros(lever.shape[0]), 0)
         scale = np.where(heard, 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
-        covariance = np.linalg.pinv(information * scale[:, None] * scale, rcond=SILENT, hermitian=True)
+        covariance = np.linalg.pinv(information * scale[:, None] * scale, rcond=LEAST_INFORMATION, hermitian=True)
         covariance = covariance * scale[:, None] * scale
         amplitude = covariance @ score
         numbers = lever[:, -1] - lever[:, place] @ amplitude

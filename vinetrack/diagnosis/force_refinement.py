@@ -31,7 +31,7 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.parameters import YIELD_PRESSURE
-from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE
+from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, RELEASE
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import whiten
 
@@ -248,7 +248,7 @@ def normal_equations(model_fit: Fit, fit: ForceFit, place: Place) -> Normal:
     p, n = theta.size, trial_effects.shape[0]
     columns = push_sensitivities(model_fit, trial_effects, place.motions, _pushes(model_fit, place))
     centre, precision = trial_effect_prior(fit.problem, fit.state)
-    size = p + q + s + n * OWN
+    size = p + q + s + n * N_TRIAL_EFFECTS
     square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     cost = float(np.sum(precision * (trial_effects - centre) ** 2))
     cost += float(np.sum(fit.problem.prior_precision * (theta - fit.problem.prior_mean) ** 2))
@@ -267,7 +267,7 @@ def normal_equations(model_fit: Fit, fit: ForceFit, place: Place) -> Normal:
             fit.state.variance[i]
         )
         gram = white.T @ white
-        mine = p + q + s + i * OWN + np.arange(OWN)
+        mine = p + q + s + i * N_TRIAL_EFFECTS + np.arange(N_TRIAL_EFFECTS)
         keys = np.where(fit.problem.index[i] >= 0, fit.problem.index[i], size)
         index = np.concatenate([keys, p + np.arange(q + s), mine])
         square[np.ix_(index, index)] += gram[:-1, :-1]
@@ -328,14 +328,18 @@ def _pushes(fit: Fit, place: Place) -> list[Floats]:
                 varied.append(job)
                 continue
             at = theta[layout.index[i, column]]
-            change = number.outside(at + SMALL) - number.outside(at)
+            change = number.from_scaled(at + SMALL) - number.from_scaled(at)
             if key == YIELD_PRESSURE:
                 varied.append(job._replace(yield_pressure_Pa=job.yield_pressure_Pa + change))
             else:
                 k = layout.model.parameter_names.index(key)
-                factor = number.outside(at + SMALL) / number.outside(at) if number.logarithmic else 0.0
+                factor = number.from_scaled(at + SMALL) / number.from_scaled(at) if number.logarithmic else 0.0
                 varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
-        felt = [fit.predictor.feels_pressure[i], fit.predictor.feels_damping[i], *[True] * len(layout.keys)]
+        felt = [
+            fit.predictor.has_pressure_deviation[i],
+            fit.predictor.has_damping_deviation[i],
+            *[True] * len(layout.keys),
+        ]
         changes = [
             (_acceleration(fit, place, motion, moved) - motion.free) / SMALL
             if feels and moved is not job
@@ -388,7 +392,7 @@ def _stepped(fit: ForceFit, place: Place, normal: Normal, damping: float, *, sha
         law = law.shifted(name, float(np.clip(step[p + q + k], -reach, reach)))
     law = law.kept_inside(max(float(motion.lead_position_m.max()) for motion in place.motions))
     reach_s = 2 * np.array([trial_data.frame_s for trial_data in fit.data])
-    trial_effects = place.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, OWN)
+    trial_effects = place.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, N_TRIAL_EFFECTS)
     trial_effects[:, RELEASE] = place.trial_effects[:, RELEASE] + np.clip(
         trial_effects[:, RELEASE] - place.trial_effects[:, RELEASE], -reach_s, reach_s
     )

@@ -338,8 +338,8 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
         index=problem.index[where],
         feels=problem.feels[where],
         gauge_error=problem.gauge_error[where],
-        own_centre=problem.own_centre[where],
-        own_precision=problem.own_precision[where],
+        release_origin_mean=problem.release_origin_mean[where],
+        release_origin_precision=problem.release_origin_precision[where],
         points=problem.points[where],
         stretches=problem.stretches[where],
     )
@@ -348,7 +348,7 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
         fit.solution,
         state=here,
         problem=smaller,
-        grams=fit.solution.grams[where],
+        cross_products=fit.solution.cross_products[where],
         columns=tuple(fit.solution.columns[k] for k in where),
     )
     part = replace(fit, predictor=predictor, solution=solution, trials=tuple(fit.trials[k] for k in where), smooth=None)

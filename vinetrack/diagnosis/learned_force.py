@@ -151,7 +151,7 @@ def learned_force(
         return None
     largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
     effects = np.zeros_like(fit.trial_effects)
-    effects[:, : fit.problem.own_centre.shape[1]] = fit.problem.own_centre
+    effects[:, : fit.problem.release_origin_mean.shape[1]] = fit.problem.release_origin_mean
     motions = on_tracks(fit, effects, motions_of(model_fit, effects))
     begins = [
         Place(fit.state.theta, effects, surface, np.zeros(surface.domain.size), list(motions), driven=False)

@@ -325,7 +325,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     answers = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
-    columns = systematics.put_back(fit_columns(fit))
+    columns = systematics.at_zero_errors(fit_columns(fit))
     sums = products_of(fit, columns, answers, systematics)
     structure = structure_of(fit, columns, systematics)
     return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure, level)

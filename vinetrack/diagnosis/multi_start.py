@@ -148,7 +148,7 @@ class SubsetFitter:
             problem = make_problem(predictor, trial_effects)
             state = first_state(self.data, theta, trial_effects)
             solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations, search=search)
-            part = marginal(solution.grams, solution.problem, solution.state)
+            part = marginal(solution.cross_products, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
         level = deviance(part, solution.problem, solution.state, CLIMB_SPREADS, restricted=False)

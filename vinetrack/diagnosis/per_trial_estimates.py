@@ -11,7 +11,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.left_out import laid_on, rest_is_seen
+from vinetrack.inference.left_out import aligned_to_trials, rest_is_seen
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
 
@@ -81,7 +81,7 @@ def lay(fit: Fit) -> AlignedTrial:
     FitError
         If it cannot be followed.
     """
-    predictor, trial_effects, _ = laid_on(fit, fit.predictor.data, from_rest=True)
+    predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
     try:
         return AlignedTrial(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
     except SimulationError as error:

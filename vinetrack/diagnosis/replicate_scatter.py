@@ -26,7 +26,7 @@ FIRST_GUESS = (0.01, 0.03, 0.2)
 LEAST, LARGEST = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
 """Chosen: from exact to worse than any rig; the search never ends there where replicates tell anything."""
 
-LEAST_SPREAD = (0.005, 0.015)
+LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
 """Of pressure and B, for whoever needs both: replicates tell their sum much better than either. Chosen: half of a
 usual scatter."""
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.left_out import FEWEST_AT_REST, told_apart
+from vinetrack.inference.left_out import FEWEST_AT_REST, scaled_least_squares
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 from vinetrack.tracks.wild_points import FEWEST_POINTS, local_fit
 
@@ -142,7 +142,7 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     """
     rests = [frames_at_rest(trial) for trial in trials]
     release_s, origin_m = (np.array(values) for values in zip(*map(_begin, trials, rests), strict=True))
-    seen = np.array([n > 0 or trial.vague_rest is not None for trial, n in zip(trials, rests, strict=True)])
+    seen = np.array([n > 0 or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)])
     longest = int(np.argmax([trial.time_s[-1] - at for trial, at in zip(trials, release_s, strict=True)]))
     reference = _reference(trials[longest], float(release_s[longest]), float(origin_m[longest]))
     for i, trial in enumerate(trials):
@@ -154,7 +154,7 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     time_s = begin_s + frame_s.min() * np.arange(math.floor((end_s - begin_s) / frame_s.min() + 1e-6) + 1)
     speed_m_s = np.gradient(reference.at(time_s), time_s)
     at_rest = np.array(
-        [n >= FEWEST_AT_REST or trial.vague_rest is not None for trial, n in zip(trials, rests, strict=True)]
+        [n >= FEWEST_AT_REST or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)]
     )
     earliest_s, latest_s = np.array([_within_reach(trial, reference) for trial in trials]).T
     for _ in range(MOST_ROUNDS):
@@ -208,8 +208,8 @@ def _reference(trial: TrialFit, release_s: float, origin_m: float) -> _Reference
 
 def _begin(trial: TrialFit, n_rest: int) -> tuple[float, float]:
     """When a trial begins to move, s, and from where, m, by its rest; its first frame where no rest was seen."""
-    if n_rest == 0 and trial.vague_rest is not None:
-        return trial.vague_rest.release_s, trial.vague_rest.origin_m
+    if n_rest == 0 and trial.imprecise_rest is not None:
+        return trial.imprecise_rest.release_s, trial.imprecise_rest.origin_m
     return float(trial.time_s[max(n_rest - 1, 0)]), float(np.mean(trial.lead_position_m[: max(n_rest, 1)]))
 
 
@@ -259,7 +259,7 @@ def _shifts(deviation_m: Floats, speed_m_s: Floats, at_rest: Floats) -> tuple[Fl
         if np.count_nonzero(use) > 2:
             free = 0.0 if at_rest[i] else 1.0
             design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-            shifts[:, i] = told_apart(design, left_m[use], TELLS_APART)
+            shifts[:, i] = scaled_least_squares(design, left_m[use], TELLS_APART)
     return shifts[0], shifts[1]
 
 

@@ -23,17 +23,17 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.shape_products import Products, blocks_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
-    LEAST_SPREAD,
+    LEAST_BETWEEN_TRIAL_SD,
     FitState,
-    cross_products,
-    cross_products_vector,
-    inverse_among,
-    solve_each,
+    sum_matrix_blocks,
+    sum_vector_blocks,
+    inverse_of_block,
+    solve_per_trial,
 )
 from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes
-from vinetrack.inference.robust_covariance import scatter_of
-from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.robust_covariance import cluster_variance
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import at_correlation
 
 IMITATED = 1e-9
@@ -77,7 +77,7 @@ class Scores:
         """Its error by how much the scores of single trials scatter, once the size has explained its part of them."""
         diagonal = np.diag(self.information)
         left = self.scores - np.einsum("njj->nj", self.informations) * self.size
-        scatter = np.sqrt(scatter_of(left, self.degrees))
+        scatter = np.sqrt(cluster_variance(left, self.degrees))
         return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
 
     @property
@@ -127,10 +127,8 @@ def projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_asked
     X, r, C = slice(0, p), p, slice(p + 1, None)
     blocks, places = blocks_of(fit, sums, state), sums.asked
-    square = cross_products(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
-    slope = cross_products_vector(blocks[:, X, r], problem) - problem.prior_precision * (
-        state.theta - problem.prior_mean
-    )
+    square = sum_matrix_blocks(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
+    slope = sum_vector_blocks(blocks[:, X, r], problem) - problem.prior_precision * (state.theta - problem.prior_mean)
     # What a trial does not feel, number or error, is counted in a last row and column, and left out.
     cross, total, score = np.zeros((size + 1, asked + 1)), np.zeros((asked + 1, asked + 1)), np.zeros(asked + 1)
     np.add.at(cross, (problem.index[:, :, None], places[:, None, :]), blocks[:, X, C])
@@ -139,7 +137,7 @@ def projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     np.add.at(score, places, blocks[:, C, r])
     cross, total, score = cross[:size, :asked], total[:asked, :asked], score[:asked]
     moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
-    inverse = inverse_among(square, moving)
+    inverse = inverse_of_block(square, moving)
     lever, step = inverse @ cross, inverse @ slope
     information, gone = _emptied(total - cross.T @ lever, total)
     score = score - cross.T @ step
@@ -245,11 +243,13 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
     whole, squares, levers = np.zeros((total, total)), [], []
     for part in sums.parts:
         # The residual tells nothing of the information.
-        grams = np.delete(np.delete(sums.grams(part), OWN + p, axis=2), OWN + p, axis=3)
-        white = at_correlation(grams, state.rho) / state.variance[part, None, None]
-        flat = white[:, :2, :2] + problem.own_precision[part, :, None] * np.eye(2)
-        left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
-        whole += cross_products(left[:, 2:, 2:], replace(problem, index=problem.index[part]))
+        cross_products = np.delete(
+            np.delete(sums.cross_products(part), N_TRIAL_EFFECTS + p, axis=2), N_TRIAL_EFFECTS + p, axis=3
+        )
+        white = at_correlation(cross_products, state.rho) / state.variance[part, None, None]
+        flat = white[:, :2, :2] + problem.release_origin_precision[part, :, None] * np.eye(2)
+        left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(flat, white[:, :2, 2:])
+        whole += sum_matrix_blocks(left[:, 2:, 2:], replace(problem, index=problem.index[part]))
         lever = np.zeros((len(left), 2, total + 1))
         for k in range(index.shape[1]):
             lever[np.arange(len(left)), :, index[part, k]] += left[:, :2, 2 + k]
@@ -258,8 +258,8 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
     square, lever = np.concatenate(squares), np.concatenate(levers)
     alone = []
     for spread in spreads:
-        precision = 1 / np.maximum(spreads_of_trials(problem, spread), LEAST_SPREAD) ** 2
-        explained = solve_each(square + precision[:, :, None] * np.eye(2), lever)
+        precision = 1 / np.maximum(spreads_of_trials(problem, spread), LEAST_BETWEEN_TRIAL_SD) ** 2
+        explained = solve_per_trial(square + precision[:, :, None] * np.eye(2), lever)
         information = whole - lever.reshape(-1, total).T @ explained.reshape(-1, total)
         alone.append(np.diag(_alone(fit, information, sums.n_shapes)))
     return np.array(alone)
@@ -276,7 +276,7 @@ def _alone(fit: Fit, information: Floats, n_shapes: int) -> Floats:
     moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
     cross = information[:size, size:]
     known = information[size:, size:]
-    left, _ = _emptied(known - cross.T @ inverse_among(square, moving) @ cross, known)
+    left, _ = _emptied(known - cross.T @ inverse_of_block(square, moving) @ cross, known)
     return _beside_systematics(np.zeros(len(left)), left, _systematics_turn(left, n_shapes))[1]
 
 
@@ -355,9 +355,9 @@ def linear_gains(fit: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
 def _rest(fit: Fit, blocks: Floats, p: int, state: FitState) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
     problem = fit.solution.problem
-    square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
+    square = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     away = state.theta - problem.prior_mean
-    slope = cross_products_vector(blocks[:, :p, p], problem) - problem.prior_precision * away
+    slope = sum_vector_blocks(blocks[:, :p, p], problem) - problem.prior_precision * away
     step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
     whole = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * away**2))
     return max(float(whole - step @ slope), 1e-9 * float(whole))

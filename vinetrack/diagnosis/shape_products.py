@@ -18,7 +18,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effects_eliminated
-from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import all_products
 
@@ -32,7 +32,7 @@ class Products:
     """Columns of a fit and of answers, shape (n_points, n_columns) a trial, and the sums of their products.
 
     In order: own numbers, keys, residual, shapes, doubts. Of doubts a trial has those that it feels; `places`, shape
-    (n_trials, n_felt), tells which of the `n_doubts` they are, `n_doubts` for none.
+    (n_trials, n_columns), tells which of the `n_doubts` they are, `n_doubts` for none.
     """
 
     columns: tuple[Floats, ...]
@@ -49,7 +49,7 @@ class Products:
 
     @property
     def asked(self) -> NDArray[np.int_]:
-        """Place of each trial's shapes and doubts among all of them, shape (n_trials, n_shapes + n_felt).
+        """Place of each trial's shapes and doubts among all of them, shape (n_trials, n_shapes + n_columns).
 
         `n_asked` where a trial does not feel a doubt.
         """
@@ -61,7 +61,7 @@ class Products:
         """The trials in parts whose products are held at once."""
         return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
 
-    def grams(self, part: slice) -> Floats:
+    def cross_products(self, part: slice) -> Floats:
         """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
 
         Kept where there is one part; those of more would be three times as large as the columns.
@@ -140,8 +140,8 @@ def products_of(
     -------
     Products
     """
-    keys, shapes = columns[0].shape[1] - OWN - 1, len(answers.shapes)
-    of_shapes = slice(OWN + keys + 1, OWN + keys + 1 + shapes)
+    keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(answers.shapes)
+    of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
     whole: list[Floats] = []
     for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
         whole.append(np.column_stack([of_fit, answers.columns[i], systematic]))
@@ -160,19 +160,19 @@ def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
 
     Returns
     -------
-    array, shape (n_trials, n_keys + 1 + n_shapes + n_felt, the same again)
+    array, shape (n_trials, n_keys + 1 + n_shapes + n_columns, the same again)
     """
-    size = sums.columns[0].shape[1] - OWN
+    size = sums.columns[0].shape[1] - N_TRIAL_EFFECTS
     blocks = np.empty((len(sums.columns), size, size))
     for part in sums.parts:
         of_part = _of_trials(fit.solution.problem, state, part)
-        blocks[part] = trial_effects_eliminated(sums.grams(part), sums.n_keys, *of_part)
+        blocks[part] = trial_effects_eliminated(sums.cross_products(part), sums.n_keys, *of_part)
     return blocks
 
 
 def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
     """Problem and state of a part of the trials."""
-    arrays = ("index", "feels", "gauge_error", "own_centre", "own_precision", "points", "stretches")
+    arrays = ("index", "feels", "gauge_error", "release_origin_mean", "release_origin_precision", "points", "stretches")
     return (
         replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
         replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),

@@ -18,7 +18,7 @@ from vinetrack.diagnosis.initial_fit import probe
 from vinetrack.diagnosis.score_test import Scores, scores_of
 from vinetrack.diagnosis.shape_products import products_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.robust_covariance import scatter_of
+from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.systematics import Systematics
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
@@ -112,7 +112,7 @@ def structure_in(scores: Scores) -> Structure:
     turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
     single = scores.scores[:, live] @ turn
     explained = np.einsum("jk,njl,lk->nk", turn, scores.informations[:, live][:, :, live], turn) * along
-    robust = scatter_of(single - explained, scores.degrees)
+    robust = cluster_variance(single - explained, scores.degrees)
     chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0

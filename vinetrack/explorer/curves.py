@@ -19,7 +19,7 @@ from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.explorer.campaign import Campaign, ShownTrial
-from vinetrack.inference.left_out import TOLD_APART, told_apart
+from vinetrack.inference.left_out import TOLD_APART, scaled_least_squares
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
 GRID_POINTS = 500
@@ -182,7 +182,7 @@ def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, flo
         square = float(slope @ slope)
         return (float(slope @ left) / square if square > 0 else 0.0), 0.0
     design = np.column_stack([slope, np.ones(slope.size)])
-    later, higher = told_apart(design, left, math.sqrt(TOLD_APART))
+    later, higher = scaled_least_squares(design, left, math.sqrt(TOLD_APART))
     return float(later), float(higher)
 
 

@@ -375,10 +375,12 @@ class FitProgress:
         step : the last one of the fit.
         """
         self._step = step
-        if math.isfinite(step.promised) and step.promised > 0:
-            self._largest = max(self._largest, step.promised)
+        if math.isfinite(step.predicted_decrease) and step.predicted_decrease > 0:
+            self._largest = max(self._largest, step.predicted_decrease)
             whole = math.log10(max(self._largest, 10 * SETTLED_DECREASE) / SETTLED_DECREASE)
-            done = math.log10(max(self._largest, step.promised) / max(step.promised, SETTLED_DECREASE))
+            done = math.log10(
+                max(self._largest, step.predicted_decrease) / max(step.predicted_decrease, SETTLED_DECREASE)
+            )
             self._share = max(self._share, min(done / whole, 0.97))
 
     def state(self, now: float, about: str, other: Step | None = None) -> tuple[float, str]:
@@ -398,9 +400,11 @@ class FitProgress:
         step = other or self._step
         where = f" · step {step.iteration}" if step is not None else ""
         promise = ""
-        if step is not None and math.isfinite(step.promised):
+        if step is not None and math.isfinite(step.predicted_decrease):
             promise = (
-                f" · the next lowers −2 ln L by {step.promised:,.2g}" if step.promised < 1e4 else " · still far off"
+                f" · the next lowers −2 ln L by {step.predicted_decrease:,.2g}"
+                if step.predicted_decrease < 1e4
+                else " · still far off"
             )
         return self._share, f"{about}{where}{promise} · {now - self._begun:.1f} s"
 

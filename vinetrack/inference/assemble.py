@@ -15,16 +15,16 @@ from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model, values_by_key
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
-from vinetrack.inference.intervals import Precision, among_first, near_bound, precision, profile_interval, student
-from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
+from vinetrack.inference.intervals import Precision, first_parameters, near_bound, precision, profile_interval, student
+from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
 from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.optimiser import Solution, chi2_per_dof
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
-from vinetrack.inference.robust_covariance import few_trials, widened_covariance
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.trace_errors import mended_Pa, penalty
+from vinetrack.inference.robust_covariance import too_few_clusters, widened_covariance
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.trace_errors import trace_correction_Pa, penalty
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
@@ -85,14 +85,14 @@ def assemble(
     smooth = smooth_errors(predictor, solution, options.get("held"))
     wide = smooth.solution if smooth else solution
     by_noise = precision(wide)
-    trials = _trial_fits(predictor, solution, among_first(by_noise, len(layout.free)))
+    trials = _trial_fits(predictor, solution, first_parameters(by_noise, len(layout.free)))
     pooled = _pooled(predictor, solution, options)
     if pooled is not None:
         wide, by_noise = pooled.solution, replace(by_noise, covariance=_with_unknown(pooled.covariance, by_noise))
     if smooth is not None:
         trials = _beside_smooth_errors(trials, smooth)
     known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None, pooled)
-    by_noise, known = (among_first(each, len(layout.free)) for each in (by_noise, known))
+    by_noise, known = (first_parameters(each, len(layout.free)) for each in (by_noise, known))
     numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
     between = _outside(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
@@ -158,7 +158,7 @@ def _pooled(predictor: Predictor, solution: Solution, options: Mapping[str, Any]
     held = options.get("held")
     if held is not None and held.noise is not None:
         return None
-    if few_trials(predictor, solution) or not solution.problem.feels.any():
+    if too_few_clusters(predictor, solution) or not solution.problem.feels.any():
         return pool(predictor, solution, len(predictor.layout.free))
     return None
 
@@ -197,8 +197,8 @@ def log_likelihood(solution: Solution) -> float:
     -------
     float
     """
-    part = marginal(solution.grams, solution.problem, solution.state)
-    spread = estimate_spreads(part, solution.problem, solution.state, solution.estimable, restricted=False)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    spread = estimate_between_trial_sd(part, solution.problem, solution.state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, solution.problem, solution.state, spread, restricted=False)
 
 
@@ -246,8 +246,8 @@ def _numbers(
                 vine=number.vine,
                 symbol=number.symbol,
                 unit=number.unit,
-                value=number.outside(float(theta[k])),
-                sigma=float(sigma[k]) * number.slope(number.outside(float(theta[k]))),
+                value=number.from_scaled(float(theta[k])),
+                sigma=float(sigma[k]) * number.derivative(number.from_scaled(float(theta[k]))),
                 low=_bound_outside(number, low),
                 high=_bound_outside(number, high),
                 dof=float(dof[k]),
@@ -261,24 +261,24 @@ def _numbers(
 
 
 def _bound_outside(number: FreeParameter, theta: float) -> float:
-    return number.outside(float(theta)) if math.isfinite(theta) else math.inf * theta
+    return number.from_scaled(float(theta)) if math.isfinite(theta) else math.inf * theta
 
 
 def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
-    slopes = np.array([free.slope(number.value) for free, number in zip(layout.free, numbers, strict=True)])
+    slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     return np.asarray(covariance * slopes[:, None] * slopes)
 
 
 def _own_sigma(solution: Solution, known: Precision) -> Floats:
     """Standard errors of each trial's own numbers, shape (n_trials, 4), those of the shared numbers included."""
     problem, state = solution.problem, solution.state
-    white = at_correlation(solution.grams, state.rho) / state.variance[:, None, None]
+    white = at_correlation(solution.cross_products, state.rho) / state.variance[:, None, None]
     precision_own = trial_effect_prior(problem, state)[1]
-    square = white[:, :OWN, :OWN] + precision_own[:, :, None] * np.eye(OWN)
+    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision_own[:, :, None] * np.eye(N_TRIAL_EFFECTS)
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(OWN)
+    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(N_TRIAL_EFFECTS)
     inverse = np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :]
-    lever = inverse @ white[:, :OWN, OWN:-1]
+    lever = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
     shared = np.zeros((state.theta.size + 1,) * 2)
     shared[:-1, :-1] = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
     mine = shared[problem.index[:, :, None], problem.index[:, None, :]]
@@ -291,7 +291,7 @@ def _own_sigma(solution: Solution, known: Precision) -> Floats:
 
 def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
     state, sigma = solution.state, _own_sigma(solution, known)
-    moved = predictor.unmoved(state.theta, state.trial_effects)
+    moved = predictor.trajectories_at(state.theta, state.trial_effects)
     return tuple(
         trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
                   moved[i].lead_velocity_m_s, state.rho,
@@ -351,7 +351,7 @@ def trial_fit(
         damping_deviation=math.expm1(trial_effects[DAMPING_DEVIATION]),
         damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
         noise_m=math.sqrt(variance / (1 - rho**2)),
-        vague_rest=trial_data.vague_rest,
+        imprecise_rest=trial_data.imprecise_rest,
     )
 
 
@@ -366,7 +366,7 @@ def _messages(
         )
     for k, number in enumerate(numbers):
         free = layout.free[k]
-        if known.silent[k]:
+        if known.insensitive[k]:
             messages.append(
                 f"{number.title} ({number.key}) never moved the trajectories: it stays at {number.value:.4g}"
             )
@@ -378,8 +378,8 @@ def _messages(
             wider = number.sigma > WIDENED * free.prior_sd
             why = "; they disagree by more than their noise, so its error exceeds the sheet's" if wider else ""
             messages.append(f"{number.title}: the trajectories say no more than the sheet does{why}")
-    if known.tied.any():
-        titles = [f"{n.title} ({n.key})" for n, tied in zip(numbers, known.tied, strict=True) if tied]
+    if known.collinear.any():
+        titles = [f"{n.title} ({n.key})" for n, collinear in zip(numbers, known.collinear, strict=True) if collinear]
         messages.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
     messages += _close_pairs(numbers, known)
     for k, name in enumerate(SPREAD_NAMES):
@@ -408,7 +408,7 @@ def _smoothed(data: Sequence[FitTrial]) -> list[str]:
 
 def _mended(data: Sequence[FitTrial]) -> list[str]:
     """What is said of recorded pressures that the motion told better than their gauge."""
-    moved = [float(np.max(np.abs(mended_Pa(each)))) for each in data if each.trace_told is not None]
+    moved = [float(np.max(np.abs(trace_correction_Pa(each)))) for each in data if each.trace_error_sizes is not None]
     if not moved:
         return []
     trials = f"{len(moved)} trials" if len(moved) > 1 else "one trial"

@@ -15,7 +15,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.position_errors import with_smooth_errors
-from vinetrack.inference.robust_covariance import moved_by
+from vinetrack.inference.robust_covariance import parameter_shifts
 from vinetrack.inference.systematics import FILM_ERROR, film_errors
 
 FILM = "film_mass"
@@ -52,9 +52,9 @@ def film_influence(fit: Fit) -> Floats:
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    moved = moved_by(fit.predictor, with_smooth_errors(fit), errors)[: len(fit.numbers)]
+    moved = parameter_shifts(fit.predictor, with_smooth_errors(fit), errors)[: len(fit.numbers)]
     free = fit.predictor.layout.free
-    slopes = np.array([each.slope(number.value) for each, number in zip(free, fit.numbers, strict=True)])
+    slopes = np.array([each.derivative(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)
 
 

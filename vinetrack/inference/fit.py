@@ -32,7 +32,7 @@ from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects
-from vinetrack.inference.trace_errors import as_recorded, with_errors_told
+from vinetrack.inference.trace_errors import as_recorded, with_fitted_trace_errors
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -114,7 +114,7 @@ def fit(
     held = _held(spreads, noise, data)
     solution = solve_from_scratch(predictor, held, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
-    predictor, solution = with_errors_told(predictor, solution, held, watch=watch)
+    predictor, solution = with_fitted_trace_errors(predictor, solution, held, watch=watch)
     fitted = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
     return replace(fitted, pairs=tuple(pairs))
 
@@ -245,7 +245,7 @@ def refit(
     values = {number.name: number.value for number in before.numbers} | dict(yields_Pa or {})
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
-            theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))
+            theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))
     beside = before.state
     held = FixedTerms(beside.spread if hold_spreads else None, (beside.rho, beside.variance) if hold_noise else None)
     try:
@@ -274,7 +274,7 @@ def refit(
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     if led:
         solution = solve_again(predictor, solution, held, watch, thorough=thorough, goal=goal)
-    predictor, solution = with_errors_told(
+    predictor, solution = with_fitted_trace_errors(
         predictor, solution, held, most_iterations=most_iterations, watch=watch, search=not thorough
     )
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)

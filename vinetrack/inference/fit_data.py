@@ -80,7 +80,7 @@ class FitError(UserError, ValueError):
 
 
 @dataclass(frozen=True)
-class VagueRest:
+class ImpreciseRest:
     """A rest before the motion seen only vaguely, such as behind a door: when it ended, where it was, how surely."""
 
     release_s: float
@@ -94,10 +94,10 @@ class FitTrial:
 
     `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
-    `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
+    `imprecise_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
     pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
     wrong along the whole motion, the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are one standard
-    deviation each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_told`, shape (n_errors,),
+    deviation each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_error_sizes`, shape (n_errors,),
     is by how many of them it moved the trace from the recorded one (`vinetrack.inference.trace_errors`).
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
@@ -117,8 +117,8 @@ class FitTrial:
     gauge_error: float = 0.0
     trace_errors_Pa: Floats | None = None
     trace_is_curve: bool = False
-    trace_told: Floats | None = None
-    vague_rest: VagueRest | None = None
+    trace_error_sizes: Floats | None = None
+    imprecise_rest: ImpreciseRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
     stated_m: Floats | None = None
     slow_m: Floats | None = None
@@ -155,17 +155,17 @@ class FitTrial:
     @property
     def shows_rest(self) -> bool:
         """Whether anything is seen of the rest before the motion, be it only vaguely."""
-        return self.n_rest > 0 or self.vague_rest is not None
+        return self.n_rest > 0 or self.imprecise_rest is not None
 
     @property
     def rest_origin_m(self) -> float:
         """Where the edge rests before the motion, m; the mean of its points where they are in the fit."""
-        if self.vague_rest is not None:
-            return self.vague_rest.origin_m
+        if self.imprecise_rest is not None:
+            return self.imprecise_rest.origin_m
         return float(np.mean(self.lead_position_m[: self.n_rest]))
 
     @cached_property
-    def let_in(self) -> bool:
+    def pressurised_in_recording(self) -> bool:
         """Whether the pressure was let in while it was recorded: then the trace says what started the growth, and when.
 
         Nothing else holds the vine, and a release of its own would pass for a threshold.
@@ -207,11 +207,11 @@ def prepare_trial(
         or one that moves although its pressure cannot do it.
     """
     usable = track.usable & ~_nearing_end(trial, track)
-    vague, vague_rest = _vague(track, usable)
+    vague, imprecise_rest = _vague(track, usable)
     usable &= ~vague
     smoothing, rounding_m = (smoothing, rounding_m) if trial.video is None else (None, 0.0)
-    if rounding_m > 0 and vague_rest is None:
-        alike, vague_rest = _rounded_alike(track, usable, rounding_m)
+    if rounding_m > 0 and imprecise_rest is None:
+        alike, imprecise_rest = _rounded_alike(track, usable, rounding_m)
         usable &= ~alike
     smoothed_frame_s = 0.0
     if smoothing is not None:
@@ -237,7 +237,7 @@ def prepare_trial(
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
-    n_rest = 0 if vague_rest is not None else rest_points(position_m)
+    n_rest = 0 if imprecise_rest is not None else rest_points(position_m)
     moving = time_s.size - n_rest
     if 0 < moving < FEWEST_MOVING:
         raise FitError(
@@ -260,7 +260,7 @@ def prepare_trial(
         gauge_error=0.0 if quiet is None else _gauge_error(quiet, time_s[max(n_rest - 1, 0) :]),
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
         trace_is_curve=extended is not None and extended.is_curve,
-        vague_rest=vague_rest,
+        imprecise_rest=imprecise_rest,
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
@@ -298,7 +298,7 @@ def _gauge_error(quiet: QuietTrace, moving_s: Floats) -> float:
     return quiet.mean_error_Pa * math.sqrt(told.size / np.count_nonzero(told)) / typical_Pa
 
 
-def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:
+def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
     """Points whose own stated error is several times that of the others, such as an edge half behind the door.
 
     And what the rest before the motion still says where it is among them.
@@ -314,22 +314,22 @@ def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
     vague = known & (sigma_m > VAGUE * np.median(better_m))
     places = np.flatnonzero(usable)
     at_rest = places[: rest_points(track.lead_position_m[places])]
-    vague_rest = None
+    imprecise_rest = None
     if 0 < at_rest.size < places.size and np.mean(vague[at_rest]) > MOSTLY:
         # The few that are left of such a rest would hold the origin alone.
         vague[at_rest] = True
-        vague_rest = VagueRest(
+        imprecise_rest = ImpreciseRest(
             release_s=float(track.time_s[at_rest[-1]]),
             origin_m=float(np.median(track.lead_position_m[at_rest])),
             sigma_m=float(np.median(sigma_m[at_rest])),
         )
     enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
-    return (vague, vague_rest) if enough else (np.zeros(usable.size, dtype=bool), None)
+    return (vague, imprecise_rest) if enough else (np.zeros(usable.size, dtype=bool), None)
 
 
 def _rounded_alike(
     track: Track, usable: NDArray[np.bool_], rounding_m: float
-) -> tuple[NDArray[np.bool_], VagueRest | None]:
+) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
     """Points at standstill whose noise is too small to tell them from one another once they are rounded.
 
     All of them err by the same then: they tell no more than one of them does. What the rest before the motion says of
@@ -344,7 +344,7 @@ def _rounded_alike(
     alike[places[:n_rest]] = True
     stands = int(np.flatnonzero(y != y[-1])[-1]) + 1
     alike[places[stands + 1 :]] = True
-    return alike, VagueRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
+    return alike, ImpreciseRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
 
 
 def _undriven(trial: Trial) -> bool:

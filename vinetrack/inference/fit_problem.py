@@ -52,19 +52,21 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
     frames = np.array([trial_data.frame_s for trial_data in data])
     rests = np.array([trial_data.shows_rest for trial_data in data])
-    known = rests | np.array([trial_data.let_in for trial_data in data])
-    vague = np.array([0.0 if trial_data.vague_rest is None else trial_data.vague_rest.sigma_m for trial_data in data])
+    known = rests | np.array([trial_data.pressurised_in_recording for trial_data in data])
+    vague = np.array(
+        [0.0 if trial_data.imprecise_rest is None else trial_data.imprecise_rest.sigma_m for trial_data in data]
+    )
     release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
-    release_sd[[trial_data.let_in for trial_data in data]] = KNOWN_RELEASE_S
+    release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = KNOWN_RELEASE_S
     noise = np.array([trial_data.noise_m for trial_data in data])
     room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
     origin_sd = np.where(rests, room, 3 * spans)
     return MixedProblem(
         index=layout.index,
-        feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
+        feels=np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation]),
         gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
-        own_centre=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
-        own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
+        release_origin_mean=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
+        release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
         lower=lower,

@@ -14,7 +14,7 @@ from vinetrack.core.numbers import decimals, or_nan
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model
-from vinetrack.inference.fit_data import FitError, VagueRest
+from vinetrack.inference.fit_data import FitError, ImpreciseRest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,7 +128,7 @@ class TrialFit:
 
     `whitened` are residuals freed of their correlation and of smooth errors of position, in standard deviations.
     Deviations are relative, of the set pressure and of the vine's B. `band_m`, of a trial that was not in the fit, is
-    the half width of the 95 % band of its position about the prediction. `vague_rest` is the rest before the motion
+    the half width of the 95 % band of its position about the prediction. `imprecise_rest` is the rest before the motion
     where its points were left out.
     """
 
@@ -149,7 +149,7 @@ class TrialFit:
     damping_deviation_sigma: float
     noise_m: float
     band_m: Floats | None = None
-    vague_rest: VagueRest | None = None
+    imprecise_rest: ImpreciseRest | None = None
 
     @property
     def within_band(self) -> float:

@@ -24,7 +24,7 @@ from vinetrack.inference.sensitivity import Predictor
 SINGULAR = 1e-10
 """Smallest eigenvalue of an information matrix of unit diagonal at which two numbers can still be told apart."""
 
-SILENT = 1e-6
+LEAST_INFORMATION = 1e-6
 """Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number.
 Chosen far below anything of weight: a Δχ² of 1e-6 is an interval of a thousand scales."""
 
@@ -41,17 +41,17 @@ the interval is interpolated."""
 class Precision:
     """Covariance of the free numbers as the fit holds them, shape (n_free, n_free), infinite where nothing is known.
 
-    `degrees`, shape (n_free,), are those of freedom of the errors. `silent` marks numbers that move no trajectory,
-    `tied` those that only a sum or product with others fixes.
+    `degrees`, shape (n_free,), are those of freedom of the errors. `insensitive` marks numbers that move no trajectory,
+    `collinear` those that only a sum or product with others fixes.
     """
 
     covariance: Floats
     degrees: Floats
-    silent: np.ndarray
-    tied: np.ndarray
+    insensitive: np.ndarray
+    collinear: np.ndarray
 
 
-def among_first(known: Precision, count: int) -> Precision:
+def first_parameters(known: Precision, count: int) -> Precision:
     """What is known of the first `count` numbers, the others being integrated out.
 
     Parameters
@@ -64,7 +64,9 @@ def among_first(known: Precision, count: int) -> Precision:
     -------
     Precision
     """
-    return Precision(known.covariance[:count, :count], known.degrees[:count], known.silent[:count], known.tied[:count])
+    return Precision(
+        known.covariance[:count, :count], known.degrees[:count], known.insensitive[:count], known.collinear[:count]
+    )
 
 
 def precision(solution: Solution) -> Precision:
@@ -78,32 +80,32 @@ def precision(solution: Solution) -> Precision:
     -------
     Precision
     """
-    part = marginal(solution.grams, solution.problem, solution.state)
-    covariance, silent, tied = _covariance(part, solution.problem, solution.state, solution.state.spread)
-    return Precision(covariance, degrees_of_freedom(solution), silent, tied)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    covariance, insensitive, collinear = _covariance(part, solution.problem, solution.state, solution.state.spread)
+    return Precision(covariance, degrees_of_freedom(solution), insensitive, collinear)
 
 
 def _covariance(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, np.ndarray, np.ndarray]:
-    """Covariance of the free numbers, which of them are silent, and which are tied."""
+    """Covariance of the free numbers, which of them are insensitive, and which are collinear."""
     information = normal_equations(part, problem, state, spread)[0]
     diagonal = np.diag(information)
-    silent = problem.free & ~(diagonal > SILENT)
-    k = np.flatnonzero(problem.free & ~silent)
+    insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
+    k = np.flatnonzero(problem.free & ~insensitive)
     covariance = np.zeros_like(information)
-    tied = np.zeros(diagonal.size, dtype=bool)
+    collinear = np.zeros(diagonal.size, dtype=bool)
     if k.size:
         scale = 1 / np.sqrt(diagonal[k])
         values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
         singular = values < SINGULAR
         for column in np.flatnonzero(singular):
-            tied[k] |= np.abs(vectors[:, column]) > 0.1
+            collinear[k] |= np.abs(vectors[:, column]) > 0.1
         inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
         covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
-    unknown = np.flatnonzero(silent | tied)
+    unknown = np.flatnonzero(insensitive | collinear)
     covariance[unknown, unknown] = math.inf
-    return covariance, silent, tied
+    return covariance, insensitive, collinear
 
 
 def degrees_of_freedom(solution: Solution) -> Floats:
@@ -125,7 +127,7 @@ def degrees_of_freedom(solution: Solution) -> Floats:
     size = problem.prior_mean.size
     if not active:
         return np.full(size, math.inf)
-    part = marginal(solution.grams, problem, state)
+    part = marginal(solution.cross_products, problem, state)
 
     def moved(shifts: Floats) -> tuple[float, float]:
         spread = list(state.spread)
@@ -249,7 +251,7 @@ def profile_interval(
 
 
 def _lowest(solution: Solution) -> float:
-    part = marginal(solution.grams, solution.problem, solution.state)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
     return deviance(part, solution.problem, solution.state, solution.state.spread, restricted=False)
 
 
@@ -259,7 +261,7 @@ def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int
     free[place] = False
     theta = solution.state.theta.copy()
     step = value - theta[place]
-    part = marginal(solution.grams, solution.problem, solution.state)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
     covariance = _covariance(part, solution.problem, solution.state, solution.state.spread)[0]
     if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
         along = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)

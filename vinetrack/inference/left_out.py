@@ -19,7 +19,7 @@ from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     ORIGIN,
-    OWN,
+    N_TRIAL_EFFECTS,
     PRESSURE,
     RELEASE,
     RELEASE_STEP_FRAMES,
@@ -96,13 +96,13 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     """
     rho = 0.0 if from_rest else fit.noise_correlation
     variance = fit.noise_m**2 * (1 - rho**2)
-    predictor, trial_effects, square = laid_on(fit, data, from_rest=from_rest)
+    predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
     data = predictor.data
     try:
         moved = predictor.run(predictor.jobs(np.empty(0), trial_effects))
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
-    sigma = np.zeros((len(data), OWN))
+    sigma = np.zeros((len(data), N_TRIAL_EFFECTS))
     sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
     return [
         trial_fit(
@@ -118,7 +118,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     ]
 
 
-def laid_on(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
+def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
     """The fitted model laid on trials: see `predict_prepared`.
 
     Parameters
@@ -155,7 +155,7 @@ def laid_on(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Pre
     return predictor, trial_effects, square
 
 
-def told_apart(design: Floats, left: Floats, least: float) -> Floats:
+def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
     """Least squares of columns brought to one length, shape (n_columns,); what is hardly told apart is left alone.
 
     At constant speed a later release and a higher origin are one. `least` is the least singular value that counts.
@@ -188,7 +188,8 @@ def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     array of bool, shape (n_trials,)
     """
     return np.array(
-        [trial_data.n_rest >= FEWEST_AT_REST or trial_data.vague_rest is not None for trial_data in data], dtype=bool
+        [trial_data.n_rest >= FEWEST_AT_REST or trial_data.imprecise_rest is not None for trial_data in data],
+        dtype=bool,
     )
 
 
@@ -242,7 +243,7 @@ def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: 
     held = rest_is_seen(data) & from_rest
     trial_effects, square = trial_effects.copy(), np.zeros((len(data), 2, 2))
     trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    let_in = np.array([trial_data.let_in for trial_data in data], dtype=bool)
+    pressurised_in_recording = np.array([trial_data.pressurised_in_recording for trial_data in data], dtype=bool)
     for i in np.flatnonzero(held).tolist():
         trial_effects[i, ORIGIN] = data[i].rest_origin_m
     moving = np.arange(len(data))
@@ -250,10 +251,10 @@ def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: 
         sums = _sums(predictor, trial_effects, moving, rho)
         square[moving] = sums[:, :2, :2]
         sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
-        sums[let_in[moving], RELEASE, :] = sums[let_in[moving], :, RELEASE] = 0.0
+        sums[pressurised_in_recording[moving], RELEASE, :] = sums[pressurised_in_recording[moving], :, RELEASE] = 0.0
         # At constant speed a later release and a higher origin are one: brought to a unit diagonal that is seen.
         scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
-        scale[held[moving], ORIGIN] = scale[let_in[moving], RELEASE] = 0.0
+        scale[held[moving], ORIGIN] = scale[pressurised_in_recording[moving], RELEASE] = 0.0
         even = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
         inverse = np.linalg.pinv(even, rcond=TOLD_APART, hermitian=True) * scale[:, :, None] * scale[:, None, :]
         step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])

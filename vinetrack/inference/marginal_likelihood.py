@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.mixed_effects import (
-    LEAST_SPREAD,
+    LEAST_BETWEEN_TRIAL_SD,
     FitState,
     MixedProblem,
     bounded_solve,
-    put_back,
-    solve_each,
+    at_zero_deviations,
+    solve_per_trial,
     spreads,
     trial_effect_prior,
 )
-from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.variance_kernels import decrease_within_bounds, noise_at_correlations, sums_without_deviations
 from vinetrack.inference.whitening import at_correlation
 
@@ -62,12 +62,12 @@ class Marginal:
     log_constant: float
 
 
-def marginal(grams: Floats, problem: MixedProblem, state: FitState) -> Marginal:
+def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> Marginal:
     """Eliminate release and origin, and put back what the deviations explain so far.
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
     problem : what does not change during the fit.
     state : where the fit stands.
@@ -76,16 +76,16 @@ def marginal(grams: Floats, problem: MixedProblem, state: FitState) -> Marginal:
     -------
     Marginal
     """
-    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    white = put_back(white, state, -1)
-    flat = white[:, :2, :2] + problem.own_precision[:, :, None] * np.eye(2)
-    left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
+    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
+    white = at_zero_deviations(white, state, -1)
+    flat = white[:, :2, :2] + problem.release_origin_precision[:, :, None] * np.eye(2)
+    left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(flat, white[:, :2, 2:])
     log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
-    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(problem.own_precision).sum(axis=1))
+    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(problem.release_origin_precision).sum(axis=1))
     return Marginal(left, float(log_noise + log_flat + np.sum(problem.points) * math.log(2 * math.pi)))
 
 
-def left_to_keys(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
+def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
     """What every trial says of its keys once all it has of its own is integrated out, and what that took.
 
     Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
@@ -160,10 +160,10 @@ def deviance(
     """
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
     constant = square + log_det + part.log_constant
-    return deviance_left(information, slope, constant, problem, state, restricted=restricted)
+    return profiled_deviance(information, slope, constant, problem, state, restricted=restricted)
 
 
-def deviance_left(
+def profiled_deviance(
     information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
 ) -> float:
     """The end of `deviance`: what is left once the free numbers are at their best.
@@ -211,7 +211,7 @@ def _groups_integrated(information: Floats, prior_precision: Floats, random: NDA
     return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
 
 
-def estimate_spreads(
+def estimate_between_trial_sd(
     part: Marginal,
     problem: MixedProblem,
     state: FitState,
@@ -244,7 +244,7 @@ def estimate_spreads(
     which = [k for k in range(2) if estimable[k]]
     if not which:
         return state.spread
-    least, largest = math.log(LEAST_SPREAD), [math.log(most) for most in LARGEST_SPREAD]
+    least, largest = math.log(LEAST_BETWEEN_TRIAL_SD), [math.log(most) for most in LARGEST_SPREAD]
 
     def at(logs: Floats) -> tuple[float, float]:
         spread = list(state.spread)
@@ -269,7 +269,7 @@ def estimate_spreads(
 
 
 def estimate_noise(
-    grams: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
+    cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
 ) -> tuple[float, Floats]:
     """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
 
@@ -279,7 +279,7 @@ def estimate_noise(
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
     problem : what does not change during the fit.
     state : where the fit stands.
@@ -297,14 +297,14 @@ def estimate_noise(
     centre, precision = trial_effect_prior(problem, state)
     stiff = precision * state.variance[:, None]
     pull_back = stiff * (state.trial_effects - centre)
-    freed = OWN + problem.index.shape[1] if within else OWN
+    freed = N_TRIAL_EFFECTS + problem.index.shape[1] if within else N_TRIAL_EFFECTS
     shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
     if within:
-        stiff = np.concatenate([stiff, _loose(grams, freed)], axis=1)
-        pull_back = np.pad(pull_back, ((0, 0), (0, freed - OWN)))
-    columns = [*range(freed), grams.shape[-1] - 1]
+        stiff = np.concatenate([stiff, _loose(cross_products, freed)], axis=1)
+        pull_back = np.pad(pull_back, ((0, 0), (0, freed - N_TRIAL_EFFECTS)))
+    columns = [*range(freed), cross_products.shape[-1] - 1]
     scores, squares, degrees = noise_at_correlations(
-        np.ascontiguousarray(grams[:, :, columns][:, :, :, columns]),
+        np.ascontiguousarray(cross_products[:, :, columns][:, :, :, columns]),
         stiff,
         pull_back,
         problem.points,
@@ -315,13 +315,13 @@ def estimate_noise(
     scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(grams, problem, state, _lowest(grid, scores, best), within=within)
+        return estimate_noise(cross_products, problem, state, _lowest(grid, scores, best), within=within)
     return rho, _draw_together(squares[0], degrees[0])
 
 
-def _loose(grams: Floats, freed: int) -> Floats:
+def _loose(cross_products: Floats, freed: int) -> Floats:
     """Precision that leaves the shared numbers free in every trial, shape (n_trials, n_keys): tiny beside its own."""
-    told = np.einsum("nkk->nk", grams[:, 0])[:, OWN:freed]
+    told = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:freed]
     return np.asarray(np.where(told > 0, LOOSE * told, 1.0))
 
 

@@ -26,7 +26,7 @@ About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + 
    analytically so that the cost is linear in the number of trials; then new trajectories (Lindstrom & Bates, Biometrics
    46, 673, 1990).
 2. σ_P and σ_B by the restricted likelihood of the linear model, u_i and θ integrated out
-   (`marginal_likelihood.estimate_spreads`; Patterson & Thompson, Biometrika 58, 545, 1971). One that too few trials
+   (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). One that too few trials
    feel stays as stated.
 3. ρ and v_i by the restricted likelihood of what is left once u_i has been fitted, v_i drawn to the common variance as
    far as trials differ by chance (`marginal_likelihood.estimate_noise`).
@@ -43,15 +43,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEASE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, PRESSURE, RELEASE
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation
 
-LEAST_SPREAD = 1e-5
+LEAST_BETWEEN_TRIAL_SD = 1e-5
 """Least between-trial standard deviation. Chosen far below what any rig repeats, so that its logarithm stays
 finite."""
 
-SPREAD_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
+DEVIATION_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class MixedProblem:
 
     `index`, shape (n_trials, n_keys), places each trial's columns among the free numbers; `feels`, shape (n_trials, 2),
     tells which trials have a deviation of pressure and of B; `gauge_error`, shape (n_trials,), the relative error of a
-    pressure that was measured, 0 of one that was set; `own_centre` and `own_precision`, shape (n_trials, 2),
+    pressure that was measured, 0 of one that was set; `release_origin_mean` and `release_origin_precision`, shape (n_trials, 2),
     belong to release and origin: so wide a prior that it only matters where a track leaves them open.
     `free` marks the numbers that may move; `points` and `stretches` count those of each trial. `random` marks numbers
     that are random effects of a group of trials, their priors being the distribution of the groups.
@@ -85,8 +85,8 @@ class MixedProblem:
     index: NDArray[np.int_]
     feels: NDArray[np.bool_]
     gauge_error: Floats
-    own_centre: Floats
-    own_precision: Floats
+    release_origin_mean: Floats
+    release_origin_precision: Floats
     prior_mean: Floats
     prior_precision: Floats
     lower: Floats
@@ -115,9 +115,9 @@ def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, 
     centre, precision : arrays, shape (n_trials, 4)
     """
     n = problem.index.shape[0]
-    centre, precision = np.zeros((n, OWN)), np.ones((n, OWN))
-    centre[:, :2], precision[:, :2] = problem.own_centre, problem.own_precision
-    precision[:, SPREAD_COLUMNS] = 1 / np.maximum(spreads(problem, state.spread), LEAST_SPREAD) ** 2
+    centre, precision = np.zeros((n, N_TRIAL_EFFECTS)), np.ones((n, N_TRIAL_EFFECTS))
+    centre[:, :2], precision[:, :2] = problem.release_origin_mean, problem.release_origin_precision
+    precision[:, DEVIATION_COLUMNS] = 1 / np.maximum(spreads(problem, state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
     return centre, precision
 
 
@@ -171,7 +171,7 @@ def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
     return np.asarray(np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
-def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
+def sum_matrix_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
     """Sum blocks of the trials' columns, shape (n_trials, n_keys, n_keys), into those of all free numbers.
 
     Parameters
@@ -190,8 +190,8 @@ def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
 
-def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
-    """As `cross_products`, for vectors, shape (n_trials, n_keys).
+def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
+    """As `sum_matrix_blocks`, for vectors, shape (n_trials, n_keys).
 
     Parameters
     ----------
@@ -206,14 +206,16 @@ def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     return np.asarray(np.bincount(problem.places.ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
 
 
-def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: float) -> tuple[Floats, Floats, float]:
+def levenberg_marquardt_step(
+    cross_products: Floats, problem: MixedProblem, state: FitState, damping: float
+) -> tuple[Floats, Floats, float]:
     """Step of all unknowns towards the minimum of the penalised sum of squares, and the decrease it promises.
 
     Numbers at a bound that want to go beyond it stay. `damping` is that of Levenberg and Marquardt.
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
     problem : what does not change during the fit.
     state : where the fit stands.
@@ -224,36 +226,40 @@ def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: 
     -------
     step : array, shape (n_free,)
     trial_effect_step : array, shape (n_trials, 4)
-    promised : float
+    predicted_decrease : float
         Decrease of the sum of squares by the linear model.
     """
-    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
+    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     centre, precision = trial_effect_prior(problem, state)
-    own_square = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
-    own_slope = white[:, :OWN, -1] - precision * (state.trial_effects - centre)
-    damped = own_square * (1 + damping * np.eye(OWN))
-    mixed = white[:, :OWN, OWN:-1]
-    solved = solve_each(damped, np.concatenate([mixed, own_slope[:, :, None]], axis=2))
-    square = cross_products(white[:, OWN:-1, OWN:-1], problem) + np.diag(problem.prior_precision)
-    slope = cross_products_vector(white[:, OWN:-1, -1], problem) - problem.prior_precision * (
+    own_square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
+    own_slope = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
+    damped = own_square * (1 + damping * np.eye(N_TRIAL_EFFECTS))
+    mixed = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
+    solved = solve_per_trial(damped, np.concatenate([mixed, own_slope[:, :, None]], axis=2))
+    square = sum_matrix_blocks(white[:, N_TRIAL_EFFECTS:-1, N_TRIAL_EFFECTS:-1], problem) + np.diag(
+        problem.prior_precision
+    )
+    slope = sum_vector_blocks(white[:, N_TRIAL_EFFECTS:-1, -1], problem) - problem.prior_precision * (
         state.theta - problem.prior_mean
     )
     reduced = square * (1 + damping * np.eye(square.shape[0]))
-    reduced = reduced - cross_products(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
-    reduced_slope = slope - cross_products_vector(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), problem)
+    reduced = reduced - sum_matrix_blocks(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
+    reduced_slope = slope - sum_vector_blocks(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), problem)
     step, _ = bounded_solve(reduced, reduced_slope, problem, state.theta)
     spread_out = np.append(step, 0.0)[problem.index]
     trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], spread_out)
-    promised = float(step @ slope + np.sum(trial_effect_step * own_slope))
-    return step, trial_effect_step, promised
+    predicted_decrease = float(step @ slope + np.sum(trial_effect_step * own_slope))
+    return step, trial_effect_step, predicted_decrease
 
 
-def trial_effect_step(grams: Floats, problem: MixedProblem, state: FitState, *, pinned: bool = False) -> Floats:
+def trial_effect_step(
+    cross_products: Floats, problem: MixedProblem, state: FitState, *, pinned: bool = False
+) -> Floats:
     """Step of the trials' own numbers alone, shape (n_trials, 4); `pinned` leaves the release where it is.
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
     problem : what does not change during the fit.
     state : where the fit stands.
@@ -264,14 +270,14 @@ def trial_effect_step(grams: Floats, problem: MixedProblem, state: FitState, *, 
     -------
     array, shape (n_trials, 4)
     """
-    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
+    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     centre, precision = trial_effect_prior(problem, state)
-    square = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
-    slope = white[:, :OWN, -1] - precision * (state.trial_effects - centre)
+    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
+    slope = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
     if pinned:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
-    return np.asarray(solve_each(square, slope[:, :, None])[:, :, 0])
+    return np.asarray(solve_per_trial(square, slope[:, :, None])[:, :, 0])
 
 
 def bounded_solve(
@@ -341,7 +347,7 @@ def solve_scaled(square: Floats, slope: Floats) -> Floats:
     return np.asarray(scale * np.linalg.lstsq(even, scale * slope, rcond=1e-12)[0])
 
 
-def inverse_among(square: Floats, places: NDArray[np.int_]) -> Floats:
+def inverse_of_block(square: Floats, places: NDArray[np.int_]) -> Floats:
     """Inverse of a symmetric matrix among these places, 0 elsewhere; directions that nothing fixes are left out.
 
     Parameters
@@ -362,7 +368,7 @@ def inverse_among(square: Floats, places: NDArray[np.int_]) -> Floats:
     return inverse
 
 
-def solve_each(square: Floats, right: Floats) -> Floats:
+def solve_per_trial(square: Floats, right: Floats) -> Floats:
     """Solve the small system of every trial, shape (n_trials, k, k), brought to unit diagonals.
 
     Parameters
@@ -380,14 +386,14 @@ def solve_each(square: Floats, right: Floats) -> Floats:
     return np.asarray(scale[:, :, None] * np.linalg.solve(even, scale[:, :, None] * right))
 
 
-def trial_effects_eliminated(grams: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
+def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
     """Products of keys, residual and what follows in units of the noise, each trial's own numbers integrated out.
 
-    `grams` are those of [own numbers, keys, residual, more].
+    `cross_products` are those of [own numbers, keys, residual, more].
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual, more].
     n_keys : int
         Number of keys.
@@ -398,14 +404,18 @@ def trial_effects_eliminated(grams: Floats, n_keys: int, problem: MixedProblem, 
     -------
     array, shape (n_trials, k − 4, k − 4)
     """
-    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    white = put_back(white, state, OWN + n_keys)
-    within_trial = white[:, :OWN, :OWN] + trial_effect_prior(problem, state)[1][:, :, None] * np.eye(OWN)
-    side = white[:, :OWN, OWN:]
-    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ solve_each(within_trial, side))
+    white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
+    white = at_zero_deviations(white, state, N_TRIAL_EFFECTS + n_keys)
+    within_trial = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + trial_effect_prior(problem, state)[1][
+        :, :, None
+    ] * np.eye(N_TRIAL_EFFECTS)
+    side = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:]
+    return np.asarray(
+        white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - np.swapaxes(side, 1, 2) @ solve_per_trial(within_trial, side)
+    )
 
 
-def put_back(white: Floats, state: FitState, residual: int) -> Floats:
+def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
     """The products with what the deviations explain so far put back into the column of the residual.
 
     Parameters
@@ -420,7 +430,7 @@ def put_back(white: Floats, state: FitState, residual: int) -> Floats:
     -------
     array, shape (n_trials, k, k)
     """
-    columns = list(SPREAD_COLUMNS)
+    columns = list(DEVIATION_COLUMNS)
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
     back = white.copy()

@@ -11,12 +11,12 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import estimable, floor, track_correlation
-from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_spreads, marginal
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step, shared_penalty
+from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_between_trial_sd, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import (
     ReleaseSearch,
-    follow_trial_effects,
+    optimise_trial_effects,
     limited,
     residuals_in,
     trial_costs,
@@ -86,11 +86,11 @@ class FixedTerms:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iterations ended. `grams` and `columns` belong to `state`, see `whitened` and `sensitivity`."""
+    """Where the iterations ended. `cross_products` and `columns` belong to `state`, see `whitened` and `sensitivity`."""
 
     state: FitState
     problem: MixedProblem
-    grams: Floats
+    cross_products: Floats
     columns: tuple[Floats, ...]
     estimable: tuple[bool, bool]
     converged: bool
@@ -107,13 +107,13 @@ class Step:
 
     iteration: int
     values: Mapping[str, float]
-    promised: float
+    predicted_decrease: float
 
 
 Watch = Callable[[Step], None]
 """Told of every step; what it raises ends the fit."""
 
-Behind = Callable[[Floats, MixedProblem, FitState, float], float]
+Shortfall = Callable[[Floats, MixedProblem, FitState, float], float]
 """How far −2 ln L of a fit is behind where it has to get, from its products, problem, state and sum of squares."""
 
 
@@ -129,7 +129,7 @@ def solve(
     columns: Sequence[Floats] | None = None,
     least_decrease: float = SETTLED_DECREASE,
     search: bool = False,
-    behind: Behind | None = None,
+    behind: Shortfall | None = None,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -152,7 +152,7 @@ def solve(
     columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
         Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
     least_decrease : float
-        Decrease of −2 ln L, promised by a step, below which the fit has settled.
+        Decrease of −2 ln L, predicted_decrease by a step, below which the fit has settled.
     search : bool
         Whether the fit is one of many that are held against each other: far off, it ends where it only creeps.
     behind : callable, optional
@@ -176,27 +176,29 @@ def solve(
         state = replace(state, rho=held.noise[0], variance=held.noise[1])
     if held.correlation is not None:
         state = replace(state, rho=held.correlation)
-    damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
+    damping, converged, iteration, predicted_decrease = (0.0 if warm else 1e-3), False, 0, math.inf
     early = not warm
-    columns, grams = _about(predictor, state) if columns is None else (columns, predictor.products(columns))
+    columns, cross_products = _about(predictor, state) if columns is None else (columns, predictor.products(columns))
     looks, looked, in_vain = MOST_LOOKS, 0, False
     levels: list[float] = []
     releases = ReleaseSearch(predictor, problem)
     for iteration in range(1, most_iterations + 1):
-        near = promised < FAR_OFF or iteration > MOST_EARLY
+        near = predicted_decrease < FAR_OFF or iteration > MOST_EARLY
         early = early and not (iteration > EARLY_ITERATIONS and near)
         before = state
-        state = _update_variances(predictor, problem, grams, state, can, held, early=early)
+        state = _update_variances(predictor, problem, cross_products, state, can, held, early=early)
         moved = variances_moved(before, state)
-        step, own_change, promised = newton_step(grams, problem, state, damping)
+        step, own_change, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, damping)
         if watch is not None:
-            watch(_step_report(predictor, state, iteration, promised))
-        settled = promised < least_decrease
-        if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
+            watch(_step_report(predictor, state, iteration, predicted_decrease))
+        settled = predicted_decrease < least_decrease
+        if looks and (
+            settled or (predicted_decrease < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE
+        ):
             looked, in_vain = iteration, True
             jumped = releases.look(state, residuals_in(columns))
             if jumped is not None:
-                state, (columns, grams) = jumped, _about(predictor, jumped)
+                state, (columns, cross_products) = jumped, _about(predictor, jumped)
                 looks, in_vain = looks - 1, False
                 continue
             looks = 0 if settled else looks
@@ -206,14 +208,14 @@ def solve(
         now = cost(predictor, problem, state, residuals_in(columns))
         levels.append(_level(problem, state, now, held))
         if search and _creeps(levels, CREEPING * float(np.sum(problem.points))):
-            there = Solution(state, problem, grams, tuple(columns), can, converged, iteration)
+            there = Solution(state, problem, cross_products, tuple(columns), can, converged, iteration)
             if is_poor_fit(predictor, there):
                 break
         if behind is not None and iteration > EARLY_ITERATIONS:
             further = (most_iterations - iteration) * _fall_per_step(levels)
-            if behind(grams, problem, state, now) > _most_gained(problem, now, promised) + further:
+            if behind(cross_products, problem, state, now) > _most_gained(problem, now, predicted_decrease) + further:
                 break
-        taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping, now)
+        taken, damping = _take_step(predictor, problem, cross_products, state, step, own_change, damping, now)
         if taken is None:
             # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
             converged = moved < SETTLED_SPREAD
@@ -221,12 +223,12 @@ def solve(
                 break
             continue
         try:
-            columns, grams = _about(predictor, taken)
+            columns, cross_products = _about(predictor, taken)
         except SimulationError:
             # A neighbour of the new place cannot be followed: what was reached before is worth more than nothing.
             break
         state = taken
-    return Solution(state, problem, grams, tuple(columns), can, converged, iteration)
+    return Solution(state, problem, cross_products, tuple(columns), can, converged, iteration)
 
 
 def _level(problem: MixedProblem, state: FitState, now: float, held: FixedTerms) -> float:
@@ -236,12 +238,12 @@ def _level(problem: MixedProblem, state: FitState, now: float, held: FixedTerms)
     return now + float(np.sum(problem.points * np.log(state.variance)))
 
 
-def _most_gained(problem: MixedProblem, now: float, promised: float) -> float:
+def _most_gained(problem: MixedProblem, now: float, predicted_decrease: float) -> float:
     """Fall of −2 ln L if a step keeps its promise and the noise is taken for as much less.
 
     Of n points with noise s it is n ln s²; a step near the end promises all but the noise itself.
     """
-    left = 1 - promised / max(now, 1e-300)
+    left = 1 - predicted_decrease / max(now, 1e-300)
     return -float(np.sum(problem.points)) * math.log(left) if left > 0 else math.inf
 
 
@@ -266,9 +268,11 @@ def _about(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]
     return columns, predictor.products(columns)
 
 
-def _step_report(predictor: Predictor, state: FitState, iteration: int, promised: float) -> Step:
+def _step_report(predictor: Predictor, state: FitState, iteration: int, predicted_decrease: float) -> Step:
     values = predictor.layout.values(state.theta).tolist()
-    return Step(iteration, dict(zip([number.name for number in predictor.layout.free], values, strict=True)), promised)
+    return Step(
+        iteration, dict(zip([number.name for number in predictor.layout.free], values, strict=True)), predicted_decrease
+    )
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
@@ -288,7 +292,7 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     data = predictor.data
     rho = track_correlation(data)
     noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), floor(data))
-    left = at_correlation(solution.grams, rho)[:, -1, -1]
+    left = at_correlation(solution.cross_products, rho)[:, -1, -1]
     taken = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.feels.any(axis=1)
     return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - taken, 1.0)))
 
@@ -333,7 +337,7 @@ def missed_fraction(predictor: Predictor, solution: Solution) -> float:
 def _update_variances(
     predictor: Predictor,
     problem: MixedProblem,
-    grams: Floats,
+    cross_products: Floats,
     state: FitState,
     can: tuple[bool, bool],
     held: FixedTerms,
@@ -343,10 +347,10 @@ def _update_variances(
     """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
     if held.noise is None:
         known = state.rho if early or held.correlation is not None else None
-        rho, variance = estimate_noise(grams, problem, state, known)
+        rho, variance = estimate_noise(cross_products, problem, state, known)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if not early and any(can):
-        spread = estimate_spreads(marginal(grams, problem, state), problem, state, can)
+        spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, can)
         state = replace(state, spread=spread)
     return state
 
@@ -370,7 +374,7 @@ def variances_moved(before: FitState, after: FitState) -> float:
 def _take_step(
     predictor: Predictor,
     problem: MixedProblem,
-    grams: Floats,
+    cross_products: Floats,
     state: FitState,
     step: Floats,
     own_change: Floats,
@@ -388,7 +392,7 @@ def _take_step(
             return tried, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(MOST_DAMPED):
         damping = max(10 * damping, 1e-4)
-        step, own_change, _ = newton_step(grams, problem, state, damping)
+        step, own_change, _ = levenberg_marquardt_step(cross_products, problem, state, damping)
         tried = _tried(predictor, problem, state, step, own_change, now)
         if tried is not None:
             return tried, damping * 0.1
@@ -414,7 +418,7 @@ def _tried(
     try:
         there = replace(state, theta=theta, trial_effects=limited(predictor, state.trial_effects, own_change))
         most = now - shared_penalty(problem, there)
-        there, costs = follow_trial_effects(predictor, problem, there, most if at_once else math.inf)
+        there, costs = optimise_trial_effects(predictor, problem, there, most if at_once else math.inf)
     except SimulationError:
         return None
     return there if float(np.sum(costs)) < most else None

@@ -82,7 +82,7 @@ class FreeParameter:
         """`effect.parameter`, with the vine in brackets where it has one of its own."""
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
-    def inside(self, value: float) -> float:
+    def to_scaled(self, value: float) -> float:
         """The value as the fit holds it.
 
         Parameters
@@ -97,7 +97,7 @@ class FreeParameter:
             return math.log(max(value, LEAST_DAMPING))
         return value / self.scale
 
-    def outside(self, theta: float) -> float:
+    def from_scaled(self, theta: float) -> float:
         """The value, SI, of what the fit holds.
 
         Parameters
@@ -111,7 +111,7 @@ class FreeParameter:
         """
         return math.exp(theta) if self.logarithmic else theta * self.scale
 
-    def slope(self, value: float) -> float:
+    def derivative(self, value: float) -> float:
         """By how much the value changes for a change of one in what the fit holds.
 
         Parameters
@@ -122,7 +122,7 @@ class FreeParameter:
         -------
         float
         """
-        return self.outside(self.inside(value)) if self.logarithmic else self.scale
+        return self.from_scaled(self.to_scaled(value)) if self.logarithmic else self.scale
 
 
 @dataclass(frozen=True)
@@ -143,14 +143,14 @@ class ParameterMap:
     @property
     def start(self) -> Floats:
         """Starting values, scaled, shape (n_free,)."""
-        return np.array([number.inside(number.start) for number in self.free])
+        return np.array([number.to_scaled(number.start) for number in self.free])
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds, scaled, shape (n_free,) each."""
         return (
-            np.array([number.inside(number.lower) for number in self.free]),
-            np.array([number.inside(number.upper) for number in self.free]),
+            np.array([number.to_scaled(number.lower) for number in self.free]),
+            np.array([number.to_scaled(number.upper) for number in self.free]),
         )
 
     @property
@@ -170,7 +170,7 @@ class ParameterMap:
         -------
         array, shape (n_free,)
         """
-        return np.array([number.outside(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
+        return np.array([number.from_scaled(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
         """Model parameters (n_trials, n_parameters) and yield pressures (n_trials,), Pa, for scaled values `theta`.

@@ -15,7 +15,7 @@ from vinetrack.inference.sensitivity import Predictor
 Indices = NDArray[np.int_]
 
 
-def numbers_felt(layout: ParameterMap, rows: Indices) -> Indices:
+def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
     """Places of the free numbers that some of these trials feel, in their order.
 
     Parameters
@@ -89,7 +89,7 @@ def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
     )
 
 
-def subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
+def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
     """The frame of these trials and numbers; `layout` is theirs already.
 
     Parameters
@@ -112,8 +112,8 @@ def subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, pla
         index=layout.index,
         feels=problem.feels[rows],
         gauge_error=problem.gauge_error[rows],
-        own_centre=problem.own_centre[rows],
-        own_precision=problem.own_precision[rows],
+        release_origin_mean=problem.release_origin_mean[rows],
+        release_origin_precision=problem.release_origin_precision[rows],
         prior_mean=numbers(problem.prior_mean),
         prior_precision=numbers(problem.prior_precision),
         lower=numbers(problem.lower),

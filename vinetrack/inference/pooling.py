@@ -33,16 +33,16 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
-    SPREAD_COLUMNS,
+    DEVIATION_COLUMNS,
     FitState,
     MixedProblem,
-    inverse_among,
+    inverse_of_block,
     trial_effect_step,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes, with_shapes
-from vinetrack.inference.sensitivity import ORIGIN, OWN, Predictor
+from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, Predictor
 
 MOST_STEPS, SETTLED = 12, 0.05
 """Steps at most, and the length of a step in standard errors at which they end. Chosen: a twentieth of an error; the
@@ -105,10 +105,12 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     columns: Sequence[Floats] = solution.columns
     for _ in range(MOST_STEPS):
         wide = _with_shapes(columns, shapes, state.theta[shared:])
-        grams = predictor.products(wide)
-        rho, variance = estimate_noise(grams, problem, state, within=True)
+        cross_products = predictor.products(wide)
+        rho, variance = estimate_noise(cross_products, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
-        pooled = _weighed(replace(solution, state=state, problem=problem, grams=grams, columns=tuple(wide)), shared)
+        pooled = _weighed(
+            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(wide)), shared
+        )
         step = pooled.covariance @ _slope(pooled, problem, state)
         scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
@@ -117,7 +119,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
             return pooled
         step = step * min(1.0, LONGEST_STEP / longest)
         state = _moved(pooled.solution, state, step)
-        if np.max(np.abs(state.trial_effects[:, SPREAD_COLUMNS])) > FARTHEST_DEVIATION:
+        if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > FARTHEST_DEVIATION:
             return None
         try:
             columns = predictor.linearise(state.theta[:shared], state.trial_effects)
@@ -152,9 +154,9 @@ def _moved(solution: Solution, state: FitState, step: Floats) -> FitState:
     problem = solution.problem
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     change = np.append(theta - state.theta, 0.0)[problem.index]
-    turned = solution.grams.copy()
+    turned = solution.cross_products.copy()
     # The residual once the numbers have moved: r − X δ.
-    turned[..., -1] -= np.einsum("nsik,nk->nsi", solution.grams[..., OWN:-1], change)
+    turned[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
     trial_effects = state.trial_effects + trial_effect_step(turned, problem, state)
     return replace(state, theta=theta, trial_effects=trial_effects)
 
@@ -167,7 +169,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
     total = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    root = _typical_root(inverse_among(total, live), information, shared)
+    root = _typical_root(inverse_of_block(total, live), information, shared)
     values, vectors = np.linalg.eigh(information)
     half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     # With J = H Hᵀ and Hᵀ R = U S Vᵀ, R the root of M, (J⁻¹ + τ²M)⁻¹ = H U (1 + τ²S²)⁻¹ Uᵀ Hᵀ for any τ²: J − J(…)J
@@ -196,7 +198,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
     less = 1 / (1 + tau2 * stretch**2)
     weight = (ways * less[:, None, :]) @ np.swapaxes(ways, 1, 2)
     score = np.einsum("nij,nj->ni", ways, less * along) + beside
-    covariance = inverse_among(weight.sum(axis=0) + prior, live)
+    covariance = inverse_of_block(weight.sum(axis=0) + prior, live)
     return Pooled(solution, weight, score, covariance, tau2 * root @ root.T)
 
 
@@ -214,7 +216,7 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     """
     problem = solution.problem
     size, p = problem.prior_mean.size, problem.index.shape[1]
-    blocks = trial_effects_eliminated(solution.grams, p, problem, solution.state)
+    blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
     information = np.zeros((len(blocks), size + 1, size + 1))
     scores = np.zeros((len(blocks), size + 1))
     for i, (block, places) in enumerate(zip(blocks, problem.index, strict=True)):

@@ -23,7 +23,7 @@ def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) ->
     change : array, shape (n_points,), m
         Changed in place.
     over : array of bool, shape (n_points,)
-        Points behind the end of the unmoved trajectory.
+        Points behind the end of the trajectories_at trajectory.
     moved_ends : bool
         Whether the moved one comes to its end too.
     """
@@ -35,13 +35,13 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
 
     Growth ends at the same place whenever it ends, so a plain difference has a jump between the two ends, of the order
     of the whole answer, that depends on the sign and size of the step: two effects that do exactly the same would seem
-    to differ by that one frame. So until the unmoved trajectory ends the moved one is continued at its last speed, and
+    to differ by that one frame. So until the trajectories_at trajectory ends the moved one is continued at its last speed, and
     from there on only what moves the place of the end counts.
 
     Parameters
     ----------
     plain : Trajectory
-        The unmoved trajectory.
+        The trajectories_at trajectory.
     moved : Trajectory
         The same trial, at the same instants, with a step made.
 
@@ -56,7 +56,7 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
     last = int(np.argmax(early)) - 1
     if early.any() and last >= 0:
-        # A step small enough ends growth earlier by what it moves over the speed; where the unmoved motion takes longer
+        # A step small enough ends growth earlier by what it moves over the speed; where the trajectories_at motion takes longer
         # it is another one, such as a stop before the end, and is not continued.
         speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
         reach_s = plain.time_s[last] + MOST_CONTINUED * abs(float(change[last])) / speed_m_s

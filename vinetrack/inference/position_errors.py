@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_problem import floor
-from vinetrack.inference.intervals import SILENT
+from vinetrack.inference.intervals import LEAST_INFORMATION
 from vinetrack.inference.marginal_likelihood import (
     deviance,
     estimate_noise,
-    estimate_spreads,
+    estimate_between_trial_sd,
     marginal,
     normal_equations,
 )
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step
 from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, variances_moved
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten
@@ -132,7 +132,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     still = replace(solution.problem, free=solution.problem.free & _moves(solution))
     problem = with_shapes(still, count)
     start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
-    state, grams, moved, level = _iterated(predictor, solution, wide, problem, start, held)
+    state, cross_products, moved, level = _iterated(predictor, solution, wide, problem, start, held)
     # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
     # without the shapes, and is not theirs.
     bare = _iterated(predictor, solution, solution.columns, still, solution.state, held)[3]
@@ -142,7 +142,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
             solution,
             state=state,
             problem=with_shapes(solution.problem, count),
-            grams=grams,
+            cross_products=cross_products,
             columns=tuple(_with_residual(wide, left)),
         ),
         gain=max(level - bare, 0.0),
@@ -160,9 +160,9 @@ def _moves(solution: Solution) -> NDArray[np.bool_]:
     The column of one that does not is rounding. A step along it is millions of scales long and promises a likelihood
     that no trajectory keeps; columns that stay would let it be taken.
     """
-    part = marginal(solution.grams, solution.problem, solution.state)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
     information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
-    return np.asarray(np.diag(information) > SILENT)
+    return np.asarray(np.diag(information) > LEAST_INFORMATION)
 
 
 def _iterated(
@@ -175,32 +175,32 @@ def _iterated(
 ) -> tuple[FitState, Floats, Floats, float]:
     """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L.
 
-    Steps are taken as long as they raise ln L. Two numbers that only rounding tells apart may be promised any way along
+    Steps are taken as long as they raise ln L. Two numbers that only rounding tells apart may be predicted_decrease any way along
     which they cancel; no trajectory is followed here that would refuse it.
     """
-    grams = predictor.products(columns)
-    moved = np.zeros((len(grams), grams.shape[-1] - 1))
-    state = _variances(predictor, problem, grams, state, solution, held)
-    level = _level(grams, problem, state, solution)
+    cross_products = predictor.products(columns)
+    moved = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
+    state = _variances(predictor, problem, cross_products, state, solution, held)
+    level = _level(cross_products, problem, state, solution)
     for _ in range(MOST_STEPS):
-        step, own_step, promised = newton_step(grams, problem, state, 0.0)
+        step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
         change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
-        there = _moved(grams, change)
+        there = _moved(cross_products, change)
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
         after = _variances(predictor, problem, there, before, solution, held)
         reached = _level(there, problem, after, solution)
         if reached < level - SETTLED:
             break
-        grams, moved, state, level = there, moved + change, after, reached
-        if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
+        cross_products, moved, state, level = there, moved + change, after, reached
+        if predicted_decrease < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
             break
-    return state, grams, moved, level
+    return state, cross_products, moved, level
 
 
-def _level(grams: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
+def _level(cross_products: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
     """Marginal ln L at a state, spreads at their best for it."""
-    part = marginal(grams, problem, state)
-    spread = estimate_spreads(part, problem, state, solution.estimable, restricted=False)
+    part = marginal(cross_products, problem, state)
+    spread = estimate_between_trial_sd(part, problem, state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, problem, state, spread, restricted=False)
 
 
@@ -239,7 +239,7 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
 def _variances(
     predictor: Predictor,
     problem: MixedProblem,
-    grams: Floats,
+    cross_products: Floats,
     state: FitState,
     solution: Solution,
     held: FixedTerms,
@@ -251,23 +251,25 @@ def _variances(
     """
     estimable = solution.estimable
     if held.noise is None:
-        rho, variance = estimate_noise(grams, problem, state, held.correlation)
+        rho, variance = estimate_noise(cross_products, problem, state, held.correlation)
         if rho > solution.state.rho:
-            rho, variance = estimate_noise(grams, problem, state, solution.state.rho)
+            rho, variance = estimate_noise(cross_products, problem, state, solution.state.rho)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if any(estimable):
-        state = replace(state, spread=estimate_spreads(marginal(grams, problem, state), problem, state, estimable))
+        state = replace(
+            state, spread=estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable)
+        )
     return state
 
 
-def _moved(grams: Floats, change: Floats) -> Floats:
+def _moved(cross_products: Floats, change: Floats) -> Floats:
     """Products of the columns once the unknowns of each trial, shape (n_trials, n_columns − 1), have moved by so much.
 
     The residual becomes r − C·change, the other columns stay.
     """
-    turn = np.broadcast_to(np.eye(grams.shape[-1]), (len(grams), *grams.shape[-2:])).copy()
+    turn = np.broadcast_to(np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])).copy()
     turn[:, :-1, -1] = -change
-    return np.asarray(np.swapaxes(turn, 1, 2)[:, None] @ grams @ turn[:, None])
+    return np.asarray(np.swapaxes(turn, 1, 2)[:, None] @ cross_products @ turn[:, None])
 
 
 def with_smooth_errors(fit: Fit) -> Solution:

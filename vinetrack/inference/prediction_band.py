@@ -32,13 +32,13 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.intervals import student
-from vinetrack.inference.mixed_effects import FitState, inverse_among, spreads
+from vinetrack.inference.mixed_effects import FitState, inverse_of_block, spreads
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
 from vinetrack.inference.position_errors import position_shapes
-from vinetrack.inference.robust_covariance import root_of
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, Predictor
+from vinetrack.inference.robust_covariance import matrix_root
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, Predictor
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
 
@@ -207,13 +207,13 @@ def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tupl
     felt = free[np.diag(basis.information[i])[free] > 0]
     if len(basis.scores) < 2 or (np.diag(others)[felt] <= TOLD_BY_OTHERS * np.diag(total)[felt]).any():
         return None
-    covariance = inverse_among(others, free)
+    covariance = inverse_of_block(others, free)
     columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
     design = _design(columns, problem.index[i], size)
     shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
     missed = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
     own_loadings = _own_loadings(_own_spreads(solution, i), columns, trial_data)
-    loadings = np.column_stack([design @ root_of(covariance + basis.between), own_loadings])
+    loadings = np.column_stack([design @ matrix_root(covariance + basis.between), own_loadings])
     noise = float(state.variance[i]) / (1 - state.rho**2)
     left, random, missed = _aligned(loadings, missed, columns[:, :2], trial_data, weigh, state, noise)
     return missed, np.sum(left**2, axis=1) + random
@@ -222,7 +222,7 @@ def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tupl
 def _design(columns: Floats, index: np.ndarray, size: int) -> Floats:
     """What the free numbers do to positions of a trial, shape (n_points, size), from the columns of its keys."""
     design = np.zeros((len(columns), size + 1))
-    np.add.at(design.T, index, columns[:, OWN:-1].T)
+    np.add.at(design.T, index, columns[:, N_TRIAL_EFFECTS:-1].T)
     return design[:, :size]
 
 
@@ -242,7 +242,7 @@ def _own_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floa
 def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """What one standard deviation of each error does to a new trial, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
-    theta, places = laid_over(fit, layout, trial_data)
+    theta, places = values_for_trial(fit, layout, trial_data)
     predictor = Predictor(layout, [trial_data], fit.predictor.host)
     trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
     columns = predictor.linearise(theta, trial_effects)[0]
@@ -254,14 +254,14 @@ def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: Trial
     design = _design(columns, layout.index[0], theta.size)
     state = basis.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
-    spread *= [predictor.feels_pressure[0], predictor.feels_damping[0]]
+    spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]
     shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
-    loadings = np.column_stack([design @ root_of(mine), _own_loadings(spread, columns, trial_data), shapes])
+    loadings = np.column_stack([design @ matrix_root(mine), _own_loadings(spread, columns, trial_data), shapes])
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
     return _aligned(loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise)[:2]
 
 
-def laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
+def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
     """The numbers of a fit as the layout of one trial holds them.
 
     Parameters
@@ -286,7 +286,7 @@ def laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Flo
     for k, free in enumerate(layout.free):
         for place, number in enumerate(fit.numbers):
             if number.key == free.key and number.vine in groups:
-                theta[k], places[k] = free.inside(number.value), place
+                theta[k], places[k] = free.to_scaled(number.value), place
     return theta, places
 
 
@@ -295,7 +295,7 @@ def _covariance(fit: Fit, basis: _Basis) -> Floats:
     problem = basis.solution.problem
     total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
     count = len(fit.numbers)
-    plain = inverse_among(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
+    plain = inverse_of_block(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
     held = fit.predictor.layout.free
     sigma = np.array(
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
@@ -314,7 +314,7 @@ def _aligned(
     them, `noise` the variance of a position, m².
     """
     white = whiten(design, trial_data.first, weigh, trial_data.relative_sd)
-    fixed = np.array([not trial_data.let_in, True])
+    fixed = np.array([not trial_data.pressurised_in_recording, True])
     inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
     points = missed.size
     whitener = whiten(np.eye(points), trial_data.first, weigh, trial_data.relative_sd)

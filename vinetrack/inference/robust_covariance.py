@@ -15,10 +15,10 @@ import numpy as np
 from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.intervals import Precision
-from vinetrack.inference.mixed_effects import cross_products, inverse_among, trial_effects_eliminated
+from vinetrack.inference.mixed_effects import sum_matrix_blocks, inverse_of_block, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.pooling import Pooled, trial_information
-from vinetrack.inference.sensitivity import OWN, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import Systematics, systematics_of
 from vinetrack.inference.whitening import products
 
@@ -34,7 +34,7 @@ LARGEST_SHARE = 0.99
 score is enlarged by 7 instead of 10; what is left of it then is rounding more than scatter."""
 
 
-def scatter_of(single: Floats, degrees: float) -> Floats:
+def cluster_variance(single: Floats, degrees: float) -> Floats:
     """Variance of sums over trials from how single trials, shape (n_trials, n), scatter; 0 where they are too few.
 
     Priors' parts belong to no trial: the mean is taken out.
@@ -56,7 +56,7 @@ def scatter_of(single: Floats, degrees: float) -> Floats:
     return np.asarray(np.sum((single - single.mean(axis=0)) ** 2, axis=0) * trials / degrees)
 
 
-def few_trials(predictor: Predictor, solution: Solution) -> bool:
+def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
     """Whether trials are too few for a sandwich over them.
 
     Parameters
@@ -145,7 +145,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     return plain, robust
 
 
-def moved_by(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
+def parameter_shifts(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
     """How far one standard deviation of each systematic error moves each free number, to first order.
 
     Parameters
@@ -184,7 +184,7 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
     live = np.flatnonzero(np.diag(plain) > 0)
     if not live.size or len(scores) < 2:
         return variance, degrees
-    root = root_of(plain[np.ix_(live, live)])
+    root = matrix_root(plain[np.ix_(live, live)])
     score = (scores - scores.mean(axis=0))[:, live] @ root
     shares, mended = [], []
     constant = root.T @ np.diag(solution.problem.prior_precision[live]) @ root
@@ -207,7 +207,7 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
     return variance, degrees
 
 
-def root_of(square: Floats) -> Floats:
+def matrix_root(square: Floats) -> Floats:
     """A matrix whose product with its own transpose is a symmetric positive one.
 
     Parameters
@@ -232,26 +232,26 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
 
 
 def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Covariance by the noise model and by the scatter of trials, shape (n_free, n_free) each, and `moved_by`.
+    """Covariance by the noise model and by the scatter of trials, shape (n_free, n_free) each, and `parameter_shifts`.
 
     Numbers at a bound stay there.
     """
     problem, state = solution.problem, solution.state
-    grams = solution.grams
-    p, size = grams.shape[-1] - OWN - 1, problem.prior_mean.size
-    if systematics.n_felt:
+    cross_products = solution.cross_products
+    p, size = cross_products.shape[-1] - N_TRIAL_EFFECTS - 1, problem.prior_mean.size
+    if systematics.n_columns:
         both = zip(solution.columns, systematics.columns, predictor.data, strict=True)
-        grams = np.stack(
+        cross_products = np.stack(
             [
                 products(np.column_stack([sensitivities, systematic]), trial_data.first, trial_data.relative_sd)
                 for sensitivities, systematic, trial_data in both
             ]
         )
-    blocks = trial_effects_eliminated(grams, p, problem, state)
-    square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
+    blocks = trial_effects_eliminated(cross_products, p, problem, state)
+    square = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     live = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
-    plain = inverse_among(square, live)
+    plain = inverse_of_block(square, live)
     single = _scores(blocks[:, :p, p], problem.index, size)
     trials = len(blocks)
     # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.

@@ -1,9 +1,9 @@
 """How the predicted positions of every trial answer to what a fit may move.
 
 Per trial there are four numbers of its own: the instant of release, the origin of position, the relative deviation of
-its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Behind them come the
+its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Shortfall them come the
 free numbers of the model.
-All trajectories, moved and unmoved, are simulated in one call.
+All trajectories, moved and trajectories_at, are simulated in one call.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Mo
 from vinetrack.inference.whitening import all_products
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
-OWN = 4
+N_TRIAL_EFFECTS = 4
 """Numbers of a trial's own: release, s; origin, m; relative deviation of pressure; deviation of ln B. Defined by the
 model: release, origin, pressure, B."""
 
@@ -52,7 +52,7 @@ DAMPING_STEP = 1e-3
 class Predictor:
     """Simulates the trials of a fit.
 
-    `feels_pressure` and `feels_damping`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
+    `has_pressure_deviation` and `has_damping_deviation`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
     set, or measured by a gauge with noise) and a B. `host` is a larger model whose compiled form serves this one.
     `divisible` tells whether a predictor of some of its trials answers as this one.
     """
@@ -64,7 +64,7 @@ class Predictor:
         model = layout.model
         self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
         driven = "pressure_drive" in model
-        self.feels_pressure = np.array(
+        self.has_pressure_deviation = np.array(
             [
                 driven
                 and (trial_data.trial.pressure_Pa > 0 if trial_data.trace is None else trial_data.gauge_error > 0)
@@ -72,7 +72,7 @@ class Predictor:
             ],
             dtype=bool,
         )
-        self.feels_damping = np.array(
+        self.has_damping_deviation = np.array(
             [self.damping_column >= 0 and trial_data.trial.travel_ratio != 1 for trial_data in data], dtype=bool
         )
         check_needs(model, *(trial_data.trial for trial_data in data))
@@ -168,7 +168,7 @@ class Predictor:
         ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
-        """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4).
+        """The trajectories_at trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4).
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class Predictor:
         whole[:, [PRESSURE, DAMPING_DEVIATION]] += self.layout.shifts(theta)
         return whole
 
-    def unmoved(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
+    def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
         """The trajectories with nothing moved.
 
         Parameters
@@ -241,9 +241,9 @@ class Predictor:
         -------
         list of arrays, shape (n_points,)
         """
-        return self.residuals_of_ways(theta, [trial_effects])[0]
+        return self.residuals_of_each(theta, [trial_effects])[0]
 
-    def residuals_of_ways(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
+    def residuals_of_each(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
         """`residuals` for several sets of the trials' own numbers, simulated in one call.
 
         Parameters
@@ -281,11 +281,11 @@ class Predictor:
         return [values[a:b] for a, b in itertools.pairwise(edges)]
 
     def linearise(
-        self, theta: Floats, trial_effects: Floats, *, own_only: bool = False, past_end: bool = False
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
     ) -> list[Floats]:
         """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
 
-        `own_only` leaves the columns of the keys empty, but for B. `past_end` takes derivatives as `position_change`
+        `trial_effects_only` leaves the columns of the keys empty, but for B. `past_end` takes derivatives as `position_change`
         does, for tests that hold columns against each other; an iteration wants what a step really changes, the jump
         at the end of growth included, and settles in other places without it.
 
@@ -294,7 +294,7 @@ class Predictor:
         theta : array, shape (n_free,)
             Free numbers, scaled.
         trial_effects : array, shape (n_trials, 4)
-        own_only : bool
+        trial_effects_only : bool
             Leave the columns of the keys empty, but for B.
         past_end : bool
             Run trajectories on past the end of growth. The steps of later calls are not adapted then.
@@ -306,11 +306,11 @@ class Predictor:
             column is the residual, m.
         """
         plain, whole = self.together(theta, trial_effects), self._deviations(theta, trial_effects)
-        moves = list(self._variations(plain, theta, whole, own_only))
+        moves = list(self._variations(plain, theta, whole, trial_effects_only))
         motions = self._simulated(self.layout.model, Jobs.joined([plain, *(varied for _, _, varied in moves)]))
         count = len(self.data)
         rows = motions.rows(0, count)
-        table = np.zeros((rows.shape[0], OWN + len(self.layout.keys) + 1))
+        table = np.zeros((rows.shape[0], N_TRIAL_EFFECTS + len(self.layout.keys) + 1))
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
         table[:, -1] = self._left(rows[:, OBSERVED], trial_effects)
@@ -329,7 +329,7 @@ class Predictor:
         columns = self.by_trial(table)
         self._share_damping(columns)
         self._share_deviations(columns)
-        if not (own_only or past_end):
+        if not (trial_effects_only or past_end):
             self._adapt(table)
         return columns
 
@@ -368,23 +368,23 @@ class Predictor:
         )
 
     def _variations(
-        self, plain: Jobs, theta: Floats, trial_effects: Floats, own_only: bool
+        self, plain: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
     ) -> Iterator[tuple[int, Floats, Jobs]]:
         """What to simulate for the differences: place of the column, the trials' steps, and the moved trajectories."""
         if len(measured := np.flatnonzero(~self.plain_release)):
             steps, varied = RELEASE_STEP_FRAMES * self.frames_s[measured], plain.take(measured)
             yield RELEASE, steps, replace(varied, release_s=varied.release_s + steps)
-        if len(driven := np.flatnonzero(self.feels_pressure)):
+        if len(driven := np.flatnonzero(self.has_pressure_deviation)):
             steps, varied = self.pressure_step[driven], plain.take(driven)
             yield PRESSURE, steps, replace(varied, pressure_deviation=varied.pressure_deviation + steps)
-        if DAMPING not in self.layout.keys and len(damped := np.flatnonzero(self.feels_damping)):
+        if DAMPING not in self.layout.keys and len(damped := np.flatnonzero(self.has_damping_deviation)):
             varied = plain.take(damped)
             varied.row[:, self.damping_column] *= np.exp(DAMPING_STEP)
             yield DAMPING_DEVIATION, np.full(damped.size, DAMPING_STEP), varied
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
             feels = np.flatnonzero(self.layout.index[:, column] >= 0)
-            if not feels.size or (own_only and key != DAMPING) or self.layout.term(key) is not None:
+            if not feels.size or (trial_effects_only and key != DAMPING) or self.layout.term(key) is not None:
                 continue
             places = self.layout.index[feels, column]
             step = float(self.steps[column])
@@ -393,23 +393,27 @@ class Predictor:
             free = [self.layout.free[place] for place in places]
             there = theta[places] + steps
             if key == YIELD_PRESSURE:
-                varied.yield_pressure_Pa[:] = [number.outside(x) for number, x in zip(free, there, strict=True)]
+                varied.yield_pressure_Pa[:] = [number.from_scaled(x) for number, x in zip(free, there, strict=True)]
             elif key == DAMPING:
                 there = there + trial_effects[feels, DAMPING_DEVIATION]
-                varied.row[:, self.damping_column] = [number.outside(x) for number, x in zip(free, there, strict=True)]
+                varied.row[:, self.damping_column] = [
+                    number.from_scaled(x) for number, x in zip(free, there, strict=True)
+                ]
             else:
                 here_and_there = zip(free, theta[places], there, strict=True)
                 k = self.layout.model.parameter_names.index(key)
-                varied.row[:, k] += [number.outside(x) - number.outside(here) for number, here, x in here_and_there]
-            yield OWN + column, steps, varied
+                varied.row[:, k] += [
+                    number.from_scaled(x) - number.from_scaled(here) for number, here, x in here_and_there
+                ]
+            yield N_TRIAL_EFFECTS + column, steps, varied
 
     def _share_damping(self, columns: list[Floats]) -> None:
         """A trial's deviation of B and ln B itself are one sensitivity."""
         if DAMPING not in self.layout.keys:
             return
         column = self.layout.keys.index(DAMPING)
-        for i in np.flatnonzero(self.feels_damping):
-            columns[i][:, DAMPING_DEVIATION] = columns[i][:, OWN + column]
+        for i in np.flatnonzero(self.has_damping_deviation):
+            columns[i][:, DAMPING_DEVIATION] = columns[i][:, N_TRIAL_EFFECTS + column]
 
     def _share_deviations(self, columns: list[Floats]) -> None:
         """What trials differ by systematically moves them as their own deviation does, times its regressor."""
@@ -418,14 +422,14 @@ class Predictor:
                 continue
             column, source = self.layout.keys.index(term.key), PRESSURE if term.pressure else DAMPING_DEVIATION
             for i in np.flatnonzero(self.layout.index[:, column] >= 0):
-                columns[i][:, OWN + column] = term.scale * term.regressor[i] * columns[i][:, source]
+                columns[i][:, N_TRIAL_EFFECTS + column] = term.scale * term.regressor[i] * columns[i][:, source]
 
     def _adapt(self, table: Floats) -> None:
         """Steps for the next time, from how far these moved the trajectories."""
         answers = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
         for column in range(len(self.layout.keys)):
-            self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))
-        for i in np.flatnonzero(self.feels_pressure):
+            self.steps[column] = _step(float(np.max(answers[:, N_TRIAL_EFFECTS + column])), float(self.steps[column]))
+        for i in np.flatnonzero(self.has_pressure_deviation):
             self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
 
 

@@ -21,7 +21,7 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import (
     MOST_ITERATIONS,
     POOR_FIT,
-    Behind,
+    Shortfall,
     FixedTerms,
     Solution,
     Watch,
@@ -169,11 +169,11 @@ def _guided(
         return None
 
 
-def _behind(goal: float) -> Behind:
+def _behind(goal: float) -> Shortfall:
     """How far the −2 ln L of a solution, its shared numbers at their best, lies above that of `goal`."""
 
-    def lacking(grams: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
-        reached = deviance(marginal(grams, problem, state), problem, state, state.spread, restricted=False)
+    def lacking(cross_products: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
+        reached = deviance(marginal(cross_products, problem, state), problem, state, state.spread, restricted=False)
         return reached + 2 * goal
 
     return lacking
@@ -301,8 +301,10 @@ def solve_onward(
     SimulationError
         If the model cannot be followed.
     """
-    problem = replace(make_problem(predictor, before.state.trial_effects), own_centre=before.problem.own_centre)
-    state = led_back(predictor, problem, replace(before.state, theta=theta), held, search=search)
+    problem = replace(
+        make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
+    )
+    state = start_at_held_noise(predictor, problem, replace(before.state, theta=theta), held, search=search)
     return solve(
         predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch, search=search
     )
@@ -350,11 +352,11 @@ def solve_again(
 
 
 def _deviance(solution: Solution) -> float:
-    part = marginal(solution.grams, solution.problem, solution.state)
+    part = marginal(solution.cross_products, solution.problem, solution.state)
     return deviance(part, solution.problem, solution.state, solution.state.spread)
 
 
-def led_back(
+def start_at_held_noise(
     predictor: Predictor, problem: MixedProblem, state: FitState, held: FixedTerms, *, search: bool = False
 ) -> FitState:
     """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.

@@ -11,7 +11,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, EXPONENT, ParameterMap
-from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE, Predictor
+from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, RELEASE, Predictor
 
 EXPONENTS = (0.15, 0.37, 0.65, 1.0)
 """Exponents tried. Chosen around the published 0.37, from nearly constant friction to linear damping."""
@@ -35,19 +35,19 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     -------
     array, shape (n_trials, 4)
     """
-    trial_effects = np.zeros((len(data), OWN))
+    trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
     for i, trial_data in enumerate(data):
         if trial_data.n_rest > 0:
             trial_effects[i, RELEASE] = trial_data.time_s[trial_data.n_rest - 1]
             trial_effects[i, ORIGIN] = np.mean(trial_data.lead_position_m[: max(trial_data.n_rest - 1, 1)])
-        elif trial_data.vague_rest is not None:
+        elif trial_data.imprecise_rest is not None:
             trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = (
-                trial_data.vague_rest.release_s,
-                trial_data.vague_rest.origin_m,
+                trial_data.imprecise_rest.release_s,
+                trial_data.imprecise_rest.origin_m,
             )
         else:
             trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = trial_data.time_s[0], trial_data.lead_position_m[0]
-        if trial_data.let_in:
+        if trial_data.pressurised_in_recording:
             assert trial_data.trace is not None
             trial_effects[i, RELEASE] = min(trial_data.time_s[0], trial_data.trace[0][0])
     return trial_effects
@@ -77,7 +77,7 @@ def candidates(
     combined = list(itertools.islice(itertools.product(*tries), 12))
     starts_found: list[tuple[Floats, Floats]] = []
     for values in combined:
-        theta = np.array([number.inside(value) for value, number in zip(values, layout.free, strict=True)])
+        theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
         starts = _scan(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
         starts_found += [(start, trial_effects) for start in starts]
     scored = []
@@ -121,7 +121,7 @@ def _scan(
     starts = []
     for n in EXPONENTS if free_n else (_held_exponent(layout),):
         values = theta.copy()
-        values[free_n] = [layout.free[k].inside(n) for k in free_n]
+        values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
         guess = {
             k: float(np.exp(np.mean(np.log(drive[place == k]) - n * np.log(speed[place == k]))))
             for k in np.unique(place)
@@ -130,7 +130,7 @@ def _scan(
         for factor in DAMPING_FACTORS:
             for k, B in guess.items():
                 free = layout.free[k]
-                values[k] = free.inside(float(np.clip(factor * B, free.lower, free.upper)))
+                values[k] = free.to_scaled(float(np.clip(factor * B, free.lower, free.upper)))
             try:
                 _, misfit = align(data, predictor, values, trial_effects)
             except SimulationError:
@@ -221,7 +221,7 @@ def align(
     )
     best, misfit = trial_effects.copy(), np.zeros(len(data))
     for i, (trial_data, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
-        if trial_data.let_in:
+        if trial_data.pressurised_in_recording:
             shifts = np.zeros(1)
         elif trial_data.shows_rest:
             shifts = trial_data.frame_s * np.arange(-6, 3.01, 0.5)
@@ -240,6 +240,6 @@ def align(
 
 def _thinned(trial_data: FitTrial) -> tuple[Floats, Floats]:
     """At most sixty points, most of them in motion."""
-    begin = 0 if trial_data.let_in else max(trial_data.n_rest - 5, 0)
+    begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
     take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_LOOKED_AT).astype(int))
     return trial_data.time_s[take], trial_data.lead_position_m[take]

@@ -17,7 +17,13 @@ from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, solve
-from vinetrack.inference.part_of_trials import Indices, numbers_felt, subset_frame, subset_predictor, subset_state
+from vinetrack.inference.part_of_trials import (
+    Indices,
+    parameters_of_trials,
+    subset_problem,
+    subset_predictor,
+    subset_state,
+)
 
 
 def fit_subset(
@@ -53,17 +59,17 @@ def fit_subset(
         If no trial is kept, one is unknown, or the model cannot be followed.
     """
     rows = _rows(fit, keep)
-    places = numbers_felt(fit.predictor.layout, rows)
+    places = parameters_of_trials(fit.predictor.layout, rows)
     predictor = subset_predictor(fit.predictor, rows, places)
     state = subset_state(fit.state, rows, places)
-    problem = subset_frame(fit.solution.problem, predictor.layout, rows, places)
+    problem = subset_problem(fit.solution.problem, predictor.layout, rows, places)
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
     problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
     # The numbers of a fit include what smooth errors of position moved them by; its state does not.
     reported = {number.name: number.value for number in fit.numbers}
     stays = [
-        number.inside(reported[number.name]) if not moves and number.name in reported else theta
+        number.to_scaled(reported[number.name]) if not moves and number.name in reported else theta
         for number, moves, theta in zip(predictor.layout.free, free, state.theta, strict=True)
     ]
     state = replace(state, theta=np.array(stays, dtype=float))

@@ -65,9 +65,9 @@ class Systematics:
 
     Parameters
     ----------
-    columns : list of arrays, shape (n_points, n_felt), m
+    columns : list of arrays, shape (n_points, n_columns), m
         One a trial.
-    places : array of int, shape (n_trials, n_felt)
+    places : array of int, shape (n_trials, n_columns)
         Which error each column belongs to, `count` where a trial does not feel one of that kind.
     count : int
         Number of errors of the campaign.
@@ -95,7 +95,7 @@ class Systematics:
         """
         return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
 
-    def put_back(self, columns: Sequence[Floats]) -> list[Floats]:
+    def at_zero_errors(self, columns: Sequence[Floats]) -> list[Floats]:
         """Columns of a fit with what the errors explain so far in the residual, the last column, again.
 
         Parameters
@@ -116,7 +116,7 @@ class Systematics:
         return whole
 
     @property
-    def n_felt(self) -> int:
+    def n_columns(self) -> int:
         """Columns of each trial."""
         return self.places.shape[1]
 
@@ -157,15 +157,15 @@ def systematics_of(
         *([film_errors(predictor, solution, trials)] if film else []),
         *(_felt_by_all(columns) for columns in dense),
     ]
-    columns = [np.empty((size, sum(part.n_felt for part in parts))) for size in points]
-    places = np.empty((len(points), sum(part.n_felt for part in parts)), dtype=int)
+    columns = [np.empty((size, sum(part.n_columns for part in parts))) for size in points]
+    places = np.empty((len(points), sum(part.n_columns for part in parts)), dtype=int)
     count, begin, total = 0, 0, sum(part.count for part in parts)
     for part in parts:
-        beside = slice(begin, begin + part.n_felt)
+        beside = slice(begin, begin + part.n_columns)
         places[:, beside] = np.where(part.places < part.count, count + part.places, total)
         for column, felt in zip(columns, part.columns, strict=True):
             column[:, beside] = felt
-        count, begin = count + part.count, begin + part.n_felt
+        count, begin = count + part.count, begin + part.n_columns
     return Systematics(columns, places, total, recorded.told)
 
 
@@ -232,7 +232,7 @@ def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
 def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     """The error of the pressure that was set for a condition; its replicates have it together."""
     data = [trial_data.trial for trial_data in predictor.data]
-    feels = predictor.feels_pressure & np.array([trial_data.trace is None for trial_data in predictor.data])
+    feels = predictor.has_pressure_deviation & np.array([trial_data.trace is None for trial_data in predictor.data])
     if not feels.any():
         return Systematics.none([len(sensitivities) for sensitivities in solution.columns])
     columns = [np.zeros((len(sensitivities), 1)) for sensitivities in solution.columns]
@@ -283,8 +283,8 @@ def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only:
         return nothing
     told = [np.zeros(trial_data.time_s.size) for trial_data in data]
     for told_m, column, trial_data in zip(told, columns, data, strict=True):
-        if trial_data.trace_told is not None:
-            told_m += column[:, : trial_data.trace_told.size] @ trial_data.trace_told
+        if trial_data.trace_error_sizes is not None:
+            told_m += column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
     return Systematics(columns, places, sum(counts), told)
 
 

@@ -21,13 +21,13 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.mixed_effects import (
     bounded_solve,
-    cross_products,
-    cross_products_vector,
-    solve_each,
+    sum_matrix_blocks,
+    sum_vector_blocks,
+    solve_per_trial,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, is_poor_fit
-from vinetrack.inference.sensitivity import OWN, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures
 
@@ -38,7 +38,7 @@ never asked. Chosen: −2 ln L is quadratic about the likeliest, and 0.1 in one 
 is asked now and then, at twice 0.04."""
 
 
-def with_errors_told(
+def with_fitted_trace_errors(
     predictor: Predictor,
     solution: Solution,
     held: FixedTerms,
@@ -73,7 +73,7 @@ def with_errors_told(
     for _ in range(MOST_ROUNDS):
         if is_poor_fit(predictor, solution):
             break
-        moved = told_by_motion(predictor, solution)
+        moved = trace_error_step(predictor, solution)
         if not np.max(np.abs(moved), initial=0.0) > SETTLED:
             break
         mended = [_mended(trial_data, more) for trial_data, more in zip(predictor.data, moved, strict=True)]
@@ -100,10 +100,14 @@ def penalty(data: Sequence[FitTrial]) -> float:
     -------
     float
     """
-    return sum(float(np.sum(trial_data.trace_told**2)) for trial_data in data if trial_data.trace_told is not None)
+    return sum(
+        float(np.sum(trial_data.trace_error_sizes**2))
+        for trial_data in data
+        if trial_data.trace_error_sizes is not None
+    )
 
 
-def mended_Pa(trial_data: FitTrial) -> Floats:
+def trace_correction_Pa(trial_data: FitTrial) -> Floats:
     """By how much a fit moved the recorded pressure of a trial.
 
     Parameters
@@ -116,9 +120,9 @@ def mended_Pa(trial_data: FitTrial) -> Floats:
     array, shape (n_samples,), Pa
     """
     assert trial_data.trace is not None
-    if trial_data.trace_errors_Pa is None or trial_data.trace_told is None:
+    if trial_data.trace_errors_Pa is None or trial_data.trace_error_sizes is None:
         return np.zeros(trial_data.trace[0].size)
-    return trial_data.trace_errors_Pa @ trial_data.trace_told
+    return trial_data.trace_errors_Pa @ trial_data.trace_error_sizes
 
 
 def as_recorded(trial_data: FitTrial) -> FitTrial:
@@ -132,9 +136,9 @@ def as_recorded(trial_data: FitTrial) -> FitTrial:
     -------
     FitTrial
     """
-    if trial_data.trace_told is None:
+    if trial_data.trace_error_sizes is None:
         return trial_data
-    return replace(_mended(trial_data, -trial_data.trace_told), trace_told=None)
+    return replace(_mended(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
 
 
 def _has_errors(trial_data: FitTrial) -> bool:
@@ -151,11 +155,11 @@ def _mended(trial_data: FitTrial, more: Floats) -> FitTrial:
     clock_s, pressure_Pa = trial_data.trace
     errors_Pa = trial_data.trace_errors_Pa
     more = more[: errors_Pa.shape[1]]
-    told = more if trial_data.trace_told is None else trial_data.trace_told + more
-    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ more), trace_told=told)
+    told = more if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes + more
+    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ more), trace_error_sizes=told)
 
 
-def told_by_motion(predictor: Predictor, solution: Solution) -> Floats:
+def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     """By how many standard deviations each error moves beside what was found before.
 
     Parameters
@@ -169,22 +173,24 @@ def told_by_motion(predictor: Predictor, solution: Solution) -> Floats:
         0 for errors that a trial does not have, and in all where a trial cannot be simulated with one of them.
     """
     errors = recorded_pressures(predictor, solution, curves_only=True)
-    if not errors.n_felt:
+    if not errors.n_columns:
         return np.zeros((len(predictor.data), 0))
-    told = np.zeros((len(predictor.data), errors.n_felt))
+    told = np.zeros((len(predictor.data), errors.n_columns))
     for row, trial_data in zip(told, predictor.data, strict=True):
-        if trial_data.trace_told is not None:
-            row[: trial_data.trace_told.size] = trial_data.trace_told
+        if trial_data.trace_error_sizes is not None:
+            row[: trial_data.trace_error_sizes.size] = trial_data.trace_error_sizes
     problem, state = solution.problem, solution.state
-    grams = predictor.products([np.column_stack(both) for both in zip(solution.columns, errors.columns, strict=True)])
-    p = solution.grams.shape[-1] - OWN - 1
-    blocks = trial_effects_eliminated(grams, p, problem, state)
+    cross_products = predictor.products(
+        [np.column_stack(both) for both in zip(solution.columns, errors.columns, strict=True)]
+    )
+    p = solution.cross_products.shape[-1] - N_TRIAL_EFFECTS - 1
+    blocks = trial_effects_eliminated(cross_products, p, problem, state)
     # What is left once the errors are eliminated as well, each with its prior of standard deviation 1.
-    square = blocks[:, p + 1 :, p + 1 :] + np.eye(errors.n_felt)
+    square = blocks[:, p + 1 :, p + 1 :] + np.eye(errors.n_columns)
     mixed, slope = blocks[:, p + 1 :, :p], blocks[:, p + 1 :, p] - told
-    solved = solve_each(square, np.concatenate([mixed, slope[:, :, None]], axis=2))
-    information = cross_products(blocks[:, :p, :p] - np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
-    gradient = cross_products_vector(blocks[:, :p, p] - np.einsum("nek,ne->nk", mixed, solved[:, :, -1]), problem)
+    solved = solve_per_trial(square, np.concatenate([mixed, slope[:, :, None]], axis=2))
+    information = sum_matrix_blocks(blocks[:, :p, :p] - np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
+    gradient = sum_vector_blocks(blocks[:, :p, p] - np.einsum("nek,ne->nk", mixed, solved[:, :, -1]), problem)
     gradient -= problem.prior_precision * (state.theta - problem.prior_mean)
     step, _ = bounded_solve(information + np.diag(problem.prior_precision), gradient, problem, state.theta)
     spread_out = np.append(step, 0.0)[problem.index]

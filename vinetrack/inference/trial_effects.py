@@ -23,12 +23,12 @@ from vinetrack.inference.mixed_effects import (
     trial_effect_prior,
     trial_effect_step,
 )
-from vinetrack.inference.part_of_trials import numbers_felt, subset_frame, subset_predictor, subset_state
+from vinetrack.inference.part_of_trials import parameters_of_trials, subset_problem, subset_predictor, subset_state
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     ORIGIN,
-    OWN,
+    N_TRIAL_EFFECTS,
     PRESSURE,
     RELEASE,
     Predictor,
@@ -48,7 +48,7 @@ LARGEST_RELEASE_STEP_FRAMES = 2.0
 """Chosen with the two above as a trust region; at half releases take more steps, at twice they overshoot."""
 
 
-def follow_trial_effects(
+def optimise_trial_effects(
     predictor: Predictor, problem: MixedProblem, state: FitState, most: float = math.inf
 ) -> tuple[FitState, Floats]:
     """The trials' own numbers brought to their best for the others, and the costs there.
@@ -69,25 +69,25 @@ def follow_trial_effects(
     state : FitState
     costs : array, shape (n_trials,)
     """
-    columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
-    grams = predictor.products(columns)
-    steps = [trial_effect_step(grams, problem, state, pinned=pinned) for pinned in (False, True)]
+    columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
+    cross_products = predictor.products(columns)
+    steps = [trial_effect_step(cross_products, problem, state, pinned=pinned) for pinned in (False, True)]
     here = trial_costs(predictor, problem, state, residuals_in(columns))
-    if float(np.sum(here - _promised(grams, problem, state, steps[0]))) >= most:
+    if float(np.sum(here - _promised(cross_products, problem, state, steps[0]))) >= most:
         return state, here
     moved = [limited(predictor, state.trial_effects, step) for step in steps]
     ways = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved)]
-    there = zip(ways[1:], predictor.residuals_of_ways(state.theta, moved), strict=True)
+    there = zip(ways[1:], predictor.residuals_of_each(state.theta, moved), strict=True)
     costs = np.array([here, *(trial_costs(predictor, problem, way, left_m) for way, left_m in there)])
     best = np.argmin(costs, axis=0)
     trial_effects = np.array([ways[way].trial_effects[i] for i, way in enumerate(best)])
     return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
 
 
-def _promised(grams: Floats, problem: MixedProblem, state: FitState, step: Floats) -> Floats:
+def _promised(cross_products: Floats, problem: MixedProblem, state: FitState, step: Floats) -> Floats:
     """By how much a step of each trial's own numbers to their linear best lowers its cost, shape (n_trials,)."""
     centre, precision = trial_effect_prior(problem, state)
-    told = at_correlation(grams[:, :, :OWN, -1:], state.rho)[:, :, 0] / state.variance[:, None]
+    told = at_correlation(cross_products[:, :, :N_TRIAL_EFFECTS, -1:], state.rho)[:, :, 0] / state.variance[:, None]
     return np.asarray(np.sum(step * (told - precision * (state.trial_effects - centre)), axis=1))
 
 
@@ -206,7 +206,7 @@ class ReleaseSearch:
 
     def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
         self.predictor, self.problem = predictor, problem
-        self.led_back = np.zeros(len(predictor.data), dtype=bool)
+        self.returned = np.zeros(len(predictor.data), dtype=bool)
         self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
         self.numbers = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
@@ -229,7 +229,7 @@ class ReleaseSearch:
         release_s = state.trial_effects[:, RELEASE]
         back = np.abs(release_s - self.jumped_from) < LED_BACK * np.abs(self.jumped_to - self.jumped_from)
         # Where the shared numbers have moved since, it is they that led there.
-        self.led_back |= back & (np.max(np.abs(state.theta - self.numbers), axis=1, initial=0.0) < SAME_NUMBERS)
+        self.returned |= back & (np.max(np.abs(state.theta - self.numbers), axis=1, initial=0.0) < SAME_NUMBERS)
         tried = self._likelier(state, residuals)
         kept = state if tried is None else self._borne_out(state, tried)
         jumped_s = kept.trial_effects[:, RELEASE]
@@ -247,7 +247,7 @@ class ReleaseSearch:
         places = [
             i
             for i, trial_data in enumerate(predictor.data)
-            if not trial_data.let_in
+            if not trial_data.pressurised_in_recording
             and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
         ]
         if not places:
@@ -273,18 +273,18 @@ class ReleaseSearch:
         rows = np.flatnonzero((tried.trial_effects != state.trial_effects).any(axis=1))
         predictor, problem, before = self.predictor, self.problem, state
         if rows.size < len(predictor.data) and predictor.divisible:
-            places = numbers_felt(predictor.layout, rows)
+            places = parameters_of_trials(predictor.layout, rows)
             predictor = subset_predictor(predictor, rows, places)
-            problem = subset_frame(problem, predictor.layout, rows, places)
+            problem = subset_problem(problem, predictor.layout, rows, places)
             before, tried = (subset_state(each, rows, places) for each in (state, tried))
         else:
             rows = np.arange(len(predictor.data))
         for _ in range(IMPROVED):
-            tried = follow_trial_effects(predictor, problem, tried)[0]
+            tried = optimise_trial_effects(predictor, problem, tried)[0]
         better = _levels(predictor, problem, tried) < _levels(predictor, problem, before) - WORTH_MOVING
-        if self.led_back[rows].any():
+        if self.returned[rows].any():
             lower = trial_costs(predictor, problem, tried) < trial_costs(predictor, problem, before)
-            better &= lower | ~self.led_back[rows]
+            better &= lower | ~self.returned[rows]
         trial_effects = state.trial_effects.copy()
         trial_effects[rows[better]] = tried.trial_effects[better]
         return replace(state, trial_effects=trial_effects)
@@ -292,11 +292,11 @@ class ReleaseSearch:
 
 def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
     """−2 ln L of every trial with its own numbers integrated out about where they stand, shape (n_trials,)."""
-    columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
+    columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     white = at_correlation(predictor.products(columns), state.rho)
-    square = white[:, :OWN, :OWN] / state.variance[:, None, None]
+    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] / state.variance[:, None, None]
     precision = trial_effect_prior(problem, state)[1]
-    log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
+    log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS))[1]
     return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
 
 
@@ -358,10 +358,10 @@ def _answers(
     for job, tried_s in zip(plain, releases, strict=True):
         i = job.trial
         ways = [((-1, 0.0), job)]
-        if predictor.feels_pressure[i]:
+        if predictor.has_pressure_deviation[i]:
             deviation = job.pressure_deviation + PRESSURE_STEP
             ways.append(((PRESSURE, PRESSURE_STEP), job._replace(pressure_deviation=deviation)))
-        if predictor.feels_damping[i]:
+        if predictor.has_damping_deviation[i]:
             row = job.row.copy()
             row[predictor.damping_column] *= np.exp(DAMPING_STEP)
             ways.append(((DAMPING_DEVIATION, DAMPING_STEP), job._replace(row=row)))
@@ -375,7 +375,7 @@ def _answers(
     for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=instants), strict=True):
         y = moved.observed_position_m
         if place < 0:
-            answers = np.zeros((OWN, times.size))
+            answers = np.zeros((N_TRIAL_EFFECTS, times.size))
             answers[RELEASE] = -np.gradient(y, times)
             answers[ORIGIN] = 1.0
             answers_found.append((times, y, answers))

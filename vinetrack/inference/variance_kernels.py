@@ -156,13 +156,13 @@ def sums_without_deviations(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def noise_at_correlations(
-    grams: Floats, stiff: Floats, pull_back: Floats, points: Floats, rhos: Floats, shared: float, least: float
+    cross_products: Floats, stiff: Floats, pull_back: Floats, points: Floats, rhos: Floats, shared: float, least: float
 ) -> tuple[Floats, Floats, Floats]:
     """What every trial leaves at each correlation of the noise once its own numbers are fitted.
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, m + 1, m + 1)
+    cross_products : array, shape (n_trials, 3, m + 1, m + 1)
         Products of the trial's own numbers and the residual, see `whitening`.
     stiff, pull_back : arrays, shape (n_trials, m)
         Precision of the own numbers, and that times how far they are from their centre, in units of the noise.
@@ -188,7 +188,7 @@ def noise_at_correlations(
     for k in range(len(rhos)):
         rho = rhos[k]
         for i in range(trials):
-            plain, mixed, shifted = grams[i, 0], grams[i, 1], grams[i, 2]
+            plain, mixed, shifted = cross_products[i, 0], cross_products[i, 1], cross_products[i, 2]
             for u in range(m + 1):
                 for v in range(m + 1):
                     white[u, v] = plain[u, v] - rho * mixed[u, v] + rho * rho * shifted[u, v]

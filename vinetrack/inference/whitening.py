@@ -78,12 +78,12 @@ def all_products(
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def at_correlation(grams: Floats, rho: float) -> Floats:
+def at_correlation(cross_products: Floats, rho: float) -> Floats:
     """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1.
 
     Parameters
     ----------
-    grams : array, shape (n_trials, 3, k, k)
+    cross_products : array, shape (n_trials, 3, k, k)
         From `all_products`.
     rho : float
         Lag-one correlation.
@@ -92,7 +92,7 @@ def at_correlation(grams: Floats, rho: float) -> Floats:
     -------
     array, shape (n_trials, k, k)
     """
-    return np.asarray(grams[:, 0] - rho * grams[:, 1] + rho**2 * grams[:, 2])
+    return np.asarray(cross_products[:, 0] - rho * cross_products[:, 1] + rho**2 * cross_products[:, 2])
 
 
 def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: Floats | None = None) -> Floats:

@@ -27,10 +27,10 @@ from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import END_FRACTION, FitTrial
 from vinetrack.inference.fit_problem import make_problem
-from vinetrack.inference.marginal_likelihood import left_to_keys, marginal
+from vinetrack.inference.marginal_likelihood import deviations_eliminated, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.parameters import DAMPING, EXPONENT, FreeParameter, ParameterMap, make_layout
-from vinetrack.inference.sensitivity import OWN, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.whitening import all_products
 from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
@@ -228,19 +228,19 @@ def information(
     """
     layout = make_layout(model, data)
     predictor = Predictor(layout, data)
-    trial_effects = np.zeros((len(data), OWN))
+    trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
     theta = layout.start
     predictor.linearise(theta, trial_effects)  # its steps are right the second time
     columns = predictor.linearise(theta, trial_effects)
-    grams = all_products(columns, [trial_data.first for trial_data in data])
+    cross_products = all_products(columns, [trial_data.first for trial_data in data])
     problem = make_problem(predictor, trial_effects)
     variance = np.full(len(data), camera.noise_m**2 * (1 - camera.noise_correlation**2))
     state = FitState(theta, trial_effects, spreads, camera.noise_correlation, variance)
-    return _information(layout, problem, state, grams)
+    return _information(layout, problem, state, cross_products)
 
 
-def _information(layout: ParameterMap, problem: MixedProblem, state: FitState, grams: Floats) -> Information:
-    left, _ = left_to_keys(marginal(grams, problem, state), problem, state.spread)
+def _information(layout: ParameterMap, problem: MixedProblem, state: FitState, cross_products: Floats) -> Information:
+    left, _ = deviations_eliminated(marginal(cross_products, problem, state), problem, state.spread)
     count = len(layout.free)
     each = np.zeros((len(left), count + 1, count + 1))
     for k, block in enumerate(left):

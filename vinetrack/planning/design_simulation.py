@@ -55,7 +55,7 @@ class PartlyLinear(Predictor):
         self.new.steps = old.steps.copy()
 
     def linearise(
-        self, theta: Floats, trial_effects: Floats, *, own_only: bool = False, past_end: bool = False
+        self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
     ) -> list[Floats]:
         """Residuals and sensitivities, as `Predictor.linearise`; those of the old trials with constant sensitivities.
 
@@ -63,9 +63,9 @@ class PartlyLinear(Predictor):
         ----------
         theta : array, shape (n_free,)
             Free numbers, scaled.
-        trial_effects : array, shape (n_trials, OWN)
+        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
             Release, origin and deviations of each trial.
-        own_only : bool
+        trial_effects_only : bool
             Sensitivities of the new trials to trial effects alone.
         past_end : bool
             Run trajectories of the new trials on past the end of growth.
@@ -77,7 +77,9 @@ class PartlyLinear(Predictor):
         """
         moved = self.residuals_of_old(theta, trial_effects)
         columns = [np.column_stack([known[:, :-1], r]) for known, r in zip(self.known, moved, strict=True)]
-        return columns + self.new.linearise(theta, trial_effects[self.old :], own_only=own_only, past_end=past_end)
+        return columns + self.new.linearise(
+            theta, trial_effects[self.old :], trial_effects_only=trial_effects_only, past_end=past_end
+        )
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted positions of all trials, m.
@@ -86,7 +88,7 @@ class PartlyLinear(Predictor):
         ----------
         theta : array, shape (n_free,)
             Free numbers, scaled.
-        trial_effects : array, shape (n_trials, OWN)
+        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
             Release, origin and deviations of each trial.
 
         Returns
@@ -95,14 +97,14 @@ class PartlyLinear(Predictor):
         """
         return self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.old :])
 
-    def residuals_of_ways(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
+    def residuals_of_each(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
         """`residuals` for several sets of the trials' own numbers.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
             Free numbers, scaled.
-        ways : sequence of arrays, shape (n_trials, OWN)
+        ways : sequence of arrays, shape (n_trials, N_TRIAL_EFFECTS)
 
         Returns
         -------
@@ -118,7 +120,7 @@ class PartlyLinear(Predictor):
         ----------
         theta : array, shape (n_free,)
             Free numbers, scaled.
-        trial_effects : array, shape (n_trials, OWN)
+        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
             Release, origin and deviations of each trial.
 
         Returns
@@ -260,7 +262,9 @@ def _refitted(hypothesis: Hypothesis, seen: Sequence[tuple[int, FitTrial]], *, t
         problem = make_problem(quick, state.trial_effects)
         problem = replace(
             problem,
-            own_centre=np.concatenate([old.problem.own_centre, problem.own_centre[len(old.problem.own_centre) :]]),
+            release_origin_mean=np.concatenate(
+                [old.problem.release_origin_mean, problem.release_origin_mean[len(old.problem.release_origin_mean) :]]
+            ),
         )
         # Spreads and noise stay until the numbers have moved: what is only not yet fitted must not pass for scatter.
         told = FixedTerms(state.spread, (state.rho, state.variance))

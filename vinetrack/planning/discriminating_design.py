@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.mixed_effects import SPREAD_COLUMNS, solve_each
-from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, solve_per_trial
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis, View
 from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank
@@ -124,7 +124,7 @@ def all_sides(
     data = hypotheses[0].fit.predictor.data
     times, weights = zip(*(_times(lens, run) for lens, run in zip(cameras, runs, strict=True)), strict=True)
     items = [blank(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
-    trial_effects = np.zeros((len(conditions), OWN))
+    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
     predictors = [hypothesis.predictor(range(len(conditions)), items) for hypothesis in hypotheses]
     columns = [
         np.stack(p.linearise(hypothesis.theta, trial_effects))
@@ -135,7 +135,7 @@ def all_sides(
     motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     sides = []
     for k, (hypothesis, mine, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
-        feels = np.column_stack([predictor.feels_pressure, predictor.feels_damping])
+        feels = np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation])
         sides.append(_side(hypothesis, mine * heavy, (motions - motions[:, :, [k]]) * heavy, feels))
     return sides
 
@@ -178,10 +178,12 @@ def _side(hypothesis: Hypothesis, columns: Floats, gaps: Floats, feels: NDArray[
 
 def _left(hypothesis: Hypothesis, view: View, products: Floats) -> tuple[Floats, Floats, Floats]:
     """Information, pull and gap with the own numbers of a trial eliminated, placed among all free numbers."""
-    precision = np.full(OWN, 1e-9)
-    precision[list(SPREAD_COLUMNS)] = 1 / np.array(view.spread) ** 2
-    within_trial = products[:, :OWN, :OWN] + np.diag(precision)
-    reduced = products[:, OWN:, OWN:] - products[:, OWN:, :OWN] @ solve_each(within_trial, products[:, :OWN, OWN:])
+    precision = np.full(N_TRIAL_EFFECTS, 1e-9)
+    precision[list(DEVIATION_COLUMNS)] = 1 / np.array(view.spread) ** 2
+    within_trial = products[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(precision)
+    reduced = products[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - products[
+        :, N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS
+    ] @ solve_per_trial(within_trial, products[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:])
     index = hypothesis.layout.index
     n, keys, size = len(products), index.shape[1], hypothesis.theta.size
     every = np.arange(n)
@@ -237,7 +239,7 @@ def _best_refit(square: Floats, slope: Floats, down: Floats, up: Floats) -> Floa
         loose = ~held
         right = np.where(loose, slope - np.einsum("nij,nj->ni", square, np.where(held, step, 0.0)), 0.0)
         kept = square * (loose[:, :, None] & loose[:, None, :]) + held[:, :, None] * np.eye(size)
-        solved = solve_each(kept, right[:, :, None])[:, :, 0]
+        solved = solve_per_trial(kept, right[:, :, None])[:, :, 0]
         step = np.where(loose, solved, step)
         out = loose & ((step < down) | (step > up))
         if not out.any():

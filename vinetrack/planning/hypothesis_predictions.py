@@ -16,7 +16,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import LARGEST_SPREAD, marginal, normal_equations
-from vinetrack.inference.mixed_effects import LEAST_SPREAD
+from vinetrack.inference.mixed_effects import LEAST_BETWEEN_TRIAL_SD
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.planning.feasible_trials import Condition
@@ -146,7 +146,7 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         name=name,
         fit=fit,
         layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index).reshape(len(conditions), -1), base),
-        theta=np.concatenate([state.theta, [number.inside(number.start) for number in added]]),
+        theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
         views=_views(fit, np.array([1 / OPEN**2 + (number.scale / number.prior_sd) ** 2 for number in added])),
         spread_of_new=np.array(moved),
         rho=state.rho,
@@ -158,15 +158,15 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
 def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
     """What the trials so far say, with all the scatter that a refit may come to; new numbers by their priors alone."""
     state, problem = fit.solution.state, fit.solution.problem
-    part = marginal(fit.solution.grams, problem, state)
+    part = marginal(fit.solution.cross_products, problem, state)
     views: dict[tuple[float, float], View] = {}
     plain = 0.0
     for factors in WIDER:
         spread = tuple(
-            min(s * factor, most) if can and s > LEAST_SPREAD else s
+            min(s * factor, most) if can and s > LEAST_BETWEEN_TRIAL_SD else s
             for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
         )
-        pair = (max(spread[0], LEAST_SPREAD), max(spread[1], LEAST_SPREAD))
+        pair = (max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD))
         if pair in views:
             continue
         information, slope, square, log_det = normal_equations(part, problem, state, pair)
@@ -175,7 +175,10 @@ def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
         wide[:old, :old] = information
         wide[range(old, size), range(old, size)] = precision_of_new
         plain = plain if views else square + log_det
-        wider = (pair[0] / max(state.spread[0], LEAST_SPREAD), pair[1] / max(state.spread[1], LEAST_SPREAD))
+        wider = (
+            pair[0] / max(state.spread[0], LEAST_BETWEEN_TRIAL_SD),
+            pair[1] / max(state.spread[1], LEAST_BETWEEN_TRIAL_SD),
+        )
         leans = np.concatenate([slope, np.zeros(size - old)])
         views[pair] = View(pair, wider, wide, leans, square + log_det - plain)
     return tuple(views.values())

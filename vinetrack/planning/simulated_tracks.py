@@ -13,7 +13,7 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, EXPONENT
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
@@ -146,7 +146,7 @@ def courses(
     times = [np.linspace(0.0, camera.longest_s, TIMES_LOOKED_AT) for camera in cameras]
     items = [blank(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
     every = range(len(conditions))
-    trial_effects = np.zeros((len(conditions), OWN))
+    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
     runs: list[list[Trajectory | None]] = []
     jobs: list[Job] = []
     for hypothesis in hypotheses:
@@ -208,7 +208,7 @@ def _slackness(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> f
 
 def _slackest_so_far(fit: Fit) -> float:
     """Largest slackness among the trials of the experiment."""
-    jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), OWN)))
+    jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
     slack = [
         _slackness(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
         for trial_fit, job in zip(fit.trials, jobs, strict=True)
@@ -256,11 +256,11 @@ def film(
     ]
     items = [blank(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
     predictor = truth.predictor(places, items)
-    trial_effects = np.zeros((len(chosen), OWN))
+    trial_effects = np.zeros((len(chosen), N_TRIAL_EFFECTS))
     trial_effects[:, RELEASE] = [(lens.rest_frames - 1 + rng.uniform()) * lens.frame_s for lens in lenses]
     trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
-    trial_effects[:, PRESSURE] = np.where(predictor.feels_pressure, deviations[:, 0], 0.0)
-    trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.feels_damping, deviations[:, 1], 0.0)
+    trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
+    trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
     seen = []
     for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
         stop = times[i].size
