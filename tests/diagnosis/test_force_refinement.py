@@ -16,7 +16,7 @@ from vinetrack.diagnosis.force_surface import Surface, curves, domains
 from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE
 
 
 @pytest.fixture(scope="module")

@@ -14,15 +14,15 @@ from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
-from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_between_trial_sd, marginal
+from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, estimate_noise, marginal
 from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
-    bounded_solve,
-    sum_matrix_blocks,
-    levenberg_marquardt_step,
     at_zero_deviations,
+    bounded_solve,
+    levenberg_marquardt_step,
     spreads,
+    sum_matrix_blocks,
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution

@@ -14,11 +14,11 @@ from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import (
     deviance,
-    profiled_deviance,
-    estimate_between_trial_sd,
     deviations_eliminated,
+    estimate_between_trial_sd,
     marginal,
     normal_equations,
+    profiled_deviance,
 )
 from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import Solution

@@ -28,7 +28,7 @@ from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEH
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState, solve_per_trial, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.trajectory_jobs import Jobs
 from vinetrack.inference.whitening import at_correlation

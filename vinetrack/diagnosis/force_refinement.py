@@ -31,7 +31,7 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.parameters import YIELD_PRESSURE
-from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, RELEASE
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import whiten
 

@@ -25,10 +25,10 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     LEAST_BETWEEN_TRIAL_SD,
     FitState,
-    sum_matrix_blocks,
-    sum_vector_blocks,
     inverse_of_block,
     solve_per_trial,
+    sum_matrix_blocks,
+    sum_vector_blocks,
 )
 from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes

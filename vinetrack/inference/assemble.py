@@ -23,8 +23,8 @@ from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, Parame
 from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import too_few_clusters, widened_covariance
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.trace_errors import trace_correction_Pa, penalty
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.trace_errors import penalty, trace_correction_Pa
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten

@@ -90,20 +90,22 @@ class ImpreciseRest:
 
 @dataclass(frozen=True)
 class FitTrial:
-    """One trial as a fit sees it; arrays have shape (n_points,).
+    """One trial as a fit sees it; arrays have shape (n_points,) unless stated.
 
-    `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
-    where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
-    `imprecise_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
-    pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
-    wrong along the whole motion, the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are one standard
-    deviation each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_error_sizes`, shape (n_errors,),
-    is by how many of them it moved the trace from the recorded one (`vinetrack.inference.trace_errors`).
-    `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
-    changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
-    the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
-    `slow_m` is the standard deviation of the tracker's slow error at each point, None where positions were measured
-    elsewhere.
+    Positions: `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the
+    motion, 0 where the track begins in motion. `imprecise_rest` replaces a rest whose points are left out.
+
+    Noise: `noise_m` and `correlation` are estimated from the track alone, without a model. `relative_sd` is the noise
+    of each point relative to `noise_m`, with a geometric mean of 1 so that it leaves the likelihood unchanged by
+    itself; None where all points are equally noisy. It follows from `blur_s`, the noise per speed, or, where that is 0,
+    from `stated_m`, the standard deviations in the file. `slow_m` is the standard deviation of the tracker's slowly
+    varying error at each point, None where positions were measured elsewhere.
+
+    Recorded pressure: `trace` holds time, s, on the clock of the track, and gauge pressure, Pa, with one extrapolated
+    sample at its end. Gauge noise leaves two errors in it: `gauge_error`, relative, constant over the motion; and the
+    columns of `trace_errors_Pa`, shape (n_samples, n_errors), one standard deviation each of an error that varies in
+    time. Where `trace_is_curve`, a fit estimates the latter: `trace_error_sizes`, shape (n_errors,), are the estimates
+    already added to the trace, in standard deviations (`vinetrack.inference.trace_errors`).
     """
 
     trial: Trial

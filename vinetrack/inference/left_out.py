@@ -18,8 +18,8 @@ from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
-    ORIGIN,
     N_TRIAL_EFFECTS,
+    ORIGIN,
     PRESSURE,
     RELEASE,
     RELEASE_STEP_FRAMES,

@@ -26,8 +26,8 @@ About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + 
    analytically so that the cost is linear in the number of trials; then new trajectories (Lindstrom & Bates, Biometrics
    46, 673, 1990).
 2. σ_P and σ_B by the restricted likelihood of the linear model, u_i and θ integrated out
-   (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). One that too few trials
-   feel stays as stated.
+   (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). One that applies
+   to too few trials stays as stated.
 3. ρ and v_i by the restricted likelihood of what is left once u_i has been fitted, v_i drawn to the common variance as
    far as trials differ by chance (`marginal_likelihood.estimate_noise`).
 4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ at its best and σ_P, σ_B at
@@ -74,12 +74,13 @@ class FitState:
 class MixedProblem:
     """What does not change during a fit.
 
-    `index`, shape (n_trials, n_keys), places each trial's columns among the free numbers; `feels`, shape (n_trials, 2),
-    tells which trials have a deviation of pressure and of B; `gauge_error`, shape (n_trials,), the relative error of a
-    pressure that was measured, 0 of one that was set; `release_origin_mean` and `release_origin_precision`, shape (n_trials, 2),
-    belong to release and origin: so wide a prior that it only matters where a track leaves them open.
-    `free` marks the numbers that may move; `points` and `stretches` count those of each trial. `random` marks numbers
-    that are random effects of a group of trials, their priors being the distribution of the groups.
+    `index`, shape (n_trials, n_keys), maps each trial's sensitivity columns to the free parameters, -1 where a trial
+    does not depend on one. `feels`, shape (n_trials, 2), tells which trials have a deviation of pressure and of B.
+    `gauge_error`, shape (n_trials,), is the relative error of a measured pressure, 0 for a set pressure.
+    `release_origin_mean` and `release_origin_precision`, shape (n_trials, 2), are the prior of release and origin, so
+    wide that it matters only where a track leaves them undetermined. `free` marks the parameters that are estimated;
+    `points` and `stretches` count those of each trial. `random` marks parameters that are random effects of a group of
+    trials; their prior is the distribution of the groups.
     """
 
     index: NDArray[np.int_]

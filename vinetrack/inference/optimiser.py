@@ -11,13 +11,13 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import estimable, floor, track_correlation
-from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_between_trial_sd, marginal
+from vinetrack.inference.marginal_likelihood import estimate_between_trial_sd, estimate_noise, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import (
     ReleaseSearch,
-    optimise_trial_effects,
     limited,
+    optimise_trial_effects,
     residuals_in,
     trial_costs,
 )
@@ -86,7 +86,11 @@ class FixedTerms:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iterations ended. `cross_products` and `columns` belong to `state`, see `whitened` and `sensitivity`."""
+    """Where the iterations ended.
+
+    `columns` are the sensitivities and residuals of each trial at `state` (`Predictor.linearise`), `cross_products`
+    their sums of products (`whitening.products`).
+    """
 
     state: FitState
     problem: MixedProblem
@@ -152,7 +156,7 @@ def solve(
     columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
         Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
     least_decrease : float
-        Decrease of −2 ln L, predicted_decrease by a step, below which the fit has settled.
+        Predicted decrease of −2 ln L per step below which the fit has converged.
     search : bool
         Whether the fit is one of many that are held against each other: far off, it ends where it only creeps.
     behind : callable, optional

@@ -42,7 +42,7 @@ from vinetrack.inference.mixed_effects import (
 )
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes, with_shapes
-from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 
 MOST_STEPS, SETTLED = 12, 0.05
 """Steps at most, and the length of a step in standard errors at which they end. Chosen: a twentieth of an error; the

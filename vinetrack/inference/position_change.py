@@ -1,4 +1,4 @@
-"""How far the observed positions of a trial move when something about it is changed by a little."""
+"""Finite differences of the observed positions of a trial, taken correctly across the end of growth."""
 
 from __future__ import annotations
 
@@ -10,40 +10,40 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import Trajectory
 
-MOST_CONTINUED = 3.0
-"""Times the delay that a step makes over which a trajectory is continued past its end. Derived: one for motions that
-keep their speed to the end; three allows for one that slows down to a third."""
+LONGEST_EXTRAPOLATION = 3.0
+"""Time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay that the perturbation
+causes. Derived: 1 for a motion that keeps its speed to the end; 3 allows for one that slows down to a third."""
 
 
 def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
-    """End what positions move by where the growth ends; behind that nothing that only delays the end moves them.
+    """Set the change of position after the end of growth: that of the end position, or 0 where only the time changes.
 
     Parameters
     ----------
     change : array, shape (n_points,), m
-        Changed in place.
+        Modified in place.
     over : array of bool, shape (n_points,)
-        Points behind the end of the trajectories_at trajectory.
+        Points after the end of the unperturbed trajectory.
     moved_ends : bool
-        Whether the moved one comes to its end too.
+        Whether the perturbed trajectory reaches the end of growth too.
     """
     change[over] = change[-1] if moved_ends else 0.0
 
 
 def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
-    """How far the observed positions of a trial answer to a small step, m, shape (n_points,).
+    """Change of the observed positions of a trial under a small perturbation, m, shape (n_points,).
 
-    Growth ends at the same place whenever it ends, so a plain difference has a jump between the two ends, of the order
-    of the whole answer, that depends on the sign and size of the step: two effects that do exactly the same would seem
-    to differ by that one frame. So until the trajectories_at trajectory ends the moved one is continued at its last speed, and
-    from there on only what moves the place of the end counts.
+    Growth ends at the same position whenever it ends. Between the two end times a plain difference therefore has a jump
+    as large as the whole response, which depends on the sign and size of the perturbation: two effects with exactly the
+    same action would seem to differ in that one frame. So the perturbed trajectory is extrapolated at its last speed
+    until the unperturbed one ends; after that, only a change of the end position counts.
 
     Parameters
     ----------
     plain : Trajectory
-        The trajectories_at trajectory.
+        The unperturbed trajectory.
     moved : Trajectory
-        The same trial, at the same instants, with a step made.
+        The perturbed trajectory of the same trial at the same times.
 
     Returns
     -------
@@ -56,10 +56,10 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
     last = int(np.argmax(early)) - 1
     if early.any() and last >= 0:
-        # A step small enough ends growth earlier by what it moves over the speed; where the trajectories_at motion takes longer
-        # it is another one, such as a stop before the end, and is not continued.
+        # A small perturbation ends growth earlier by displacement over speed. Where the unperturbed motion takes much
+        # longer than that, the two motions differ in kind (one stops before the end), and nothing is extrapolated.
         speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
-        reach_s = plain.time_s[last] + MOST_CONTINUED * abs(float(change[last])) / speed_m_s
+        reach_s = plain.time_s[last] + LONGEST_EXTRAPOLATION * abs(float(change[last])) / speed_m_s
         early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
         if early.any():
             faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]

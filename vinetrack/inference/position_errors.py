@@ -24,8 +24,8 @@ from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.intervals import LEAST_INFORMATION
 from vinetrack.inference.marginal_likelihood import (
     deviance,
-    estimate_noise,
     estimate_between_trial_sd,
+    estimate_noise,
     marginal,
     normal_equations,
 )
@@ -175,8 +175,8 @@ def _iterated(
 ) -> tuple[FitState, Floats, Floats, float]:
     """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L.
 
-    Steps are taken as long as they raise ln L. Two numbers that only rounding tells apart may be predicted_decrease any way along
-    which they cancel; no trajectory is followed here that would refuse it.
+    Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
+    along the direction in which they cancel; no trajectory is simulated here that would reject it.
     """
     cross_products = predictor.products(columns)
     moved = np.zeros((len(cross_products), cross_products.shape[-1] - 1))

@@ -38,7 +38,7 @@ from vinetrack.inference.parameters import ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
 from vinetrack.inference.position_errors import position_shapes
 from vinetrack.inference.robust_covariance import matrix_root
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
 

@@ -15,7 +15,7 @@ import numpy as np
 from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.intervals import Precision
-from vinetrack.inference.mixed_effects import sum_matrix_blocks, inverse_of_block, trial_effects_eliminated
+from vinetrack.inference.mixed_effects import inverse_of_block, sum_matrix_blocks, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.pooling import Pooled, trial_information
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor

@@ -1,9 +1,8 @@
-"""How the predicted positions of every trial answer to what a fit may move.
+"""Sensitivities of the predicted positions of every trial to the parameters of a fit, by finite differences.
 
-Per trial there are four numbers of its own: the instant of release, the origin of position, the relative deviation of
-its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Shortfall them come the
-free numbers of the model.
-All trajectories, moved and trajectories_at, are simulated in one call.
+Each trial has four trial effects: the time of release, the origin of position, the relative deviation of its pressure
+from the set value, and the deviation of its ln B from that of its vine. The free parameters of the model come after
+them. All trajectories, perturbed and unperturbed, are simulated in one call.
 """
 
 from __future__ import annotations
@@ -29,32 +28,32 @@ from vinetrack.inference.whitening import all_products
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 N_TRIAL_EFFECTS = 4
-"""Numbers of a trial's own: release, s; origin, m; relative deviation of pressure; deviation of ln B. Defined by the
-model: release, origin, pressure, B."""
+"""Trial effects of each trial: release, s; origin, m; relative deviation of pressure; deviation of ln B. Defined by the
+model."""
 
-AIMED_RESPONSE = 2e-3
-"""Differences are taken over steps that move a trajectory by this part of its length: 1000 times the integrator's
-error, and small enough for the curvature not to count. Derived: with the integrator's 1e-6 the optimum of truncation
-against rounding lies between 1e-3 and 1e-2."""
+TARGET_RESPONSE = 2e-3
+"""Finite differences use steps that move a trajectory by this fraction of its travel: 1000 times the integrator's
+error, yet small enough to neglect curvature. Derived: with an integrator error of 1e-6 the optimum between truncation
+and rounding error lies between 1e-3 and 1e-2."""
 
 SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1
-"""Relative steps of a difference, least and largest. Derived: below 1e-5 the integrator's error shows, above 0.1
-curvature."""
+"""Least and largest relative step of a finite difference. Derived: below 1e-5 the integrator's error dominates, above
+0.1 the curvature."""
 
 RELEASE_STEP_FRAMES = 0.1
-"""Chosen: a tenth of a frame, in which no trajectory bends."""
+"""Step of the release. Chosen: over a tenth of a frame every trajectory is straight."""
 
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
 DAMPING_STEP = 1e-3
-"""Relative step of B. Derived as AIMED_RESPONSE is: its answer is of the order of the step."""
+"""Relative step of B. Derived as TARGET_RESPONSE is: the response is of the order of the step."""
 
 
 class Predictor:
-    """Simulates the trials of a fit.
+    """Simulates the trials of a fit and differentiates their positions.
 
-    `has_pressure_deviation` and `has_damping_deviation`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
-    set, or measured by a gauge with noise) and a B. `host` is a larger model whose compiled form serves this one.
-    `divisible` tells whether a predictor of some of its trials answers as this one.
+    `has_pressure_deviation`, shape (n_trials,), tells which trials have a pressure that may deviate: one that was set,
+    or measured by a noisy gauge. `has_damping_deviation` tells which have a B. `host` is a larger model whose compiled
+    form serves this one. `divisible` tells whether a predictor of a subset of the trials gives the same results.
     """
 
     divisible = True
@@ -168,7 +167,7 @@ class Predictor:
         ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
-        """The trajectories_at trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4).
+        """Simulation jobs at scaled parameters `theta` and the given trial effects, one a trial.
 
         Parameters
         ----------
@@ -283,21 +282,19 @@ class Predictor:
     def linearise(
         self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
     ) -> list[Floats]:
-        """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
-
-        `trial_effects_only` leaves the columns of the keys empty, but for B. `past_end` takes derivatives as `position_change`
-        does, for tests that hold columns against each other; an iteration wants what a step really changes, the jump
-        at the end of growth included, and settles in other places without it.
+        """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
+            Free parameters, scaled.
         trial_effects : array, shape (n_trials, 4)
         trial_effects_only : bool
-            Leave the columns of the keys empty, but for B.
+            Leave the columns of the keys zero, except that of B.
         past_end : bool
-            Run trajectories on past the end of growth. The steps of later calls are not adapted then.
+            Differentiate as `position_change` does, across the end of growth, for tests that compare columns with each
+            other; step sizes are then not adapted. The iterations of a fit need the actual change, including the jump
+            at the end of growth, and converge elsewhere without it.
 
         Returns
         -------
@@ -450,4 +447,4 @@ def _step(answer: float, before: float) -> float:
     """Step that moves a trajectory as far as aimed at, given how far a unit step would."""
     if not answer > 0:
         return before
-    return float(np.clip(AIMED_RESPONSE / answer, SMALLEST_STEP, LARGEST_STEP))
+    return float(np.clip(TARGET_RESPONSE / answer, SMALLEST_STEP, LARGEST_STEP))

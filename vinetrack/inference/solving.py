@@ -21,8 +21,8 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import (
     MOST_ITERATIONS,
     POOR_FIT,
-    Shortfall,
     FixedTerms,
+    Shortfall,
     Solution,
     Watch,
     chi2_per_dof,

@@ -11,7 +11,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError, simulate_many
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, EXPONENT, ParameterMap
-from vinetrack.inference.sensitivity import ORIGIN, N_TRIAL_EFFECTS, RELEASE, Predictor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
 
 EXPONENTS = (0.15, 0.37, 0.65, 1.0)
 """Exponents tried. Chosen around the published 0.37, from nearly constant friction to linear damping."""

@@ -20,8 +20,8 @@ from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, solve
 from vinetrack.inference.part_of_trials import (
     Indices,
     parameters_of_trials,
-    subset_problem,
     subset_predictor,
+    subset_problem,
     subset_state,
 )
 

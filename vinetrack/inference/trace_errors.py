@@ -21,9 +21,9 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.mixed_effects import (
     bounded_solve,
+    solve_per_trial,
     sum_matrix_blocks,
     sum_vector_blocks,
-    solve_per_trial,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, is_poor_fit

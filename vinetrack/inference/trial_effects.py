@@ -23,12 +23,12 @@ from vinetrack.inference.mixed_effects import (
     trial_effect_prior,
     trial_effect_step,
 )
-from vinetrack.inference.part_of_trials import parameters_of_trials, subset_problem, subset_predictor, subset_state
+from vinetrack.inference.part_of_trials import parameters_of_trials, subset_predictor, subset_problem, subset_state
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
-    ORIGIN,
     N_TRIAL_EFFECTS,
+    ORIGIN,
     PRESSURE,
     RELEASE,
     Predictor,

@@ -13,7 +13,7 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, EXPONENT
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, N_TRIAL_EFFECTS, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
