@@ -38,9 +38,9 @@ from vinetrack.diagnosis.force_sensitivities import FittedMotion
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.learned_force import LearnedForce
-from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import missing_force
-from vinetrack.diagnosis.multi_start import from_other_starts
+from vinetrack.diagnosis.multi_start import restart_exponents
 from vinetrack.diagnosis.propose import propose
 
 LAWS = {"slip": "growth+speed", "chirp": "growth", "squeeze": "growth+pressure"}
@@ -113,8 +113,8 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     campaign = make(f"outsider:{law}", seed)
     pairs, begun = list(campaign.pairs), time.process_time()
     fit = initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), None, {}), profile=False)
-    if fit.chi2_per_dof > FAR_OFF:
-        fit = from_other_starts(fit)
+    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
+        fit = restart_exponents(fit)
     learned = missing_force(fit).learned
     row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
     row["processor_s"] = time.process_time() - begun

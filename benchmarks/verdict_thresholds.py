@@ -30,17 +30,32 @@ from hidden import make, tables
 from tqdm import tqdm
 
 THRESHOLDS = (
-    *(("misfit_tests", name) for name in ("FIRST_LEVEL", "LATER_LEVEL", "LOUD_PROBE", "FAR_OFF", "OFF")),
-    *(("misfit_tests", name) for name in ("OFF_OTHERWISE", "SUSPECT", "SUSPECT_SIGMAS", "TESTABLE_SIGMAS")),
-    *(("likelihood_ratio", name) for name in ("ANSWER_SET", "MOST_INFLATION", "CREDIBLE", "LEAST_SIGMAS")),
-    *(("selection", name) for name in ("LOUD", "LEFT", "MOSTLY")),
-    ("weighing", "EXPECTED"),
-    *(("candidate_fits", name) for name in ("PART_KEPT", "WITHIN_REACH")),
-    *(("between_trials", name) for name in ("LEAST_GAIN", "PLAUSIBLE_DRIFT", "ASKED_AGAIN")),
-    ("contradictions", "SURELY_DRIFTS"),
-    ("drift", "FALSE_ALARMS"),
-    ("trial_effect_tests", "FEW_PER_CENT"),
-    ("slack_hypothesis", "PUSHES"),
+    *(
+        ("misfit_tests", name)
+        for name in (
+            "FALSE_ALARM_LEVEL_FIRST_ROUND",
+            "FALSE_ALARM_LEVEL_LATER_ROUNDS",
+            "SINGLE_PROBE_LEVEL",
+            "FAR_OFF_CHI2_PER_DOF",
+            "MISSED_FRACTION",
+        )
+    ),
+    *(
+        ("misfit_tests", name)
+        for name in ("MISSED_FRACTION_WITHOUT_SLOW_ERRORS", "SEARCH_CHI2_PER_DOF", "SEARCH_SIGMAS", "TESTABLE_SIGMAS")
+    ),
+    *(
+        ("likelihood_ratio", name)
+        for name in ("ANSWER_SET_DELTA_CHI2", "MAX_INFLATION", "CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS")
+    ),
+    *(("selection", name) for name in ("CLEAR_SCORE_EXCESS", "STALLED_CHI2_SHARE", "PARTIAL_SHARE")),
+    ("weighing", "RANGE_EDGE_DISTANCE"),
+    *(("candidate_fits", name) for name in ("MIN_SHARE_OF_SUBSET_GAIN", "LINEAR_REACH")),
+    *(("between_trials", name) for name in ("MIN_LINEAR_GAIN", "PLAUSIBLE_DRIFT", "SYSTEMATICS_CHECK_P_VALUE")),
+    ("contradictions", "CONTRADICTING_DRIFT_SIGMAS"),
+    ("drift", "FALSE_ALARM_LEVEL"),
+    ("trial_effect_tests", "CAREFUL_PRESSURE_SCATTER"),
+    ("slack_hypothesis", "MIN_PUSH_FRACTION"),
 )
 """Numbers of `vinetrack.diagnosis` that decide between one verdict and another, by module. Those that only bound the
 time of a search, or the words of a sentence, are not among them."""

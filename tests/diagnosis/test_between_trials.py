@@ -12,9 +12,9 @@ from grown import Pairs, pairs_of, sheet
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.between_forms import confounded
-from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
+from vinetrack.diagnosis.between_gain import Difference, gains_by_onset, linear_gain, with_shared_errors
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
-from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, robust_ratio
+from vinetrack.diagnosis.likelihood_ratio import MAX_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.effects import find_effect
@@ -135,8 +135,8 @@ def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> 
     pairs = made(trials, range(len(trials)), lambda _, __: 1.0, seed=9)
     among = {difference.name: difference for difference in differences(fit(vt.base_model(), pairs, profile=False))}
     drift = among["order_drift"]
-    assert drift.ways >= 3
-    assert drift.worth == pytest.approx(drift.gain - 2 * np.log(drift.ways))
+    assert drift.n_forms >= 3
+    assert drift.penalised_gain == pytest.approx(drift.gain - 2 * np.log(drift.n_forms))
     assert drift.p > 0.003
 
 
@@ -162,7 +162,7 @@ def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after
 
     begins = range(2, len(members) - 1)
     each = [linear_gain(of_pairs, base, later(begin), spread=base.state.spread) for begin in begins]
-    assert gains_from_each(of_pairs, base, later(0), members, begins) == pytest.approx(each, abs=1e-6)
+    assert gains_by_onset(of_pairs, base, later(0), members, begins) == pytest.approx(each, abs=1e-6)
     assert np.ptp(each) > 1.0
 
 
@@ -253,7 +253,7 @@ def test_errors_that_replicates_share_take_from_a_difference_what_they_may_expla
     gains = []
     for error_Pa in (1e-6, 30.0, 3000.0):
         monkeypatch.setattr("vinetrack.inference.systematics.PRESSURE_ERROR_PA", error_Pa)
-        beside = beside_systematics(questioned, questioned.solution)
+        beside = with_shared_errors(questioned, questioned.solution)
         assert beside.problem.prior_mean.size > questioned.solution.problem.prior_mean.size
         gains.append(linear_gain(questioned, beside, by_vine))
     assert gains[0] == pytest.approx(gain, abs=1e-2)
@@ -272,7 +272,7 @@ def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
     monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
     (wider,) = between_fits(questioned, [by_vine], 0.0, str)
     assert abs(wider.sigma) == pytest.approx(np.sqrt(abs(wider.delta_chi2)) / 3)
-    assert wider.inflation == MOST_INFLATION
+    assert wider.inflation == MAX_INFLATION
 
 
 def test_a_random_effect_without_width_is_no_effect(questioned: Fit) -> None:

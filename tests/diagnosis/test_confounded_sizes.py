@@ -17,7 +17,7 @@ from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis.confounded_sizes import confounders_of, size_not_excluded
 from vinetrack.diagnosis.confounder import Confounder
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
-from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_LATER_ROUNDS, MisfitTests, misfit_tests
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
@@ -51,7 +51,7 @@ def after() -> MisfitTests:
     model = vt.base_model() + vt.effects.inlet_loss
     candidates = candidates_of(model, None, None)
     found = fit(model, both_act(), host=host_for(model, candidates), profile=False)
-    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], LATER_LEVEL)
+    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FALSE_ALARM_LEVEL_LATER_ROUNDS)
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +60,9 @@ def by_effect(after: MisfitTests) -> dict[str, Confounder]:
 
 
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: MisfitTests) -> None:
-    place = after.of("air_drag")[0]
+    place = after.ranked_shapes("air_drag")[0]
     k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
-    lever = float(levers_of(after.fit, after.sums)[k, place])
+    lever = float(levers_of(after.fit, after.products)[k, place])
     drag = 0.2
     model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
     with_drag = fit(model, both_act(), fixed=[DRAG], profile=False)

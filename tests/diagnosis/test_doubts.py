@@ -15,7 +15,7 @@ import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.score_test import informations_at, scores_of
 from vinetrack.diagnosis.shape_products import fit_columns, products_of
 from vinetrack.inference.fit import fit
@@ -46,7 +46,7 @@ def asked(pairs: Pairs) -> MisfitTests:
     model = vt.base_model()
     candidates = candidates_of(model, None, None)
     found = fit(model, pairs, host=host_for(model, candidates), profile=False)
-    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FIRST_LEVEL)
+    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
 
 
 @pytest.fixture
@@ -85,18 +85,18 @@ def seen_crookedly() -> Pairs:
 
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 def test_a_doubt_shared_by_trials_is_no_missing_effect(make):
-    assert not asked(make()).something
+    assert not asked(make()).rejects_model
 
 
 @pytest.mark.parametrize("make", [misweighed, seen_crookedly])
 @pytest.mark.usefixtures("without_doubts")
 def test_unless_it_is_left_out(make):
-    assert asked(make()).something
+    assert asked(make()).rejects_model
 
 
 def test_positions_that_somebody_else_measured_are_as_sure_as_they_say():
     measured = [(replace(trial, video=None, position_systematic_m=0.0), track) for trial, track in seen_crookedly()]
-    assert asked(measured).something
+    assert asked(measured).rejects_model
 
 
 def through_a_lens(allowance_m: float) -> Pairs:
@@ -112,8 +112,8 @@ def through_a_lens(allowance_m: float) -> Pairs:
 
 
 def test_a_lens_of_a_tenth_of_a_millimetre_is_no_physics_where_that_much_is_allowed_for():
-    assert not asked(through_a_lens(1e-4)).something
-    assert asked(through_a_lens(0.0)).something
+    assert not asked(through_a_lens(1e-4)).rejects_model
+    assert asked(through_a_lens(0.0)).rejects_model
 
 
 def test_the_smooth_error_of_position_is_found_along_with_n_and_b():
@@ -137,7 +137,7 @@ def test_the_smooth_error_of_position_is_found_along_with_n_and_b():
 def test_errors_that_few_trials_feel_count_as_if_every_trial_had_a_column_for_them() -> None:
     """One payload and one set pressure a trial, and the same with columns of zeros for all others."""
     questioned = asked([*careful(20.0, 8), *careful(60.0, 9)])
-    fitted, answers = questioned.fit, questioned.answers
+    fitted, answers = questioned.fit, questioned.sensitivities
     felt = systematics_of(fitted.predictor, fitted.solution, fitted.trials)
     assert felt.n_columns < felt.count
     wide = [np.zeros((len(columns), felt.count + 1)) for columns in felt.columns]
@@ -155,5 +155,5 @@ def test_errors_that_few_trials_feel_count_as_if_every_trial_had_a_column_for_th
         ), name
     spreads = [(0.01, 0.03), (1e-3, 0.1)]
     assert np.allclose(
-        informations_at(fitted, questioned.sums, spreads), informations_at(fitted, dense, spreads), rtol=1e-6
+        informations_at(fitted, questioned.products, spreads), informations_at(fitted, dense, spreads), rtol=1e-6
     )

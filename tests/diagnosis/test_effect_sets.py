@@ -62,14 +62,18 @@ def test_a_set_that_mends_everything_but_is_worth_no_more_than_chance_is_said_to
     """It had been said that something is left once it is added."""
     pair = SimpleNamespace(label="leak with air_drag", credible=True, fit=SimpleNamespace(log_likelihood=1.0))
     sets = SimpleNamespace(
-        grow=lambda _: [pair], of_size=lambda _: [pair], is_better=lambda _: False, steps=lambda: (), known={}
+        grow=lambda _: [pair],
+        of_size=lambda _: [pair],
+        is_better=lambda _: False,
+        plausible_steps=lambda: (),
+        fitted={},
     )
     questions: Any = SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=2.0))
     monkeypatch.setattr(selection, "EffectSets", lambda *_: sets)
     monkeypatch.setattr(selection, "mending", lambda *_: ([pair], {}, questions))
     (step,) = selection._together(questions, questions, [pair], str)  # type: ignore[list-item]
     assert step.verdict == "unexplained"
-    assert step.aside == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)
+    assert step.rejected == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +89,7 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
     singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
     pair = SimpleNamespace(names=("latch_release", "lens"), effects=(latch, lens), delta_chi2=1000.0, fit=None)
     sets: Any = SimpleNamespace(
-        known=dict(enumerate(singles)), of_effects=lambda *_: None, search=SimpleNamespace(after=lambda _: None)
+        fitted=dict(enumerate(singles)), subset=lambda *_: None, search=SimpleNamespace(tests_after=lambda _: None)
     )
     monkeypatch.setattr(selection, "_shared_step", lambda verdict, *parts: (verdict, parts[4]))
     monkeypatch.setattr(selection, "_beside", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))

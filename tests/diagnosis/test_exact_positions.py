@@ -12,7 +12,7 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
-from vinetrack.diagnosis.trial_effect_tests import noisier_in_motion
+from vinetrack.diagnosis.trial_effect_tests import noise_in_motion_p
 from vinetrack.inference.fit_problem import floor
 
 
@@ -38,5 +38,5 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(without_noise:
     fit = said.fits[0]
     assert all(trial_data.noise_m**2 < floor([trial_data])[0] for trial_data in fit.predictor.data)
     assert np.isfinite(fit.chi2_per_dof)
-    assert noisier_in_motion(fit) == 1.0
+    assert noise_in_motion_p(fit) == 1.0
     assert fit["n"].value == pytest.approx(n, abs=3 * fit["n"].sigma)

@@ -19,9 +19,14 @@ from vinetrack.diagnosis import misfit_tests
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, LATER_LEVEL, LOUD_PROBE, MisfitTests
+from vinetrack.diagnosis.misfit_tests import (
+    FALSE_ALARM_LEVEL_FIRST_ROUND,
+    FALSE_ALARM_LEVEL_LATER_ROUNDS,
+    SINGLE_PROBE_LEVEL,
+    MisfitTests,
+)
 from vinetrack.diagnosis.score_test import Scores, _beside_systematics, _systematics_turn
-from vinetrack.diagnosis.structure_test import Structure, structure_in
+from vinetrack.diagnosis.structure_test import Structure, structure_from_scores
 from vinetrack.inference.fit_result import Number
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)
@@ -40,7 +45,7 @@ def questioned(
     of: Scores,
     signs: Any = 0,
     structure: Structure = QUIET,
-    level: float = FIRST_LEVEL,
+    level: float = FALSE_ALARM_LEVEL_FIRST_ROUND,
     effects: tuple[str, ...] | None = None,
 ) -> MisfitTests:
     """The tests of candidates with these scores, each shape another effect where these are not named."""
@@ -71,7 +76,7 @@ def test_the_best_of_all_candidates_is_a_false_alarm_in_one_campaign_of_a_hundre
     draw = np.random.default_rng(20602)
     campaigns = [questioned(scores(draw, 12, 4, scatter)) for _ in range(2000)]
     # Their cosines are all near 0: one family of thresholds serves them all.
-    alarms = sum(asked.excess(campaigns[0].family) > 0 for asked in campaigns)
+    alarms = sum(asked.largest_excess(campaigns[0].family) > 0 for asked in campaigns)
     assert alarms <= 20
 
 
@@ -79,7 +84,7 @@ def test_a_candidate_of_many_shapes_is_no_more_often_a_false_alarm_than_all_shou
     draw = np.random.default_rng(20604)
     named = ("of_many",) * 20 + ("of_one",)
     campaigns = [questioned(scores(draw, 24, 21), level=0.02, effects=named) for _ in range(500)]
-    alarms = sum(asked.excess(campaigns[0].family) > 0 for asked in campaigns)
+    alarms = sum(asked.largest_excess(campaigns[0].family) > 0 for asked in campaigns)
     assert alarms <= 18  # of 500 at 2 %, more once in 100
 
 
@@ -88,16 +93,16 @@ def test_a_candidate_of_seven_standard_errors_is_found() -> None:
     found = 0
     for _ in range(40):
         asked = questioned(scores(draw, 24, 4, sizes=[7 / math.sqrt(24), 0, 0, 0]))
-        found += bool(asked.possible[0] > asked.family.of("effect_0"))
+        found += bool(asked.one_sided_z[0] > asked.family.threshold("effect_0"))
     assert found >= 36
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])
 def test_probes_of_nothing_find_structure_as_often_as_they_say(scatter: float) -> None:
     draw = np.random.default_rng(20604)
-    found = [structure_in(scores(draw, 24, 8, scatter)) for _ in range(400)]
+    found = [structure_from_scores(scores(draw, 24, 8, scatter)) for _ in range(400)]
     assert np.mean([one.p < 0.05 for one in found]) < 0.09
-    assert np.mean([one.loudest < 0.05 for one in found]) < 0.08
+    assert np.mean([one.smallest_probe_p < 0.05 for one in found]) < 0.08
     if scatter == 1:
         assert np.mean([one.p < 0.2 for one in found]) > 0.05
 
@@ -106,21 +111,21 @@ def test_what_all_probes_feel_a_little_shows_in_their_sum_and_in_none_alone() ->
     draw = np.random.default_rng(20605)
     heard = []
     for _ in range(40):
-        structure = structure_in(scores(draw, 60, 24, sizes=3.0 / math.sqrt(60) * np.resize([1, -1], 24)))
-        if structure.loudest > LOUD_PROBE:
-            heard.append(questioned(scores(draw, 12, 2), structure=structure).shaped)
+        structure = structure_from_scores(scores(draw, 60, 24, sizes=3.0 / math.sqrt(60) * np.resize([1, -1], 24)))
+        if structure.smallest_probe_p > SINGLE_PROBE_LEVEL:
+            heard.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
     assert len(heard) >= 10
     assert np.mean(heard) > 0.7
 
 
 def test_what_one_probe_alone_feels_drowns_in_the_sum_and_is_heard_as_the_loudest() -> None:
-    """At six standard errors in one of 24 the sum hears one campaign in eight, the loudest six of seven."""
+    """At six standard errors in one of 24 the sum hears one campaign in eight, the smallest_probe_p six of seven."""
     draw = np.random.default_rng(20606)
     drowned = []
     for _ in range(60):
-        structure = structure_in(scores(draw, 60, 24, sizes=[6.0 / math.sqrt(60), *[0] * 23]))
-        if structure.p > 0.1 * FIRST_LEVEL:
-            drowned.append(questioned(scores(draw, 12, 2), structure=structure).shaped)
+        structure = structure_from_scores(scores(draw, 60, 24, sizes=[6.0 / math.sqrt(60), *[0] * 23]))
+        if structure.p > 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND:
+            drowned.append(questioned(scores(draw, 12, 2), structure=structure).probes_reject)
     assert len(drowned) >= 15
     assert np.mean(drowned) > 0.6
 
@@ -129,16 +134,16 @@ def test_what_is_left_counts_by_its_shape_and_by_what_trials_take_upon_themselve
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     of = scores(np.random.default_rng(20607), 12, 2)
-    chance = {"conditions_apart": 1.0, "noisier_in_motion": 1.0}
+    chance = {"between_conditions_p": 1.0, "noise_in_motion_p": 1.0}
     for name in chance:
         monkeypatch.setattr(misfit_tests, name, lambda _, name=name: chance[name])
     shaped = Structure(80.0, 8, 1e-9, 6.0)
-    assert not questioned(of).fails
-    assert questioned(of, structure=shaped).fails
+    assert not questioned(of).omnibus_rejects
+    assert questioned(of, structure=shaped).omnibus_rejects
     for name in chance:
         chance[name] = 1e-5
-        assert questioned(of).fails
-        assert not questioned(of, level=0.1 * LATER_LEVEL).fails
+        assert questioned(of).omnibus_rejects
+        assert not questioned(of, level=0.1 * FALSE_ALARM_LEVEL_LATER_ROUNDS).omnibus_rejects
         chance[name] = 1.0
 
 
@@ -156,7 +161,9 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
         )
         answers = EffectSensitivities((shape,), [], ())
         fit: Any = None
-        limits, testable = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FIRST_LEVEL).largest(friction)
+        limits, testable = MisfitTests(
+            fit, (friction,), answers, fit, of, QUIET, FALSE_ALARM_LEVEL_FIRST_ROUND
+        ).upper_limits(friction)
         assert testable
         held.append(limits["tail_friction.mu_w"] > true)
     assert 0.92 < np.mean(held) < 0.99

@@ -20,7 +20,7 @@ from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.film_allowance import film_gain
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_nothing, _in_sigmas, answer_set
-from vinetrack.diagnosis.multi_start import start_of, starts_of
+from vinetrack.diagnosis.multi_start import distinct_starts, start_values
 from vinetrack.effects import catalogue
 from vinetrack.inference.systematics import FILM_ERROR
 
@@ -79,9 +79,9 @@ def test_what_one_vine_answers_alone_adds_up_to_what_all_answer(answered):
 
 def test_a_fit_begins_from_the_vine_that_was_asked():
     shapes = shapes_of(FILM, TRIALS)
-    assert start_of(shapes[0], 0.1) == {"film_mass.eps": 0.1}
-    assert start_of(shapes[2], 0.1) == {"film_mass.eps": {"a": 0.0, "b": 0.1}}
-    assert len(starts_of((shape, 0.1) for shape in [*shapes, shapes[1]])) == 3
+    assert start_values(shapes[0], 0.1) == {"film_mass.eps": 0.1}
+    assert start_values(shapes[2], 0.1) == {"film_mass.eps": {"a": 0.0, "b": 0.1}}
+    assert len(distinct_starts((shape, 0.1) for shape in [*shapes, shapes[1]])) == 3
 
 
 @pytest.mark.parametrize("fall", [4.0, 30.0, 3000.0])

@@ -12,7 +12,7 @@ import vinetrack as vt
 from vinetrack.diagnosis import held_fits
 from vinetrack.diagnosis.held_fits import let_go, with_curves, without_curves
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import missed_fraction
@@ -48,9 +48,9 @@ def test_of_many_trials_only_hypotheses_that_may_still_be_kept_hold_their_curves
     whole: Fit, points: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(held_fits, "MANY_POINTS", points)
-    monkeypatch.setattr(held_fits, "FITS_HELD", 2)
+    monkeypatch.setattr(held_fits, "MAX_WHOLE_FITS", 2)
     effect = find_effect("tail_friction")
-    behind = {"best": 0.0, "second": 500.0, "third": 600.0, "may be kept": 0.4 * ANSWER_SET * MOST_INFLATION}
+    behind = {"best": 0.0, "second": 500.0, "third": 600.0, "may be kept": 0.4 * ANSWER_SET_DELTA_CHI2 * MAX_INFLATION}
     hypotheses = {
         name: likelihood_ratio(whole, (effect,), replace(whole, log_likelihood=whole.log_likelihood - fall))
         for name, fall in behind.items()

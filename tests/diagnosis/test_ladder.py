@@ -139,7 +139,7 @@ def test_of_many_conditions_several_are_left_out_at_once_and_the_error_is_nearly
         return without(fit, gone)
 
     monkeypatch.setattr(ladder_module, "_without", kept)
-    monkeypatch.setattr(ladder_module, "MOST_PARTS", 4)
+    monkeypatch.setattr(ladder_module, "MAX_FOLDS", 4)
     parted = left_out(fits[1])
     assert [len(part) for part in seen] == [2, 2, 2, 2]
     vines = {trial.trial.condition: trial.trial.vine for trial in fits[1].trials}

@@ -12,21 +12,21 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign
-from vinetrack.diagnosis.family_test import family_chance, family_test
+from vinetrack.diagnosis.family_test import family_p_value, family_test
 from vinetrack.diagnosis.null_calibration import TESTS, CalibratedTest, TestChances, calibrated, null_chances
 from vinetrack.narrative.calibration_text import calibration_lines
 from vinetrack.planning.campaign_information import FilmingPlan
 
 
 def test_the_chance_of_one_score_is_its_tail() -> None:
-    assert family_chance(np.eye(1), [0], ["leak"], np.array([2.5])) == pytest.approx(2 * norm.sf(2.5))
-    assert family_chance(np.eye(1), [1], ["leak"], np.array([2.5])) == pytest.approx(norm.sf(2.5))
+    assert family_p_value(np.eye(1), [0], ["leak"], np.array([2.5])) == pytest.approx(2 * norm.sf(2.5))
+    assert family_p_value(np.eye(1), [1], ["leak"], np.array([2.5])) == pytest.approx(norm.sf(2.5))
 
 
 def test_independent_candidates_multiply_the_chance() -> None:
     count, scores = 12, np.zeros(12)
     scores[3] = 3.0
-    chance = family_chance(np.eye(count), [0] * count, [f"e{k}" for k in range(count)], scores)
+    chance = family_p_value(np.eye(count), [0] * count, [f"e{k}" for k in range(count)], scores)
     assert chance == pytest.approx(1 - (1 - 2 * norm.sf(3.0)) ** count, rel=0.03)
 
 
@@ -38,8 +38,8 @@ def test_a_score_at_its_threshold_has_the_level_of_the_family() -> None:
     cosines = cosines / root[:, None] / root
     effects, signs = ["a"] * 4 + ["b"] * 3 + ["c", "d"], [0, 0, 0, 0, 1, 1, 1, 0, -1]
     limits = family_test(cosines, signs, effects, 0.003)
-    scores = np.array([limits.of("a"), 0, 0, 0, 0, 0, 0, 0, 0.0])
-    assert family_chance(cosines, signs, effects, scores) == pytest.approx(0.003, rel=0.1)
+    scores = np.array([limits.threshold("a"), 0, 0, 0, 0, 0, 0, 0, 0.0])
+    assert family_p_value(cosines, signs, effects, scores) == pytest.approx(0.003, rel=0.1)
 
 
 def nulls(rate: float, count: int = 400) -> tuple[float, ...]:

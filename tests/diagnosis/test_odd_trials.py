@@ -51,7 +51,7 @@ def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, 
 
 
 def odd(pairs: list[tuple[Trial, Track]]) -> dict[str, float]:
-    return {trial.name: trial.like_Pa for trial in odd_trials(prepare(pairs)[0])}
+    return {trial.name: trial.implied_pressure_Pa for trial in odd_trials(prepare(pairs)[0])}
 
 
 def test_trials_that_agree_are_none_of_them_odd(campaign):
@@ -181,4 +181,4 @@ def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(c
     ]
     (slip,) = odd_trials(data)
     assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
-    assert slip.like_Pa == pytest.approx(21e3, rel=0.05)
+    assert slip.implied_pressure_Pa == pytest.approx(21e3, rel=0.05)

@@ -23,7 +23,7 @@ from vinetrack.diagnosis.expected_scores import (
     score_ratio,
 )
 from vinetrack.diagnosis.linear_power import effect_power, power_of, spread_widening
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.diagnosis.score_test import informations_at, scores_of
@@ -63,11 +63,11 @@ def power(six: MisfitTests) -> Power:
 
 
 def place_of(questions: MisfitTests, name: str) -> int:
-    return questions.answers.effects.index(name)
+    return questions.sensitivities.effects.index(name)
 
 
 def test_a_campaign_without_noise_sounds_no_alarm(six: MisfitTests) -> None:
-    assert six.possible.max() < 0.3 * six.family.single
+    assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold
 
 
 def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTests, power: Power) -> None:
@@ -75,7 +75,7 @@ def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTes
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
     entry = power["tail_friction"]
     assert (entry.size_at(0.9) - entry.size_at(0.5)) / sigma == pytest.approx(norm.ppf(0.9), abs=0.06)
-    assert entry.size_at(0.5) / sigma >= six.family.of("tail_friction") - 0.1
+    assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
 
 
 def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: MisfitTests) -> None:
@@ -90,8 +90,8 @@ def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: Misfit
 def test_information_at_other_spreads_is_that_of_scores_at_those_spreads() -> None:
     many = planned_questions(planned(4))[0]
     ways = [(0.002, 0.01), (0.01, 0.03), (0.03, 0.09)]
-    direct = [scores_of(many.fit, many.sums, replace(many.fit.state, spread=way)).information for way in ways]
-    assert informations_at(many.fit, many.sums, ways) == pytest.approx(np.array([np.diag(one) for one in direct]))
+    direct = [scores_of(many.fit, many.products, replace(many.fit.state, spread=way)).information for way in ways]
+    assert informations_at(many.fit, many.products, ways) == pytest.approx(np.array([np.diag(one) for one in direct]))
 
 
 def test_four_times_the_trials_halve_the_size(power: Power) -> None:
@@ -125,14 +125,14 @@ def test_what_cannot_act_is_said_with_a_reason(power: Power) -> None:
 
 
 def test_false_alarms_add_up_over_the_tests(power: Power) -> None:
-    assert FIRST_LEVEL < power.false_alarm_rate < 2 * FIRST_LEVEL
+    assert FALSE_ALARM_LEVEL_FIRST_ROUND < power.false_alarm_rate < 2 * FALSE_ALARM_LEVEL_FIRST_ROUND
 
 
 def test_a_sheet_that_states_days_has_one_more_test() -> None:
     design = planned(2)
     dated = replace(design, trials=tuple(replace(trial, day=trial.name[-1]) for trial in design.trials))
     rates = power_of(planned_questions(dated)[0]).false_alarms
-    assert rates["specimens, days or the order of trials"] == FIRST_LEVEL
+    assert rates["specimens, days or the order of trials"] == FALSE_ALARM_LEVEL_FIRST_ROUND
 
 
 def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
@@ -144,8 +144,8 @@ def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Po
 
 def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six: MisfitTests, power: Power) -> None:
     k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
-    moved_m = size * displacements(six.fit, six.sums)[k]
-    after = fitted_without(six.fit, six.answers.shapes[k], size, noiseless_start(six.fit))
+    moved_m = size * displacements(six.fit, six.products)[k]
+    after = fitted_without(six.fit, six.sensitivities.shapes[k], size, noiseless_start(six.fit))
     left = [block[:, -1] for block in after.solution.columns]
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
 
@@ -156,7 +156,7 @@ def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from
 ) -> None:
     # No point lies near the end of growth, where `fit_columns` takes derivatives otherwise.
     start, k = noiseless_start(six.fit), place_of(six, name)
-    after = fitted_without(six.fit, six.answers.shapes[k], power[name].size_at(0.5), start)
+    after = fitted_without(six.fit, six.sensitivities.shapes[k], power[name].size_at(0.5), start)
     for mine, other in zip(after.solution.columns, fit_columns(after), strict=True):
         scale = np.max(np.abs(other[:, :-1]), axis=0)
         assert mine[:, :-1] / scale == pytest.approx(other[:, :-1] / scale, abs=2e-3)
@@ -198,7 +198,7 @@ def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories
     six: MisfitTests, power: Power
 ) -> None:
     start, k = noiseless_start(six.fit), place_of(six, "leak")
-    after = fitted_without(six.fit, six.answers.shapes[k], power["leak"].size_at(0.5), start)
+    after = fitted_without(six.fit, six.sensitivities.shapes[k], power["leak"].size_at(0.5), start)
     begun = after.predictor.linearise(start.state.theta, start.state.trial_effects)
     kept = [
         np.isin(old.time_s, new.time_s) for old, new in zip(six.fit.predictor.data, after.predictor.data, strict=True)

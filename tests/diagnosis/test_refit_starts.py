@@ -42,7 +42,9 @@ def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_foun
         return solve_onward(predictor, before, theta, *held, **more)
 
     base = vt.fit(vt.base_model(), grown({"pressure_damping.beta": 1.5e-5}, seed=33), profile=False)
-    climb = SubsetFitter(base).climb((vt.effects.pressure_damping,), {"pressure_damping.beta": 1e-5}, iterations=9)
+    climb = SubsetFitter(base).fit_hypothesis(
+        (vt.effects.pressure_damping,), {"pressure_damping.beta": 1e-5}, iterations=9
+    )
     yields_Pa = {number.name: number.value for number in base.numbers if number.key == YIELD_PRESSURE}
     assert climb.yields_Pa.keys() == yields_Pa.keys()
     assert any(abs(climb.yields_Pa[name] - value) > 1.0 for name, value in yields_Pa.items())

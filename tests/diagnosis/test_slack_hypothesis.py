@@ -12,7 +12,7 @@ import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis.initial_fit import candidates_of
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.selection import SelectionStep, select_effects
 from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK, pushes, slack_fit
 from vinetrack.inference.fit import fit
@@ -59,7 +59,7 @@ def test_where_the_rule_makes_scattering_trials_far_worse_none_is_fitted_in_full
     """A payload that the true tail pushes, which a tail that cannot push never does."""
     taut = fit(vt.base_model(), grown(60.0, "taut"), profile=False)
     asked: list[object] = []
-    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.scatters_much", lambda _: True)
+    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.has_excess_scatter", lambda _: True)
     for name in ("refit", "full_fit"):
         monkeypatch.setattr(f"vinetrack.diagnosis.slack_hypothesis.{name}", lambda *given, **_: asked.append(given))
     assert pushes(taut)
@@ -76,15 +76,15 @@ def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_bette
     nature = Nature(effects=[*BASE, "tail_friction"], values=damping_values(trials) | truth, noise_m=5e-5, seed=6)
     found = fit(vt.base_model(), [(one.stated, one.track) for one in grow(trials, nature)], profile=False)
     effects, _ = hypotheses.testable(candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
-    questions = misfit_tests(found, effects, FIRST_LEVEL)
-    assert questions.something
+    questions = misfit_tests(found, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    assert questions.rejects_model
     assert not questions.far_off
     slack = likelihood_ratio(found, (TAIL_SLACK,), found)
-    monkeypatch.setattr(MisfitTests, "suspect", suspect)
+    monkeypatch.setattr(MisfitTests, "needs_search", suspect)
     steps = [
         SelectionStep("missing", questions, (slack,), (slack,), (), slack.names),
         SelectionStep("adequate", questions),
     ]
     monkeypatch.setattr("vinetrack.diagnosis.selection._slack", lambda *_: steps)
-    named = select_effects(found, effects, lambda _: None)[0].answer
+    named = select_effects(found, effects, lambda _: None)[0].answer_names
     assert named == (("tail_friction",) if suspect else ("tail_slack",))

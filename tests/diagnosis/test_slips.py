@@ -10,7 +10,7 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
-from vinetrack.diagnosis.candidates import BESIDE_A_SLIP, is_plausible, slip_of
+from vinetrack.diagnosis.candidates import RANGE_SHARE_BESIDE_SLIP, is_plausible, slip_of
 from vinetrack.effects import catalogue
 from vinetrack.effects._catalogue import explanation
 
@@ -53,7 +53,9 @@ def test_a_slip_in_a_column_is_named(pairs, slip, named, size, words):
 
 def test_what_is_left_beside_a_slip_must_be_an_ordinary_error():
     _, high = DIAMETER.plausible
-    inside, outside = ((1 + part * high) * (1 + FLAT) - 1 for part in (0.9 * BESIDE_A_SLIP, 1.2 * BESIDE_A_SLIP))
+    inside, outside = (
+        (1 + part * high) * (1 + FLAT) - 1 for part in (0.9 * RANGE_SHARE_BESIDE_SLIP, 1.2 * RANGE_SHARE_BESIDE_SLIP)
+    )
     assert slip_of(DIAMETER, inside, 0.0) == DIAMETER.slips[0]
     assert is_plausible(DIAMETER, inside, 0.0)
     assert slip_of(DIAMETER, outside, 0.0) is None

@@ -15,11 +15,11 @@ from hidden_truth import Pairs, grown, sheet
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.trial_effect_tests import (
-    MORE_THAN_VINES,
-    STRETCH,
-    conditions_apart,
-    noisier_in_motion,
-    scatters_much,
+    CAREFUL_DAMPING_SCATTER,
+    STRETCH_FRAMES,
+    between_conditions_p,
+    has_excess_scatter,
+    noise_in_motion_p,
 )
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
@@ -68,11 +68,11 @@ def wandering(*, at_rest: bool) -> Pairs:
 
 
 def test_replicates_that_deviate_together_are_seen() -> None:
-    assert conditions_apart(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
+    assert between_conditions_p(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
 
 
 def test_replicates_that_scatter_are_not() -> None:
-    assert all(conditions_apart(fitted(grown(seed=seed))) > 0.05 for seed in (32, 33, 34))
+    assert all(between_conditions_p(fitted(grown(seed=seed))) > 0.05 for seed in (32, 33, 34))
 
 
 def test_a_scatter_that_replicates_have_too_is_none_of_the_model() -> None:
@@ -80,17 +80,17 @@ def test_a_scatter_that_replicates_have_too_is_none_of_the_model() -> None:
     trials = with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2, prefix="a"))
     loose = fitted(of_another_film({}, 0.08, trials))
     bent = fitted(of_another_film({17: 0.6, 24: 1.5}, 0.02, trials))
-    assert min(loose.state.spread[1], bent.state.spread[1]) > MORE_THAN_VINES
-    assert not scatters_much(loose)
-    assert scatters_much(bent)
+    assert min(loose.state.spread[1], bent.state.spread[1]) > CAREFUL_DAMPING_SCATTER
+    assert not has_excess_scatter(loose)
+    assert has_excess_scatter(bent)
 
 
 @pytest.mark.parametrize("replicate", [0, 1])
 def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate: int) -> None:
     fit = fitted(of_another_film({}, 0.08)[replicate::2])
     assert len({trial.trial.condition for trial in fit.trials}) == len(fit.trials)
-    assert fit.state.spread[1] > MORE_THAN_VINES
-    assert scatters_much(fit)
+    assert fit.state.spread[1] > CAREFUL_DAMPING_SCATTER
+    assert has_excess_scatter(fit)
 
 
 def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model() -> None:
@@ -101,16 +101,16 @@ def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model()
         replace(trial, damping_deviation=float(np.expm1(0.05 * draw.standard_normal() + 0.02 * (-1) ** (k % 12 // 2))))
         for k, trial in enumerate(50 * fit.trials)
     ]
-    assert not scatters_much(replace(fit, trials=tuple(trials)))
+    assert not has_excess_scatter(replace(fit, trials=tuple(trials)))
 
 
 def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:
-    assert noisier_in_motion(fitted(wandering(at_rest=False))) < 1e-5
+    assert noise_in_motion_p(fitted(wandering(at_rest=False))) < 1e-5
 
 
 def test_noise_that_is_the_same_at_rest_is_noise() -> None:
-    assert noisier_in_motion(fitted(wandering(at_rest=True))) > 1e-2
-    assert all(noisier_in_motion(fitted(grown(seed=seed))) > 1e-2 for seed in (35, 36))
+    assert noise_in_motion_p(fitted(wandering(at_rest=True))) > 1e-2
+    assert all(noise_in_motion_p(fitted(grown(seed=seed))) > 1e-2 for seed in (35, 36))
 
 
 @pytest.mark.parametrize(("heavy", "most"), [(False, 0.02), (True, 0.04)])
@@ -118,15 +118,15 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) ->
     """600 campaigns in which nothing differs: few alarms at 1 %, also where single stretches are far louder."""
     draw, alarms = np.random.default_rng(20732), 0
     for _ in range(600):
-        white = draw.standard_normal((12, 16, STRETCH))
+        white = draw.standard_normal((12, 16, STRETCH_FRAMES))
         if heavy:
             white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
         trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
         data = SimpleNamespace(
-            slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH, noise_m=1e-4, lead_position_m=np.array([0.0, 0.3])
+            slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH_FRAMES, noise_m=1e-4, lead_position_m=np.array([0.0, 0.3])
         )
         fit: Any = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
-        alarms += noisier_in_motion(fit) < 0.01
+        alarms += noise_in_motion_p(fit) < 0.01
     assert alarms / 600 < most
 
 
@@ -135,4 +135,4 @@ def test_recordings_are_not_held_against_their_rest() -> None:
     for trial, track in wandering(at_rest=False):
         stated = replace(track, lead_position_systematic_m=np.full(track.time_s.size, 1e-4))
         filmed.append((replace(trial, video=Path("filmed.mp4")), stated))
-    assert noisier_in_motion(fitted(filmed)) == 1.0
+    assert noise_in_motion_p(fitted(filmed)) == 1.0

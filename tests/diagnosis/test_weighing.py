@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
+from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_penalty
 from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
 
@@ -44,9 +44,9 @@ def test_the_marginal_likelihood_is_the_integral_over_the_prior(value: float, si
 
 def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none() -> None:
     # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
-    assert prior_surprise(fitted(7.1e3, 1.7e3), {"g.delta": GAUGE}) == pytest.approx(12.96 - 4, abs=0.01)
-    assert prior_surprise(fitted(1.9e3, 100.0), {"g.delta": GAUGE}) == 0
-    assert prior_surprise(fitted(7.1e3, 5e3), {"g.delta": GAUGE}) == 0
+    assert prior_penalty(fitted(7.1e3, 1.7e3), {"g.delta": GAUGE}) == pytest.approx(12.96 - 4, abs=0.01)
+    assert prior_penalty(fitted(1.9e3, 100.0), {"g.delta": GAUGE}) == 0
+    assert prior_penalty(fitted(7.1e3, 5e3), {"g.delta": GAUGE}) == 0
 
 
 def test_a_number_of_which_the_data_say_nothing_costs_nothing() -> None:

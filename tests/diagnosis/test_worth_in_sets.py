@@ -28,8 +28,8 @@ def of(names: tuple[str, ...], log_likelihood: float, inflation: float = 1.0) ->
 def sets_of(known: list[LikelihoodRatio], thresholds: Mapping[str, float] | None = None) -> EffectSets:
     family = FamilyTest(3e-3, 1e-4, dict.fromkeys(NAMES, 4.0) | dict(thresholds or {}))
     search: Any = SimpleNamespace(
-        questions=SimpleNamespace(fit=SimpleNamespace(model=()), effects=()),
-        after=lambda _fit: SimpleNamespace(family=family),
+        tests=SimpleNamespace(fit=SimpleNamespace(model=()), effects=()),
+        tests_after=lambda _fit: SimpleNamespace(family=family),
     )
     return EffectSets(search, known, lambda _line: None)
 
@@ -43,7 +43,7 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
 @pytest.mark.parametrize(("worth", "enough"), [(3.0, False), (5.9, False), (6.1, True)])
 def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others(worth: float, enough: bool) -> None:
     triple, sets = of(NAMES, TRIPLE), sets_of(pairs(worth))
-    assert sets.worth(triple, triple.effects[2]) == pytest.approx(worth)
+    assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) != enough
     if not enough:
         assert f"tail_friction is worth {worth:.1f} σ beside the others, and 6.0 σ are asked" in sets.superfluous(
@@ -53,7 +53,7 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
 
 def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely() -> None:
     triple, sets = of(NAMES, TRIPLE, inflation=4.0), sets_of(pairs(11.0))
-    assert sets.worth(triple, triple.effects[2]) == pytest.approx(5.5)
+    assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(5.5)
     assert sets.superfluous(triple)
 
 

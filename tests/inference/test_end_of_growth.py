@@ -15,7 +15,7 @@ from hidden_truth import sheet
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis.initial_fit import candidates_of
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import Trajectory
 from vinetrack.inference.position_change import position_change
 from vinetrack.laboratory.tracks import BASE, Nature, grow
@@ -73,7 +73,7 @@ def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone()
     )
     fit = vt.fit(vt.base_model(), [(each.stated, each.track) for each in grow(trials, nature)], profile=False)
     candidates = candidates_of(fit.model, ["payload_friction"], None)
-    questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FIRST_LEVEL)
+    questions = misfit_tests(fit, hypotheses.testable(candidates, fit.predictor.data)[0], FALSE_ALARM_LEVEL_FIRST_ROUND)
     size, sigma = (float(values[0]) for values in (questions.scores.size, questions.scores.plain_sigma))
     # μ_p m g acts like a fall of the pressure by 2 μ_p m g / A, and half of the trials have the payload.
     alike = [2 * 0.03 * 9.81 / (math.pi / 4 * trial.diameter_m**2 * trial.pressure_Pa) for trial in bare]

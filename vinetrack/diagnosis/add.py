@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 from vinetrack.core.records import Track
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
-from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.multi_start import (
     SubsetFitter,
     best_subset_fit,
-    from_other_starts,
     full_fit,
-    start_of,
-    without,
+    restart_exponents,
+    restart_without,
+    start_values,
 )
-from vinetrack.diagnosis.selection import MOST_AGAIN, NO_BETTER
+from vinetrack.diagnosis.selection import MAX_RESTARTS, MIN_LOG_LIKELIHOOD_GAIN
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, find_effect
@@ -100,13 +100,13 @@ def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tup
     FitError
         If the model with the effect cannot be followed from any start.
     """
-    if before.chi2_per_dof > FAR_OFF:
-        before = from_other_starts(before)
-    for _ in range(1 + MOST_AGAIN):
+    if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
+        before = restart_exponents(before)
+    for _ in range(1 + MAX_RESTARTS):
         report(f"fitting it with {effect.name}")
         after = _with(before, effect)
-        rival = without(before, after)
-        if rival.log_likelihood <= before.log_likelihood + NO_BETTER:
+        rival = restart_without(before, after)
+        if rival.log_likelihood <= before.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
             break
         before = rival
     return before, after
@@ -115,7 +115,7 @@ def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tup
 def _with(before: Fit, effect: Effect) -> Fit:
     """The fit with an effect, from several starts."""
     slope = SubsetFitter(before)
-    starts = [((effect,), start_of(shape, shape.step * 10)) for shape in shapes_of(effect)]
+    starts = [((effect,), start_values(shape, shape.step * 10)) for shape in shapes_of(effect)]
     climb = best_subset_fit(slope, starts, float("inf"))
     after = full_fit(before, climb) if climb is not None else None
     if after is None:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.between_gain import Difference, gains_from_each
+from vinetrack.diagnosis.between_gain import Difference, gains_by_onset
 from vinetrack.diagnosis.result import DAY, N_BY_VINE, ORDER_DRIFT, SPECIMEN
 from vinetrack.experiment.trial_order import trial_order
 from vinetrack.inference.fit_result import Fit
@@ -29,7 +29,7 @@ DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03
 """The same from day to day, and of ln P: film in other air, a gauge zeroed anew, a regulator set anew. Chosen: a gauge
 holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent; at half and twice as of specimens."""
 
-EACH_SIDE = 2
+MIN_TRIALS_EACH_SIDE = 2
 """Trials that a change has before it and after it. Derived: a change of one trial alone is its random deviation."""
 
 FEWEST_TRIALS = 6
@@ -37,7 +37,7 @@ FEWEST_TRIALS = 6
 with six, one order in 360 is the strict one, either way. At half chance orders pass for drifts, at twice small
 campaigns are never asked."""
 
-SPREAD_OVER_CONDITIONS = 0.5
+CONFOUNDED_VARIANCE_SHARE = 0.5
 """A difference counts as confounded with the conditions where it varies within them by less than this part of what
 random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3; at
 half both are still on their sides, at twice half of all random orders count as confounded."""
@@ -62,7 +62,7 @@ def forms_of(fit: Fit, base: Solution) -> list[Difference]:
     forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
     forms += _changes(fit, base, trials)
     asked = Counter(difference.name for difference in forms)
-    return [replace(difference, ways=difference.ways * asked[difference.name]) for difference in forms]
+    return [replace(difference, n_forms=difference.n_forms * asked[difference.name]) for difference in forms]
 
 
 def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
@@ -108,13 +108,13 @@ def _drifts(trials: Sequence[Trial]) -> list[Difference]:
 def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
     """Ln P of all trials from the likeliest one on, as a regulator is set anew."""
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
-    begins = range(EACH_SIDE, len(trials) - EACH_SIDE + 1)
+    begins = range(MIN_TRIALS_EACH_SIDE, len(trials) - MIN_TRIALS_EACH_SIDE + 1)
     if len(trials) < FEWEST_TRIALS or not np.all(pressures_Pa > 0):
         return []
     ranks, stated = trial_order(trials)
     ordered = [int(i) for i in np.argsort(ranks)]
-    first = begins[int(np.argmax(gains_from_each(fit, base, _step(range(len(trials)), trials), ordered, begins)))]
-    return [replace(_step(ordered[first:], trials), stated=stated, ways=len(begins))]
+    first = begins[int(np.argmax(gains_by_onset(fit, base, _step(range(len(trials)), trials), ordered, begins)))]
+    return [replace(_step(ordered[first:], trials), stated=stated, n_forms=len(begins))]
 
 
 def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
@@ -181,13 +181,13 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
     groups = [""] * len(trials)
     for vine in dict.fromkeys(trial.vine for trial in trials):
         members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
-        begins = range(EACH_SIDE, len(members) - EACH_SIDE + 1)
+        begins = range(MIN_TRIALS_EACH_SIDE, len(members) - MIN_TRIALS_EACH_SIDE + 1)
         if not begins:
             continue
         tube = f"{vine}, later tube"
         whole = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
         form = _forms(SPECIMEN, whole, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
-        first = begins[int(np.argmax(gains_from_each(fit, base, form, members, begins)))]
+        first = begins[int(np.argmax(gains_by_onset(fit, base, form, members, begins)))]
         for i in members[first:]:
             groups[i] = tube
     conditions = [trial.condition for trial in trials]
@@ -223,7 +223,7 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     whole, outer = _square_within(regressors, [trial.vine for trial in trials])
     if inner == 0 or whole == 0:
         return True
-    return within / inner < SPREAD_OVER_CONDITIONS * whole / max(outer, 1)
+    return within / inner < CONFOUNDED_VARIANCE_SHARE * whole / max(outer, 1)
 
 
 def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:

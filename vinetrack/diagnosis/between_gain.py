@@ -53,17 +53,17 @@ class Difference:
     shared: Mapping[str, str] = field(default_factory=dict)
     stated: bool = True
     confounded: bool = True
-    ways: int = 1
+    n_forms: int = 1
     gain: float = 0.0
     p: float = 1.0
 
     @property
-    def worth(self) -> float:
+    def penalised_gain(self) -> float:
         """Fall of −2 ln L less what the best of so many forms costs."""
-        return self.gain - 2 * math.log(self.ways)
+        return self.gain - 2 * math.log(self.n_forms)
 
 
-def chance_of_gain(fit: Fit, difference: Difference, gain: float) -> float:
+def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
     """Chance of such a gain where trials do not differ.
 
     Of fixed coefficients by the F test with as many degrees of freedom as trials leave, LR = N ln(1 + q F / dof):
@@ -124,7 +124,7 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
     return plain - deviance(part, problem, state, new, restricted=False)
 
 
-def beside_systematics(fit: Fit, base: Solution) -> Solution:
+def with_shared_errors(fit: Fit, base: Solution) -> Solution:
     """A solution with the errors that trials share among its numbers: payloads, set pressures, a tracker's.
 
     All replicates of a condition have them together, so that with enough replicates they stand out from the scatter of
@@ -140,10 +140,10 @@ def beside_systematics(fit: Fit, base: Solution) -> Solution:
     Solution
         Each error has a prior of mean 0 and standard deviation 1; sensitivities stay those of the solution.
     """
-    return beside(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
+    return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
 
 
-def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
+def with_trace_errors(fit: Fit, base: Solution) -> Solution:
     """A solution with the errors of recorded pressures among its numbers, those that its fit found put back.
 
     Parameters
@@ -154,12 +154,12 @@ def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
     Returns
     -------
     Solution
-        As of `beside_systematics`.
+        As of `with_shared_errors`.
     """
-    return beside(fit, base, recorded_pressures(fit.predictor, fit.solution))
+    return with_errors(fit, base, recorded_pressures(fit.predictor, fit.solution))
 
 
-def beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
+def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     """A solution with errors among its numbers, each with a prior of mean 0 and standard deviation 1.
 
     Parameters
@@ -189,7 +189,7 @@ def beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     )
 
 
-def gains_from_each(
+def gains_by_onset(
     fit: Fit, base: Solution, difference: Difference, members: Sequence[int], begins: Iterable[int]
 ) -> list[float]:
     """`linear_gain` of a difference one of whose groups begins at each of several places of its members.

@@ -26,10 +26,10 @@ import numpy as np
 from vinetrack.diagnosis.between_forms import forms_of
 from vinetrack.diagnosis.between_gain import (
     Difference,
-    beside_systematics,
-    beside_trace_errors,
-    chance_of_gain,
+    gain_p_value,
     linear_gain,
+    with_shared_errors,
+    with_trace_errors,
 )
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.result import (
@@ -53,14 +53,14 @@ PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
 trial is done for after ten; a supply that loses 1 % a trial has lost a fifth after twenty, and somebody has looked at
 the gauge; a regulator is set to 5 %, as `pressure_gain` has it."""
 
-OUT_OF_REACH = 40.0
+MAX_GAIN_SHORTFALL = 40.0
 """How far in −2 ln L the linear estimate may stay behind the best hypothesis and still be fitted. Chosen: well above
 the answer set's 9 times the usual inflation of 1 to 3; twice as much only costs time."""
 
-LEAST_GAIN = 2.0
+MIN_LINEAR_GAIN = 2.0
 """Fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of what the gate asks for."""
 
-ASKED_AGAIN = 0.01
+SYSTEMATICS_CHECK_P_VALUE = 0.01
 """Chance below which a difference is also asked beside the errors that all replicates of a condition share. Chosen for
 time: three times the level of all tests of a first model, so that at half of it as at twice nothing that would be
 called goes unasked; beside more errors no difference gains chance."""
@@ -105,11 +105,13 @@ def differences(fit: Fit) -> list[Difference]:
     if DAMPING not in fit.predictor.layout.keys:
         return []
     plain = with_smooth_errors(fit)
-    base = beside_trace_errors(fit, plain)
+    base = with_trace_errors(fit, plain)
     best: dict[str, Difference] = {}
     for difference in forms_of(fit, base):
         estimated = _estimated(fit, plain, base, difference)
-        if estimated is not None and (difference.name not in best or estimated.worth > best[difference.name].worth):
+        if estimated is not None and (
+            difference.name not in best or estimated.penalised_gain > best[difference.name].penalised_gain
+        ):
             best[difference.name] = estimated
     return list(best.values())
 
@@ -157,7 +159,7 @@ def between_fits(
     """
     fitted: list[LikelihoodRatio] = []
     for difference in among:
-        if difference.gain < LEAST_GAIN or difference.gain < best - max(OUT_OF_REACH, 0.3 * best):
+        if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(MAX_GAIN_SHORTFALL, 0.3 * best):
             continue
         report(f"fitting {difference.name}")
         fit = _fitted(before, difference)
@@ -207,11 +209,11 @@ def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference
     gain = linear_gain(fit, base, difference)
     if not math.isfinite(gain):
         return None
-    p = chance_of_gain(fit, difference, gain)
-    if p < ASKED_AGAIN and difference.stated and difference.confounded:
-        beside = linear_gain(fit, beside_systematics(fit, plain), difference)
-        p = max(p, chance_of_gain(fit, difference, beside))
-    return replace(difference, gain=gain, p=min(p * difference.ways, 1.0))
+    p = gain_p_value(fit, difference, gain)
+    if p < SYSTEMATICS_CHECK_P_VALUE and difference.stated and difference.confounded:
+        beside = linear_gain(fit, with_shared_errors(fit, plain), difference)
+        p = max(p, gain_p_value(fit, difference, beside))
+    return replace(difference, gain=gain, p=min(p * difference.n_forms, 1.0))
 
 
 def _fitted(before: Fit, difference: Difference) -> Fit | None:

@@ -15,7 +15,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.candidates import shapes_of, testable
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import Power, PowerInput
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit import fit
@@ -45,7 +45,7 @@ def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequ
     """
     questioned = candidates_of(fitted.model, candidates, fitted.model.user_effects)
     effects, blind = testable(questioned, fitted.predictor.data)
-    return power_of(misfit_tests(fitted, effects, FIRST_LEVEL), blind, inputs, curved=True)
+    return power_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), blind, inputs, curved=True)
 
 
 def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> Power:
@@ -203,7 +203,7 @@ def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, st
         thorough=False,
     )  # fmt: skip
     effects, blind = testable(questioned, fitted.predictor.data)
-    return misfit_tests(fitted, effects, FIRST_LEVEL), blind
+    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), blind
 
 
 def as_measured(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:

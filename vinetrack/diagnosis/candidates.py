@@ -20,7 +20,7 @@ WIDE_RANGE = 10.0
 """Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
 linear scale meets every size within a factor of two."""
 
-NARROW, ROOM_BELOW = 2.0, 3.0
+NARROW_RANGE, BELOW_RANGE_FACTOR = 2.0, 3.0
 """Where plausible values differ by more than the first, an effect may be smaller than them by the second. Chosen: a
 narrow plausible range would else exclude small sizes."""
 
@@ -28,15 +28,15 @@ AMPLITUDES = (0.03, 0.2, 0.7)
 """Fractions of the plausible range at which an effect is tried whose small sizes do nothing. Chosen: near nothing,
 small, large."""
 
-LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
 """The same for a threshold: its answer jumps, and a start too far below or above leads nowhere. Chosen: steps of about
 1.3, less than the width of the jump."""
 
-BESIDE_A_SLIP = 0.5
+RANGE_SHARE_BESIDE_SLIP = 0.5
 """Part of its plausible range that an error may have beside a slip. Chosen: both at once are rare; at twice film that
 is 60 % too heavy would pass for half of its thickness, at half a tube measured flat that is 2 % off would be missed."""
 
-OF_A_TUBE = {
+TUBE_ONLY_COLUMNS = {
     "length_mm": "a tube",
     "thickness_um": "film",
     "chamber_l": "the gas of a chamber",
@@ -90,8 +90,10 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
     able, reasons = [], {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
-        if no_tube and (absent := [column for column in effect.needs if column in OF_A_TUBE]):
-            reasons[effect.name] = f"it acts on {OF_A_TUBE[absent[0]]}, and a body that moves as a whole has none"
+        if no_tube and (absent := [column for column in effect.needs if column in TUBE_ONLY_COLUMNS]):
+            reasons[effect.name] = (
+                f"it acts on {TUBE_ONLY_COLUMNS[absent[0]]}, and a body that moves as a whole has none"
+            )
             continue
         if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
             reasons[effect.name] = "the measured pressure already holds it"
@@ -164,7 +166,7 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
-    parts = LADDER if "rest_force" in effect.functions else AMPLITUDES
+    parts = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else AMPLITUDES
     return [
         CandidateShape(effect, values, part * (largest - zero), whole=True) for values in other_values for part in parts
     ]
@@ -202,7 +204,7 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     low, high = plausible_range(parameter)
     if low > 0 and high / low > WIDE_RANGE:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
-    if low > 0 and high / low < NARROW:
+    if low > 0 and high / low < NARROW_RANGE:
         return ((low + high) / 2,)
     return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
 
@@ -226,7 +228,7 @@ def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 
     """
     if parameter.plausible is None:
         return None
-    low, high = (BESIDE_A_SLIP * end for end in parameter.plausible)
+    low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
     for size, done in parameter.slips:
         left, room = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
         if low - room <= left <= high + room:
@@ -263,8 +265,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     low, high = parameter.plausible
     if math.isfinite(parameter.period):
         value = low + (value - low) % parameter.period
-    if low > 0 and high / low > NARROW:
-        low /= ROOM_BELOW
+    if low > 0 and high / low > NARROW_RANGE:
+        low /= BELOW_RANGE_FACTOR
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
     room = reach * sigma if math.isfinite(sigma) else math.inf
     return bool(low - room <= value <= high + room)

@@ -61,7 +61,7 @@ FINAL_AT_FRACTION = 0.95
 """Of the length, or of as much of it as was seen: a bare vine's speed has a meaning only with the place it is taken.
 Chosen as the fit's END_FRACTION."""
 
-LASTS = 3.0
+MAX_DURATION_FACTOR = 3.0
 """How many times longer than the recording the model is followed, to get where the measurement got. Chosen as a
 safeguard: a model three times slower has failed in any case."""
 
@@ -212,7 +212,7 @@ def _final_speed_errors(
 
     A model that never gets there has stopped: its speed there is 0. NaN where the measurement gives none.
     """
-    times = [LASTS * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    times = [MAX_DURATION_FACTOR * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
     moved = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
     errors = {}

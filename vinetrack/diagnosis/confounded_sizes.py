@@ -22,12 +22,12 @@ from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Number
 
-WORTH_SAYING = 1.0
+MIN_SHIFT_SIGMAS = 1.0
 """Shift, in standard errors of the size, from which it is said. Chosen: a shift of one error leaves a 95 %
 interval 83 %; at half (92 %) every correlated pair is listed, at twice (48 %) an interval misses the truth without a
 word."""
 
-MOST_LISTED = 3
+MAX_LISTED = 3
 """Effects listed for each size. Chosen: a sentence that can be read; further ones are weaker."""
 
 TWO_SIDED_95 = 1.959964
@@ -47,30 +47,30 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     tuple of Confounder
         For each size those that could move it by more than its own standard error, the largest first.
     """
-    if after.poorly_fitted or not after.answers.shapes:
+    if after.poorly_fitted or not after.sensitivities.shapes:
         return ()
-    levers = levers_of(after.fit, after.sums)
+    levers = levers_of(after.fit, after.products)
     chosen = []
     for k, number in enumerate(after.fit.numbers):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
             likely = [confounder for confounder in _of_number(after, number, levers[k]) if _is_worth_saying(confounder)]
-            chosen += sorted(likely, key=lambda confounder: -abs(confounder.value - number.value))[:MOST_LISTED]
+            chosen += sorted(likely, key=lambda confounder: -abs(confounder.value - number.value))[:MAX_LISTED]
     return tuple(chosen)
 
 
 def _is_worth_saying(confounder: Confounder) -> bool:
-    return abs(confounder.value - confounder.number.value) > WORTH_SAYING * confounder.number.sigma
+    return abs(confounder.value - confounder.number.value) > MIN_SHIFT_SIGMAS * confounder.number.sigma
 
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
     """Every physical effect as a confounder of one number, in the shape that moves the number most."""
     physical = {effect.name: effect for effect in after.effects if effect.kind == "physical"}
     confounders = []
-    for name in dict.fromkeys(after.answers.effects):
+    for name in dict.fromkeys(after.sensitivities.effects):
         # An effect that holds the added one as a limit stands in its place, not beside it.
         if name not in physical or number.key.split(".")[0] in physical[name].replaces:
             continue
-        each = [_in_shape(after, number, place, float(lever[place])) for place in after.of(name)]
+        each = [_in_shape(after, number, place, float(lever[place])) for place in after.ranked_shapes(name)]
         known = [confounder for confounder in each if confounder is not None]
         if known:
             confounders.append(max(known, key=lambda confounder: abs(confounder.value - number.value)))
@@ -79,7 +79,7 @@ def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confou
 
 def _in_shape(after: MisfitTests, number: Number, place: int, lever: float) -> Confounder | None:
     """One shape of an effect as a confounder; None where the data say nothing about its size."""
-    shape = after.answers.shapes[place]
+    shape = after.sensitivities.shapes[place]
     sigma = float(after.scores.sigma[place])
     if not shape.effect.parameters or shape.whole or not math.isfinite(sigma):
         return None

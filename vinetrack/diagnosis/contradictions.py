@@ -22,7 +22,7 @@ from vinetrack.inference.fit_result import Fit
 if TYPE_CHECKING:
     import pandas as pd
 
-SURELY_DRIFTS = 4.0
+CONTRADICTING_DRIFT_SIGMAS = 4.0
 """Standard deviations of a drift that contradicts an adequate model. Chosen: `drift` calls any at 1 % a campaign, which
 is too often for a sentence that doubts the verdict; 4 is 0.006 % a test, a quarter of a per cent for 40 tests. At half
 one campaign in two would carry a doubt, at twice n that differs by 7 σ between vines would go unmentioned."""
@@ -106,6 +106,6 @@ def _still_drifts(fit: Fit) -> Iterator[str]:
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return
     table = result.table
-    sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > SURELY_DRIFTS)]
+    sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > CONTRADICTING_DRIFT_SIGMAS)]
     model = " + ".join(fit.model.names)
     yield from (f"With {model}: {line}" for line in sure.drop_duplicates(["parameter", "against"])["sentence"])

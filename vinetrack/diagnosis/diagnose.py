@@ -22,7 +22,7 @@ from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.lost_frames import frames_put_right, lost_in_fit, with_lost_frames
+from vinetrack.diagnosis.lost_frames import correct_dropped_frames, lost_in_fit, with_lost_frames
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.odd_trials import odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import (
@@ -57,7 +57,7 @@ log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
 
-BLIND = "no trial answers to it at any plausible size"
+NO_RESPONSE = "no trial answers to it at any plausible size"
 TOO_WEAK = "in these conditions the largest plausible size would not show"
 
 
@@ -126,7 +126,7 @@ def diagnose(
         model = model or base_model()
         questioned = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
-        pairs, missing = frames_put_right(pairs)
+        pairs, missing = correct_dropped_frames(pairs)
         wild = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
         fit = initial_fit(model, pairs, questioned, profile=False)
@@ -186,25 +186,25 @@ def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, s
     added: list[str] = []
     fits = [fit]
     for finding in findings[:-1]:
-        effect = finding.answer[0]
+        effect = finding.answer_names[0]
         added.append(effect)
     for after in findings[1:]:
-        fits.append(after.questions.fit)
+        fits.append(after.tests.fit)
     explanation = " ".join(step.explanation for step in rounds)
     lacking = [name for name, why in blind.items() if "`" in why]
     if lacking and any(step.verdict == UNEXPLAINED for step in rounds):
         explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
-    power = power_of(findings[-1].questions, blind, first=findings[0].questions)
+    power = power_of(findings[-1].tests, blind, first=findings[0].tests)
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits), power=power)
 
 
 def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
-    questions = finding.questions
+    questions = finding.tests
     names, cosines = _cosines(questions)
     return Round(
         model=questions.fit.model.names,
         verdict=finding.verdict,
-        answer_set=finding.answer,
+        answer_set=finding.answer_names,
         ranking=tuple(_ranking(finding, blind)),
         explanation=explain(finding),
         cosine_names=names,
@@ -212,7 +212,7 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
         fit=questions.fit,
         fits={
             hypothesis.names[-1]: hypothesis.fit
-            for hypothesis in finding.kept
+            for hypothesis in finding.answer_set
             if hypothesis.effects[-1].kind != BETWEEN_TRIALS
         },
         sets=_sets(finding),
@@ -223,13 +223,13 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
 
 def _sets(finding: SelectionStep) -> tuple[tuple[str, ...], ...]:
     """The hypotheses of an answer set, each with all its effects, where one has several."""
-    sets = tuple(hypothesis.names for hypothesis in finding.kept)
+    sets = tuple(hypothesis.names for hypothesis in finding.answer_set)
     return sets if any(len(names) > 1 for names in sets) else ()
 
 
 def _partial(finding: SelectionStep) -> tuple[Candidate, ...]:
     """The steps that mend a part, each against the one before it."""
-    steps, before = [], finding.questions.fit
+    steps, before = [], finding.tests.fit
     for hypothesis in finding.partial:
         effect = hypothesis.effects[-1]
         step = likelihood_ratio(before, (effect,), hypothesis.fit)
@@ -242,22 +242,22 @@ def _partial(finding: SelectionStep) -> tuple[Candidate, ...]:
 
 def _cosines(questions: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
     """Cosines between effects, each in the shape that promises most."""
-    names = tuple(dict.fromkeys(questions.answers.effects))
-    places = [questions.of(name)[0] for name in names]
+    names = tuple(dict.fromkeys(questions.sensitivities.effects))
+    places = [questions.ranked_shapes(name)[0] for name in names]
     matrix = questions.scores.cosines[np.ix_(places, places)] if places else np.zeros((0, 0))
     return names, matrix.tolist()
 
 
 def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate]:
-    questions = finding.questions
-    aside = dict(finding.aside)
-    singles = {hypothesis.names[0]: hypothesis for hypothesis in finding.tried if len(hypothesis.names) == 1}
+    questions = finding.tests
+    aside = dict(finding.rejected)
+    singles = {hypothesis.names[0]: hypothesis for hypothesis in finding.fitted if len(hypothesis.names) == 1}
     weights = weights_of(list(singles.values()))
-    rows = [_rule(hypothesis, finding) for hypothesis in finding.kept if hypothesis.effects[-1] is TAIL_SLACK]
+    rows = [_rule(hypothesis, finding) for hypothesis in finding.answer_set if hypothesis.effects[-1] is TAIL_SLACK]
     for effect in questions.effects:
-        largest, shows = questions.largest(effect)
-        if effect.name in questions.answers.silent:
-            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=BLIND))
+        largest, shows = questions.upper_limits(effect)
+        if effect.name in questions.sensitivities.silent:
+            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=NO_RESPONSE))
             continue
         z, place = questions.best_z(effect.name)
         if effect.name in singles:
@@ -271,16 +271,16 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     single.sigma,
                     single.numbers,
                     single.plausible,
-                    effect.name in finding.answer,
+                    effect.name in finding.answer_names,
                     aside.get(effect.name, single.reason),
                     largest,
-                    single.others if effect.name in finding.answer else (),
+                    single.others if effect.name in finding.answer_names else (),
                     weights[effect.name],
                     tuple(single for single in finding.confounded if single.number.key.split(".")[0] == effect.name),
                     single.log_bayes,
                 )
             )
-        elif finding.verdict == ADEQUATE and not shows and z < questions.family.of(effect.name):
+        elif finding.verdict == ADEQUATE and not shows and z < questions.family.threshold(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=TOO_WEAK))
         else:
             rows.append(
@@ -290,13 +290,13 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     SCREENED,
                     _promised(finding, effect.name, z),
                     z,
-                    questions.predicted(effect, place),
-                    in_answer_set=effect.name in finding.answer,
+                    questions.predicted_size(effect, place),
+                    in_answer_set=effect.name in finding.answer_names,
                     reason=_holds(effect, finding) or _behind(finding, effect.name),
                     largest={} if questions.poorly_fitted else largest,
                 )
             )
-    rows += between_candidates(finding.tried, finding.answer, aside)
+    rows += between_candidates(finding.fitted, finding.answer_names, aside)
     rows += [
         Candidate(name, "", NOT_TESTABLE, reason=why) for name, why in blind.items() if name not in questions.fit.model
     ]
@@ -308,7 +308,7 @@ def _rule(hypothesis: LikelihoodRatio, finding: SelectionStep) -> Candidate:
     """The rule that a tail cannot push, as a candidate without a size."""
     name = hypothesis.names[-1]
     return Candidate(
-        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in finding.answer
+        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in finding.answer_names
     )
 
 
@@ -316,18 +316,18 @@ def _promised(finding: SelectionStep, name: str, z: float) -> float:
     """Fall of −2 ln L that the sensitivities promise; of an adequate model, what the score says."""
     if finding.verdict == ADEQUATE:
         return z**2
-    return math.nan if finding.questions.poorly_fitted else finding.questions.promise(name)
+    return math.nan if finding.tests.poorly_fitted else finding.tests.predicted_gain(name)
 
 
 def _holds(effect: Effect, finding: SelectionStep) -> str:
     """That an effect contains one that was found, where it does: it can be no worse, and need not be tried."""
-    held = [name for name in effect.replaces if name in finding.answer]
+    held = [name for name in effect.replaces if name in finding.answer_names]
     return f"it holds {held[0]} as a limit" if held else ""
 
 
 def _behind(finding: SelectionStep, name: str) -> str:
     """How far a candidate stayed behind the best where only one trial of every condition was fitted."""
-    climbs = finding.search.climbs if finding.search else {}
+    climbs = finding.search.subset_fits if finding.search else {}
     if name not in climbs:
         return ""
     behind = climbs[name].deviance - min(climb.deviance for climb in climbs.values())

@@ -77,7 +77,7 @@ MOST_ITERATIONS = 15
 """Iterations of a refit at most. Chosen: it begins beside its end."""
 
 
-FALSE_ALARMS = 0.01
+FALSE_ALARM_LEVEL = 0.01
 """How often any drift at all is called significant where nothing drifts. Chosen: the usual 1 %, shared over all
 parameters and conditions by Bonferroni."""
 
@@ -128,7 +128,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     notes: list[str] = []
     scatter = scatter or replicate_scatter(fit, courses_of(fit)[0])
     tests = list(_tests(fit, scatter, notes))
-    level = 1 - (1 - FALSE_ALARMS) ** (1 / max(len(tests), 1))
+    level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     tests.sort(key=lambda tested: tested.p)
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]

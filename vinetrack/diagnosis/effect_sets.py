@@ -14,28 +14,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.diagnosis.candidate_fits import Asked, CandidateFits, Report, simpler_forms
+from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.held_fits import let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
-from vinetrack.diagnosis.misfit_tests import SUSPECT_SIGMAS
-from vinetrack.diagnosis.multi_start import SHARE_OF_BEST
+from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS
+from vinetrack.diagnosis.multi_start import MIN_SHARE_OF_BEST_GAIN
+from vinetrack.diagnosis.nested_forms import NestedForm, simpler_forms
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
-MOST_EFFECTS = 5
+MAX_EFFECTS = 5
 """Effects of a set at most. Chosen: with six and more the sets outnumber what 48 trials can tell apart."""
 
-FIRSTS, PARTNERS = 3, 4
-"""Pairs are built on the three best effects alone, if they explain SHARE_OF_BEST of what the best explains, with the
-four that promise most beside each. Chosen for time."""
+PAIR_BASES, PAIR_PARTNERS = 3, 4
+"""Number of best single effects from which pairs are built, and of partners tried with each. A single effect needs
+MIN_SHARE_OF_BEST_GAIN of the best one's gain. Chosen for time."""
 
-FURTHER_FIRSTS, FURTHER_PARTNERS = 2, 3
+LARGER_SET_BASES, LARGER_SET_PARTNERS = 2, 3
 """Larger sets are built on the two best and the best credible one of those a size smaller. Chosen for time."""
 
-NO_BETTER = 1.0
+MIN_LOG_LIKELIHOOD_GAIN = 1.0
 """Difference in ln L that counts as better. Chosen: unsettled iterations differ by a tenth."""
 
 Names = frozenset[str]
@@ -46,13 +47,13 @@ class EffectSets:
 
     def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio], report: Report) -> None:
         self.search, self.report = search, report
-        self.before = search.questions.fit
-        self.effects = search.questions.effects
-        self.known: dict[Names, LikelihoodRatio] = {}
+        self.before = search.tests.fit
+        self.effects = search.tests.effects
+        self.fitted: dict[Names, LikelihoodRatio] = {}
         for single in singles:
             self._keep(single)
-        self.grown: set[Names] = set()
-        self.asked: set[Asked] = set()
+        self.extended: set[Names] = set()
+        self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
         """Known sets of so many effects, most likely first.
@@ -65,7 +66,7 @@ class EffectSets:
         -------
         list of LikelihoodRatio
         """
-        known = [hypothesis for names, hypothesis in self.known.items() if len(names) == size]
+        known = [hypothesis for names, hypothesis in self.fitted.items() if len(names) == size]
         return sorted(known, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
@@ -80,33 +81,33 @@ class EffectSets:
         list of LikelihoodRatio
             All known sets of that size, most likely first.
         """
-        partners = PARTNERS if size == 2 else FURTHER_PARTNERS
+        partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
         for first in self._firsts(size - 1):
             names = frozenset(first.names)
-            if names in self.grown:
+            if names in self.extended:
                 continue
-            self.grown.add(names)
-            search = CandidateFits(self.search.after(first.fit), self.report, most_fitted=partners)
-            search.singles()
-            for name, likely, held, simpler in search.asked:
-                self.asked.add(("+".join(sorted((*first.names, name))), likely, held, simpler))
+            self.extended.add(names)
+            search = CandidateFits(self.search.tests_after(first.fit), self.report, max_full_fits=partners)
+            search.fit_singles()
+            for name, likely, held, simpler in search.nested_tried:
+                self.nested_tried.add(("+".join(sorted((*first.names, name))), likely, held, simpler))
             ranked = sorted(search.fitted.values(), key=lambda further: -further.fit.log_likelihood)
-            kept = [other for k, other in enumerate(ranked) if k < partners or other.label in search.simpler]
+            kept = [other for k, other in enumerate(ranked) if k < partners or other.label in search.nested_labels]
             for further in kept:
                 self._keep(likelihood_ratio(self.before, (*first.effects, *further.effects), further.fit))
         for hypothesis in self.of_size(size)[:partners]:
-            for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.asked):
+            for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.nested_tried):
                 self._keep(likelihood_ratio(self.before, effects, fit))
         return self.of_size(size)
 
     def _firsts(self, size: int) -> list[LikelihoodRatio]:
         known = self.of_size(size)
         top = max((hypothesis.delta_chi2 for hypothesis in known), default=0.0)
-        known = [hypothesis for hypothesis in known if hypothesis.delta_chi2 >= SHARE_OF_BEST * top]
+        known = [hypothesis for hypothesis in known if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * top]
         if size == 1:
-            return known[:FIRSTS]
+            return known[:PAIR_BASES]
         credible = [hypothesis for hypothesis in known if hypothesis.credible]
-        return [*known[:FURTHER_FIRSTS], *(best for best in credible[:1] if best not in known[:FURTHER_FIRSTS])]
+        return [*known[:LARGER_SET_BASES], *(best for best in credible[:1] if best not in known[:LARGER_SET_BASES])]
 
     def prune(self, hypothesis: LikelihoodRatio) -> bool:
         """Backward: take each member out of a set.
@@ -123,10 +124,10 @@ class EffectSets:
         size = len(hypothesis.effects) - 1
         best = max((known.fit.log_likelihood for known in self.of_size(size)), default=-math.inf)
         for effect in hypothesis.effects:
-            self.without(hypothesis, effect)
-        return self.of_size(size)[0].fit.log_likelihood > best + NO_BETTER
+            self.leave_out(hypothesis, effect)
+        return self.of_size(size)[0].fit.log_likelihood > best + MIN_LOG_LIKELIHOOD_GAIN
 
-    def without(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
+    def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
         """A set with one member taken out, the others fitted again; None where that cannot be followed.
 
         Parameters
@@ -139,15 +140,15 @@ class EffectSets:
         LikelihoodRatio or None
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
-        known = self.known.get(frozenset(other.name for other in others))
+        known = self.fitted.get(frozenset(other.name for other in others))
         if known is None or known.fit.log_likelihood > hypothesis.fit.log_likelihood:
             self.report(f"taking out {effect.name}")
             fit = self._refitted(hypothesis.fit, others)
             if fit is not None:
                 self._keep(likelihood_ratio(self.before, others, fit))
-        return self.known.get(frozenset(other.name for other in others))
+        return self.fitted.get(frozenset(other.name for other in others))
 
-    def of_effects(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
+    def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
         """Some members of a set alone, fitted from the set where they are not known; None where that fails.
 
         Parameters
@@ -160,11 +161,11 @@ class EffectSets:
         LikelihoodRatio or None
         """
         names = frozenset(effect.name for effect in effects)
-        if names not in self.known:
+        if names not in self.fitted:
             fit = self._refitted(hypothesis.fit, effects)
             if fit is not None:
                 self._keep(likelihood_ratio(self.before, effects, fit))
-        known = self.known.get(names)
+        known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
 
     def _refitted(self, fit: Fit, effects: Iterable[Effect]) -> Fit | None:
@@ -173,7 +174,7 @@ class EffectSets:
         except (FitError, SimulationError, np.linalg.LinAlgError):
             return None
 
-    def worth(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
+    def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
         """What a member of a set is worth beside the others, in standard deviations; 0 where it is not known.
 
         Parameters
@@ -185,7 +186,7 @@ class EffectSets:
         -------
         float
         """
-        others = self.without(hypothesis, effect)
+        others = self.leave_out(hypothesis, effect)
         if others is None:
             return 0.0
         fall = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
@@ -205,11 +206,11 @@ class EffectSets:
         """
         for effect in hypothesis.effects:
             others = tuple(other for other in hypothesis.effects if other is not effect)
-            sigmas = self.worth(hypothesis, effect)
-            asked = SUSPECT_SIGMAS
-            smaller = self.known.get(frozenset(other.name for other in others))
+            sigmas = self.member_sigmas(hypothesis, effect)
+            asked = SEARCH_SIGMAS
+            smaller = self.fitted.get(frozenset(other.name for other in others))
             if smaller is not None:
-                asked = max(asked, self.search.after(smaller.fit).family.of(effect.name))
+                asked = max(asked, self.search.tests_after(smaller.fit).family.threshold(effect.name))
             if sigmas < asked:
                 return f"{effect.name} is worth {sigmas:.1f} σ beside the others, and {asked:.1f} σ are asked of it"
         return ""
@@ -227,11 +228,11 @@ class EffectSets:
         bool
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
-        further = self.search.after(smaller.fit).family
-        limit = max(further.of(name) for name in hypothesis.names if name not in smaller.names)
+        further = self.search.tests_after(smaller.fit).family
+        limit = max(further.threshold(name) for name in hypothesis.names if name not in smaller.names)
         return 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood) >= limit**2
 
-    def steps(self) -> tuple[LikelihoodRatio, ...]:
+    def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
         """The steps to the largest set of plausible sizes in which each effect more is no chance, one effect a step.
 
         Returns
@@ -240,21 +241,21 @@ class EffectSets:
             Empty where no single effect is plausible.
         """
         best: LikelihoodRatio | None = None
-        for size in range(1, MOST_EFFECTS + 1):
+        for size in range(1, MAX_EFFECTS + 1):
             plausible = [known for known in self.of_size(size) if known.plausible and known.credible]
             if not plausible or (best is not None and not self.is_better(plausible[0], best)):
                 break
             best = plausible[0]
         if best is None:
             return ()
-        steps = [self.of_effects(best, best.effects[: k + 1]) for k in range(len(best.effects))]
+        steps = [self.subset(best, best.effects[: k + 1]) for k in range(len(best.effects))]
         return tuple(step for step in steps if step is not None)
 
     def _keep(self, hypothesis: LikelihoodRatio) -> None:
         names = frozenset(hypothesis.names)
-        known = self.known.get(names)
+        known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
-            self.known[names] = hypothesis
-            same = {others: known for others, known in self.known.items() if len(others) == len(names)}
+            self.fitted[names] = hypothesis
+            same = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
             let_go(same)
-            self.known |= same
+            self.fitted |= same

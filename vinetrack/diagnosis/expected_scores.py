@@ -157,7 +157,7 @@ def score_ratio(questions: MisfitTests, place: int, size: float, start: Noiseles
     float
         1 where the trajectories cannot be followed with the effect at that size, or the fit without it does not settle.
     """
-    fit, shape = questions.fit, questions.answers.shapes[place]
+    fit, shape = questions.fit, questions.sensitivities.shapes[place]
     sigma = float(questions.scores.plain_sigma[place])
     if shape.whole or not shape.effect.parameters:
         return 1.0
@@ -193,8 +193,8 @@ def least_sizes(questions: MisfitTests) -> Floats:
     fit = questions.fit
     systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
     if not systematic_m > 0:
-        return np.zeros(len(questions.answers.shapes))
-    moved_m = displacements(fit, questions.sums)
+        return np.zeros(len(questions.sensitivities.shapes))
+    moved_m = displacements(fit, questions.products)
     return np.asarray(systematic_m / np.maximum(moved_m, 1e-300))
 
 

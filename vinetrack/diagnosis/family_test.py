@@ -43,14 +43,15 @@ HALVINGS = 30
 class FamilyTest:
     """Thresholds of all candidates, in standard deviations of a score.
 
-    `share` is the chance at which each candidate alone exceeds its own, `thresholds` those by name of the effect.
+    `candidate_level` is the probability with which each candidate alone exceeds its threshold; `thresholds` are by name
+    of effect.
     """
 
     level: float
-    share: float
+    candidate_level: float
     thresholds: Mapping[str, float]
 
-    def of(self, name: str) -> float:
+    def threshold(self, name: str) -> float:
         """The threshold of a candidate; of one without shapes, that of a single score of either sign.
 
         Parameters
@@ -61,12 +62,12 @@ class FamilyTest:
         -------
         float
         """
-        return self.thresholds.get(name, self.single)
+        return self.thresholds.get(name, self.single_shape_threshold)
 
     @property
-    def single(self) -> float:
+    def single_shape_threshold(self) -> float:
         """Threshold of a candidate that is tried in one shape, of either sign."""
-        return -float(ndtri(self.share / 2))
+        return -float(ndtri(self.candidate_level / 2))
 
 
 class _Scores:
@@ -142,7 +143,7 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
     return FamilyTest(level, math.exp(low), thresholds(low))
 
 
-def family_chance(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
+def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
     """Chance that any candidate stands out as far as the one that does so most: the p-value of the family.
 
     Parameters

@@ -8,7 +8,7 @@ is a hypothesis of its own, `film_mass`.
 
 from __future__ import annotations
 
-from vinetrack.diagnosis.between_gain import beside
+from vinetrack.diagnosis.between_gain import with_errors
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
@@ -35,7 +35,7 @@ def film_gain(fit: Fit) -> float:
     if not errors.n_columns:
         return 0.0
     base = with_smooth_errors(fit)
-    return max(_deviance(base, base) - _deviance(beside(fit, base, errors), base), 0.0)
+    return max(_deviance(base, base) - _deviance(with_errors(fit, base, errors), base), 0.0)
 
 
 def _deviance(solution: Solution, base: Solution) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_refinement import Normal, Place
 from vinetrack.diagnosis.force_surface import AMPLITUDES, ANY, FOLLOWED, LENGTHS, Domain, Surface, standard_error
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 
 LEAST_INFORMATION = 1e-8
 """Information below which a direction is not told apart from others, where each number alone has 1. Derived: sums of
@@ -113,7 +113,7 @@ class VariableChoice:
         narrow = [each for each in self.beginnings if each.begins != ANY]
         wide = [each for each in self.beginnings if each.begins == ANY]
         most = max((each.log_evidence for each in narrow), default=-math.inf)
-        if not narrow or (wide and wide[0].log_evidence > most + 0.5 * ANSWER_SET * error):
+        if not narrow or (wide and wide[0].log_evidence > most + 0.5 * ANSWER_SET_DELTA_CHI2 * error):
             return wide[0]
         weights = np.exp([(each.log_evidence - most) / error for each in narrow])
         weights /= weights.sum()

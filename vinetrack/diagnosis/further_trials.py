@@ -267,7 +267,7 @@ def _questions(design: CampaignDesign, added: Sequence[Condition], candidates: t
 
 def _wide(asked: MisfitTests, effect: str) -> Floats:
     """Cross products of each trial among free numbers, shared systematic errors and the effect, in this order."""
-    fit, sums, problem = asked.fit, asked.sums, asked.fit.solution.problem
+    fit, sums, problem = asked.fit, asked.products, asked.fit.solution.problem
     blocks = blocks_of(fit, sums, fit.state)
     keys, free, n = sums.n_keys, problem.prior_mean.size, len(blocks)
     shape = keys + 1 + typical_place(asked, effect)
@@ -286,7 +286,7 @@ def _wide(asked: MisfitTests, effect: str) -> Floats:
 def _prior(asked: MisfitTests) -> Floats:
     """What is known of the same numbers beforehand: systematic errors have standard deviation 1."""
     free = asked.fit.solution.problem.prior_precision
-    return np.diag(np.concatenate([np.maximum(free, UNSEEN), np.ones(asked.sums.n_doubts), [0.0]]))
+    return np.diag(np.concatenate([np.maximum(free, UNSEEN), np.ones(asked.products.n_doubts), [0.0]]))
 
 
 def _left(totals: Floats) -> Floats:
@@ -352,6 +352,6 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
         columns=tuple(fit.solution.columns[k] for k in where),
     )
     part = replace(fit, predictor=predictor, solution=solution, trials=tuple(fit.trials[k] for k in where), smooth=None)
-    sums = asked.sums.of(where)
-    answers = replace(asked.answers, columns=[asked.answers.columns[k] for k in where])
-    return replace(asked, fit=part, sums=sums, answers=answers, scores=scores_of(part, sums))
+    sums = asked.products.of(where)
+    answers = replace(asked.sensitivities, columns=[asked.sensitivities.columns[k] for k in where])
+    return replace(asked, fit=part, products=sums, sensitivities=answers, scores=scores_of(part, sums))

@@ -11,7 +11,7 @@ from collections.abc import MutableMapping
 from dataclasses import replace
 from typing import TypeVar
 
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, LikelihoodRatio
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import Predictor
@@ -21,7 +21,7 @@ MANY_POINTS = 150_000
 16 MB; at half smaller campaigns spend time on curves made again, at twice a search over them takes 2 GB. It decides no
 number or likelihood of a fit; derivatives made again come of other steps, within the error of the first."""
 
-FITS_HELD, TESTS_HELD = 8, 1
+MAX_WHOLE_FITS, MAX_WHOLE_TESTS = 8, 1
 """Fits, the likeliest of a search, and questioned fits, the last asked, that stay whole. Chosen for memory: what steps
 go on from is among the best three; of fits at half curves are made again now and then; each questioned fit more holds
 as much as ten fits."""
@@ -52,10 +52,10 @@ def let_go(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
         Hypotheses that compete, changed in place.
     """
     ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
-    for key, hypothesis in ranked[FITS_HELD:]:
+    for key, hypothesis in ranked[MAX_WHOLE_FITS:]:
         fit = hypothesis.fit
         behind = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
-        if fit.trials and behind > ANSWER_SET * MOST_INFLATION and holds_many(fit):
+        if fit.trials and behind > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION and holds_many(fit):
             fitted[key] = replace(hypothesis, fit=without_curves(fit))
 
 

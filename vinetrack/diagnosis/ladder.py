@@ -40,7 +40,7 @@ LADDER_COLUMNS = (
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
-MOST_PARTS = 48
+MAX_FOLDS = 48
 """Parts in which conditions are left out at most; of more conditions several are left out at once, so that the time
 grows as the number of trials alone and not as that times the number of conditions. Chosen: the fit still sees 98 % of
 the conditions; at half 96 %, at twice the time of this step doubles."""
@@ -169,7 +169,7 @@ def in_sample(fit: Fit) -> Errors:
 def left_out(fit: Fit) -> Errors:
     """Predictions of every condition by the model fitted to all the others.
 
-    Of more than `MOST_PARTS` conditions several are left out at once, those of one vine as far apart as it goes.
+    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine as far apart as it goes.
 
     Parameters
     ----------
@@ -181,8 +181,8 @@ def left_out(fit: Fit) -> Errors:
     Errors
     """
     vines = {trial.trial.condition: trial.trial.vine for trial in fit.trials}
-    conditions = list(vines) if len(vines) <= MOST_PARTS else sorted(vines, key=lambda name: vines[name])
-    parts = [set(conditions[k::MOST_PARTS]) for k in range(min(len(conditions), MOST_PARTS))]
+    conditions = list(vines) if len(vines) <= MAX_FOLDS else sorted(vines, key=lambda name: vines[name])
+    parts = [set(conditions[k::MAX_FOLDS]) for k in range(min(len(conditions), MAX_FOLDS))]
     return _together([_without(fit, [trial.trial.condition in part for trial in fit.trials]) for part in parts])
 
 

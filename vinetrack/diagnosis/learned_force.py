@@ -45,7 +45,7 @@ from vinetrack.diagnosis.force_refinement import SETTLED, Place, followed, norma
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
 from vinetrack.diagnosis.force_surface import ANY, CONSTANT, VARIABLES, Domain, Surface, domains
 from vinetrack.diagnosis.learned_variables import dependence, named, not_excluded, reference
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
 
@@ -207,7 +207,7 @@ def learned_force(
     lowest = {choice.domain.name: told.lowest for choice, _, told in there}
     losses = {name: (value - lowest[best.surface.domain.name]) / inflation for name, value in lowest.items()}
     everything = [choice.domain for choice, _ in linear]
-    beside = not_excluded(best.surface.domain, weights, losses, ANSWER_SET * error, everything, motions)
+    beside = not_excluded(best.surface.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, everything, motions)
     if beside:
         remarks.append("Trials that pass the same growth otherwise, at further pressures or payloads, tell.")
     return _told(fit, best, place.motions, weights, bayes, remarks, beside, choice.undecided_N)

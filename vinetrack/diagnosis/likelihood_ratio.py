@@ -12,29 +12,29 @@ from scipy.special import gammaincc, ndtri_exp
 from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.film_allowance import film_gain
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
-from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
+from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_penalty
 from vinetrack.effects import Effect
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 
-ANSWER_SET = 9.0
+ANSWER_SET_DELTA_CHI2 = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
 
-MOST_INFLATION = 6.0
+MAX_INFLATION = 6.0
 """How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little.
 Chosen: at half fewer differences count as scatter, at twice weak effects are missed."""
 
-CREDIBLE = 3.0
+CREDIBLE_RANGE_FACTOR = 3.0
 """How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag.
 Chosen: plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
 
-LEAST_SIGMAS = 1.0
+MIN_SIZE_SIGMAS = 1.0
 """A size below this many of its own errors is none. Chosen: an effect that a likelihood ratio finds at 4 σ has a size
 of about 4 errors, unless its size and shape cannot be told apart; at half, C = 0.0000057 ± 0.0000095 N would pass, at
 twice, effects whose size and shape are correlated would be lost."""
 
-LIMIT_DISTANCE = 4.0
+SAME_CURVE_DISTANCE = 4.0
 """Squared distance, in units of the noise, below which what two hypotheses predict is the same curve. Derived: two
 standard deviations of one number."""
 
@@ -57,7 +57,7 @@ class LikelihoodRatio:
     reason: str
     credible: bool = True
     inflation: float = 1.0
-    surprise: float = 0.0  #: by how much its sizes lie beyond what is plausible, on the scale of −2 ln L
+    prior_penalty: float = 0.0  #: by how much its sizes lie beyond what is plausible, on the scale of −2 ln L
     log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.weighing`
     film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.film_allowance`
 
@@ -93,7 +93,7 @@ class LikelihoodRatio:
         """All other numbers of its fit."""
         return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
 
-    def behind(self, other: LikelihoodRatio) -> float:
+    def deviance_excess(self, other: LikelihoodRatio) -> float:
         """By how much it is worse than another, in −2 ln L.
 
         Parameters
@@ -155,9 +155,9 @@ def likelihood_ratio(
         sigma=_in_sigmas(fall, effects, after) / ratio,
         plausible=plausible,
         reason=nothing or reason,
-        credible=not nothing and plausibility(effects, after, CREDIBLE)[0],
-        inflation=min(ratio**2, MOST_INFLATION),
-        surprise=prior_surprise(after, parameters),
+        credible=not nothing and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
+        inflation=min(ratio**2, MAX_INFLATION),
+        prior_penalty=prior_penalty(after, parameters),
         log_evidence=log_evidence(after, parameters),
         film_gain=film_gain(after),
     )
@@ -175,7 +175,7 @@ def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
             known = [number for number in after.numbers if number.key == key and math.isfinite(number.sigma)]
             # Where each vine has a size of its own, one that is not nothing is enough.
             away = [abs(number.value - parameter.zero) / number.sigma for number in known if number.sigma > 0]
-            if away and max(away) < LEAST_SIGMAS:
+            if away and max(away) < MIN_SIZE_SIGMAS:
                 number = known[0]
                 return f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
     return ""
@@ -282,7 +282,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
     Excluded is what is worse by 9 than the best, in −2 ln L both with film as stated and with film that weighs a little
     other (`film_gain`), as far as the scatter of trials bears it out, plus what its sizes lie beyond the plausible
-    (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
+    (`prior_penalty`). Set aside are those that hold a simpler one as a limit and are no
     better by 9 than it, and those that need a size beyond what is plausible where another does not.
 
     Parameters
@@ -303,20 +303,20 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     lowest_off = min(off.values())
 
     def behind(hypothesis: LikelihoodRatio) -> float:
-        as_stated = hypothesis.behind(highest)
+        as_stated = hypothesis.deviance_excess(highest)
         # Beside film that is off, an effect has to gain something itself.
         gained = film_alone[0] - off[hypothesis.label] if film_alone else math.inf
-        needed = gained > ANSWER_SET * highest.inflation
+        needed = gained > ANSWER_SET_DELTA_CHI2 * highest.inflation
         return min(as_stated, off[hypothesis.label] - lowest_off if needed else math.inf) / highest.inflation
 
-    likely = [hypothesis for hypothesis in hypotheses if behind(hypothesis) <= ANSWER_SET]
+    likely = [hypothesis for hypothesis in hypotheses if behind(hypothesis) <= ANSWER_SET_DELTA_CHI2]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
 
     def misfit(hypothesis: LikelihoodRatio) -> float:
-        return behind(hypothesis) + hypothesis.surprise
+        return behind(hypothesis) + hypothesis.prior_penalty
 
     lowest = min(misfit(ratio) for ratio in likely)
-    near = [ratio for ratio in likely if misfit(ratio) - lowest <= ANSWER_SET]
+    near = [ratio for ratio in likely if misfit(ratio) - lowest <= ANSWER_SET_DELTA_CHI2]
     aside = {
         ratio.label: ratio.reason or "its size lies beyond what is plausible" for ratio in likely if ratio not in near
     }
@@ -325,11 +325,11 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
         simpler = [
             other
             for other in near
-            if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET_DELTA_CHI2
             and _complexity(other) < _complexity(ratio)
             and (
                 _contains(ratio, other)
-                or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < LIMIT_DISTANCE)
+                or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < SAME_CURVE_DISTANCE)
             )
         ]
         if simpler:

@@ -33,8 +33,8 @@ from scipy.stats import norm, t
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range
 from vinetrack.diagnosis.expected_scores import beyond, followed_sizes, least_sizes, noiseless_start
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, CREDIBLE
-from vinetrack.diagnosis.misfit_tests import LOUD_PROBE, MisfitTests
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
+from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
 from vinetrack.diagnosis.score_test import informations_at
 from vinetrack.effects import Effect
@@ -107,13 +107,13 @@ def power_of(
         for response in _responses(questions, curved=curved)
         if (power := _effect_power(questions, response, joint, widening, least)) is not None
     ]
-    silent = dict.fromkeys(questions.answers.silent, "no trial responds to it at any plausible size")
+    silent = dict.fromkeys(questions.sensitivities.silent, "no trial responds to it at any plausible size")
     wary = ""
-    if questions.off or questions.poorly_fitted:
+    if questions.exceeds_slow_errors or questions.poorly_fitted:
         wary = "the model misses the trials by more than their noise, which the sizes take for noise"
     return Power(
         n_trials=len(questions.fit.trials),
-        threshold=questions.family.single,
+        threshold=questions.family.single_shape_threshold,
         false_alarms=_false_alarms(first or questions),
         effects=tuple(effects),
         not_testable={**(not_testable or {}), **silent},
@@ -193,7 +193,7 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
         places = _typical_places(questions, effect)
         if not places:
             continue
-        shapes = [questions.answers.shapes[place] for place in places]
+        shapes = [questions.sensitivities.shapes[place] for place in places]
         sizes = np.array(
             [shape.step if shape.whole else _toward(shape) / root[k] for shape, k in zip(shapes, places, strict=True)]
         )
@@ -211,9 +211,11 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
 def _typical_places(questions: MisfitTests, effect: Effect) -> list[int]:
     """Places of the shapes that an effect is followed in: the middle one, or several finite sizes where that is all."""
     known = np.diag(questions.scores.information) > 0
-    places = [k for k, name in enumerate(questions.answers.effects) if name == effect.name and known[k]]
-    small = [k for k in places if not questions.answers.shapes[k].whole]
-    return [small[len(small) // 2]] if small else sorted(places, key=lambda k: abs(questions.answers.shapes[k].step))
+    places = [k for k, name in enumerate(questions.sensitivities.effects) if name == effect.name and known[k]]
+    small = [k for k in places if not questions.sensitivities.shapes[k].whole]
+    return (
+        [small[len(small) // 2]] if small else sorted(places, key=lambda k: abs(questions.sensitivities.shapes[k].step))
+    )
 
 
 def _toward(shape: CandidateShape) -> int:
@@ -234,7 +236,7 @@ def _effect_power(
     questions: MisfitTests, response: _Response, joint: Floats, widening: Floats, least: Floats
 ) -> EffectPower | None:
     """Detectable sizes of one effect, and what it is taken for at the size found with 90 %."""
-    places = [k for k, name in enumerate(questions.answers.effects) if name == response.effect.name]
+    places = [k for k, name in enumerate(questions.sensitivities.effects) if name == response.effect.name]
     expected = _one_way(response.scores, questions.signs)
     place = max(places, key=lambda k: float(expected[-1, k]))
     means = np.maximum.accumulate(np.maximum(expected[:, place], 0.0))
@@ -282,7 +284,7 @@ def _needed_means(questions: MisfitTests, place: int, widening: Floats) -> Float
     Derivation at the head of the module; p_i is the share of trial i in the information about the shape.
     """
     scores = questions.scores
-    limit = questions.family.of(questions.answers.effects[place])
+    limit = questions.family.threshold(questions.sensitivities.effects[place])
     passes = SCORES / widening >= limit
     threshold = float(SCORES[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
@@ -329,7 +331,7 @@ def spread_widening(questions: MisfitTests) -> Floats:
             spreads.append((fit.state.spread[0] * pressure, fit.state.spread[1] * damping))
             squares = np.array([pressure, damping]) ** 2
             penalties.append(scores.degrees * float(np.sum(np.log(squares) + 1 / squares - 1)))
-    kept = informations_at(fit, questions.sums, spreads) / np.maximum(information, 1e-300)
+    kept = informations_at(fit, questions.products, spreads) / np.maximum(information, 1e-300)
     part = np.clip(kept, 1e-6, 1.0)
     costs = np.array(penalties)[None, :, None] + SCORES[:, None, None] ** 2 * part
     best = np.argmin(costs, axis=1)
@@ -363,20 +365,20 @@ def _taken_for(
     counted = np.where(_credible(questions, drawn), _one_way(drawn, questions.signs), 0.0)
     squares, names = _by_effect(questions, np.maximum(counted, 0.0) ** 2)
     itself = names.index(response.effect.name)
-    limits = np.array([questions.family.of(name) for name in names])
+    limits = np.array([questions.family.threshold(name) for name in names])
     heard = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(heard) < DRAWS / 100:
         return {}, math.nan
     holding = {effect.name for effect in questions.effects if response.effect.name in effect.replaces}
     if any(name in response.effect.replaces for name in names):
         holding.add(response.effect.name)
-    squares[:, [k for k, name in enumerate(names) if name in holding]] -= ANSWER_SET
+    squares[:, [k for k, name in enumerate(names) if name in holding]] -= ANSWER_SET_DELTA_CHI2
     squares = squares[heard]
     first = np.argmax(squares, axis=1)
     others = np.delete(squares, itself, axis=1).max(axis=1, initial=-math.inf)
     rates = {name: float(np.mean(first == k)) for k, name in enumerate(names) if k != itself}
     listed = sorted((name for name in rates if rates[name] >= LEAST_TAKEN_FOR), key=lambda name: -rates[name])
-    return {name: rates[name] for name in listed}, float(np.mean(squares[:, itself] - others > ANSWER_SET))
+    return {name: rates[name] for name in listed}, float(np.mean(squares[:, itself] - others > ANSWER_SET_DELTA_CHI2))
 
 
 def _credible(questions: MisfitTests, scores: Floats) -> Floats:
@@ -384,10 +386,10 @@ def _credible(questions: MisfitTests, scores: Floats) -> Floats:
     sigma = questions.scores.plain_sigma
     room = np.array(
         [
-            CREDIBLE * max(abs(end - shape.size.zero) for end in plausible_range(shape.size))
+            CREDIBLE_RANGE_FACTOR * max(abs(end - shape.size.zero) for end in plausible_range(shape.size))
             if shape.effect.parameters
             else math.inf
-            for shape in questions.answers.shapes
+            for shape in questions.sensitivities.shapes
         ]
     )
     with np.errstate(invalid="ignore"):
@@ -396,8 +398,8 @@ def _credible(questions: MisfitTests, scores: Floats) -> Floats:
 
 def _by_effect(questions: MisfitTests, values: Floats) -> tuple[Floats, list[str]]:
     """The largest of the values of each effect's shapes, shape (n_draws, n_effects), and the names of the effects."""
-    names = list(dict.fromkeys(questions.answers.effects))
-    of = np.array([names.index(name) for name in questions.answers.effects])
+    names = list(dict.fromkeys(questions.sensitivities.effects))
+    of = np.array([names.index(name) for name in questions.sensitivities.effects])
     return np.stack([values[:, of == k].max(axis=1) for k in range(len(names))], axis=1), names
 
 
@@ -407,7 +409,7 @@ def _false_alarms(questions: MisfitTests) -> dict[str, float]:
     rates = {
         "scores of all candidates": level,
         "any smooth force": 0.1 * level,
-        "the loudest probe": min(LOUD_PROBE, level),
+        "the loudest probe": min(SINGLE_PROBE_LEVEL, level),
         "replicates that err alike": 0.1 * level,
         "noise that is larger in motion": 0.1 * level,
     }

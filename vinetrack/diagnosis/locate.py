@@ -38,7 +38,7 @@ from vinetrack.inference.fit_result import Fit, TrialFit
 if TYPE_CHECKING:
     import pandas as pd
 
-FAILS, MISSED = 3.0, 2.0
+FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0
 """Standard deviations from which a model is said to fail (one condition among many must be less likely still), and of
 a condition that is then said to be missed."""
 
@@ -213,7 +213,7 @@ def _fail(z: Floats) -> bool:
     """Whether the largest of so many deviates, or all of them together by Fisher's way, are too unlikely."""
     from scipy.stats import chi2, norm
 
-    level = float(norm.sf(FAILS))
+    level = float(norm.sf(FAILED_SIGMAS))
     p = norm.sf(z)
     together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * z.size))
     return bool(p.min() < level / z.size or together < level)
@@ -221,7 +221,7 @@ def _fail(z: Floats) -> bool:
 
 def _where(table: pd.DataFrame, fails: bool) -> list[str]:
     """Sentences about conditions; the table has the worst first."""
-    failing = table[table["z"] > min(MISSED, float(table["z"].max()) - 1e-9)]
+    failing = table[table["z"] > min(MISSED_SIGMAS, float(table["z"].max()) - 1e-9)]
     if not fails:
         worst = table.sort_values("z").iloc[-1]
         return [

@@ -17,7 +17,7 @@ class LostFrames:
     """Trials from which frames are missing, and those among them of which that is sure."""
 
     trials: tuple[str, ...] = ()
-    sure: tuple[str, ...] = ()
+    certain: tuple[str, ...] = ()
 
     def beside(self, trial: str, track: Track) -> LostFrames:
         """With a trial whose track, its times put right, may have lost frames.
@@ -33,11 +33,11 @@ class LostFrames:
         """
         if not with_flag(track.flag, "retimed").any():
             return self
-        sure = (trial,) if frames_surely_missing(track) else ()
-        return LostFrames((*self.trials, trial), (*self.sure, *sure))
+        certain = (trial,) if frames_surely_missing(track) else ()
+        return LostFrames((*self.trials, trial), (*self.certain, *certain))
 
 
-def frames_put_right(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], LostFrames]:
+def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], LostFrames]:
     """Tracks with dropped and repeated frames put right, and the trials from which frames are missing.
 
     Parameters
@@ -93,7 +93,7 @@ def with_lost_frames(result: Diagnosis, missing: LostFrames) -> Diagnosis:
     """
     if not missing.trials:
         return result
-    if not missing.sure:
+    if not missing.certain:
         return replace(result, notes=(*result.notes, perhaps_dropped_in_words(missing.trials)))
     first = result.rounds[0]
     words = dropped_in_words(missing.trials)

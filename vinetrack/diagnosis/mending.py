@@ -6,7 +6,13 @@ from collections.abc import Sequence
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.effect_sets import EffectSets
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, answer_set, best_of
+from vinetrack.diagnosis.likelihood_ratio import (
+    ANSWER_SET_DELTA_CHI2,
+    MAX_INFLATION,
+    LikelihoodRatio,
+    answer_set,
+    best_of,
+)
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 
 
@@ -46,7 +52,7 @@ def mending(
     next_to_it = [
         hypothesis
         for hypothesis in behind
-        if hypothesis.label not in aside and hypothesis.behind(best) < ANSWER_SET * MOST_INFLATION
+        if hypothesis.label not in aside and hypothesis.deviance_excess(best) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
     ]
     for group in (kept, next_to_it):
         whole: list[LikelihoodRatio] = []
@@ -54,11 +60,15 @@ def mending(
         for hypothesis, film in [(each, film) for film in (False, True) for each in group]:
             # Film beside the best is looked for as a set, unless another as likely leaves nothing as it stands.
             alone = hypothesis is best and not whole
-            if film and (hypothesis in whole or alone or hypothesis.film_gain < ANSWER_SET):
+            if film and (hypothesis in whole or alone or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
                 continue
-            asked = search.after(hypothesis.fit, film=film) if is_believable(hypothesis) else None
+            asked = search.tests_after(hypothesis.fit, film=film) if has_credible_sizes(hypothesis) else None
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
-            if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
+            if (
+                asked is None
+                or asked.rejects_model
+                or (len(hypothesis.effects) > 1 and asked.rejects_at_first_round_level)
+            ):
                 aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"
             elif sets is not None and len(hypothesis.effects) > 2 and (why := sets.superfluous(hypothesis)):
                 aside[hypothesis.label] = why
@@ -68,17 +78,21 @@ def mending(
                 aside.pop(hypothesis.label, None)
         if whole:
             return sorted(whole, key=lambda ratio: -ratio.fit.log_likelihood), aside, after
-        if best.film_gain > ANSWER_SET and best.credible and not _has_a_shape(search.after(best.fit, film=True)):
+        if (
+            best.film_gain > ANSWER_SET_DELTA_CHI2
+            and best.credible
+            and not _has_a_shape(search.tests_after(best.fit, film=True))
+        ):
             break
     return [], aside, None
 
 
 def _has_a_shape(asked: MisfitTests) -> bool:
     """Whether any candidate or smooth force would mend what is left, whatever the trials take upon themselves."""
-    return bool(asked.off or asked.shaped or asked.excess(asked.family) > 0)
+    return bool(asked.exceeds_slow_errors or asked.probes_reject or asked.largest_excess(asked.family) > 0)
 
 
-def is_believable(hypothesis: LikelihoodRatio) -> bool:
+def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
     """Whether its sizes can be an explanation; of three effects and more all must be plausible.
 
     Parameters

@@ -33,37 +33,37 @@ from vinetrack.inference.trace_errors import as_recorded
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
 """Effects to add and values to begin from."""
 
-CLIMB_SPREADS = (0.01, 0.03)
+SUBSET_SPREADS = (0.01, 0.03)
 """Between-trial standard deviations of pressure and ln B, and iterations, of a subset fit. Chosen as FIRST_SPREADS of
 the optimiser; for time."""
 
-FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
+SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
 """Iterations of a subset fit from each start, and of the best of them each further time. Chosen for time: a start that
 leads anywhere has shown it after four steps."""
 
-MOST_CLIMBED = 14
+MAX_SUBSET_TRIALS = 14
 """Trials of a climb: one of every condition, no more than this. Chosen for time."""
 
-FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
+FULL_FIT_FIRST_ITERATIONS, FULL_FIT_MAX_ITERATIONS, ABANDONED_BEHIND = 14, 40, 50.0
 """Iterations of a full fit at first and in all, and how far behind the best in −2 ln L it is given up. Chosen for
 time."""
 
-SHARE_OF_BEST = 0.3
+MIN_SHARE_OF_BEST_GAIN = 0.3
 """Part of what the best hypothesis explains that another must explain for larger sets to be built on it. So a fit far
 off that cannot come to it need not be led to its end. Chosen for time: effects that share a misfit evenly explain a
 third of it each; at half weaker ones are built on too (time), at twice two that explain half each may not be."""
 
-LOWER, LOWER_PER_POINT = 1.0, 0.02
+MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
 """By how much −2 ln L of a climb must end lower for its start to be worth a fit. Chosen: unsettled iterations differ
 by as much."""
 
-FAR_BEYOND = 6.0
-"""Times its plausible range. Chosen: twice what CREDIBLE refuses."""
+HOPELESS_RANGE_FACTOR = 6.0
+"""Times its plausible range. Chosen: twice what CREDIBLE_RANGE_FACTOR refuses."""
 
-EXPONENTS = (0.2, 0.4, 0.7)
+START_EXPONENTS = (0.2, 0.4, 0.7)
 """Exponents from which a model is begun again. Chosen: about the published 0.37, each within a factor of two."""
 
-HOPELESS = 0.5
+HOPELESS_DEVIANCE_PER_POINT = 0.5
 """A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far. Chosen
 for time."""
 
@@ -88,10 +88,10 @@ class SubsetFit:
         return tuple(effect.name for effect in self.effects)
 
     @property
-    def hopeless(self) -> bool:
+    def far_beyond_plausible(self) -> bool:
         """Whether it ended at sizes so far beyond what is plausible that a full fit will not bring it back."""
         return any(
-            not is_plausible(parameter, value, 0.0, widened=FAR_BEYOND)
+            not is_plausible(parameter, value, 0.0, widened=HOPELESS_RANGE_FACTOR)
             for effect in self.effects
             for parameter in effect.parameters
             if isinstance(value := self.values.get(f"{effect.name}.{parameter.name}"), float)
@@ -107,7 +107,7 @@ class SubsetFitter:
         self.data = [as_recorded(fit.predictor.data[i]) for i in self.chosen]
         self.correlation = track_correlation(self.data)
 
-    def climb(
+    def fit_hypothesis(
         self,
         effects: Sequence[Effect],
         start: Mapping[str, Value],
@@ -140,7 +140,7 @@ class SubsetFitter:
         predictor = Predictor(layout, self.data, self.fit.predictor.host)
         trial_effects = self.fit.solution.state.trial_effects[self.chosen].copy()
         trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-        held = FixedTerms(spread=CLIMB_SPREADS, correlation=self.correlation)
+        held = FixedTerms(spread=SUBSET_SPREADS, correlation=self.correlation)
         try:
             theta = layout.start
             if align_first:
@@ -151,20 +151,20 @@ class SubsetFitter:
             part = marginal(solution.cross_products, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
-        level = deviance(part, solution.problem, solution.state, CLIMB_SPREADS, restricted=False)
+        level = deviance(part, solution.problem, solution.state, SUBSET_SPREADS, restricted=False)
         if not math.isfinite(level):
             return None
         values, yields_Pa = _values(layout, solution.state.theta)
         return SubsetFit(tuple(effects), level, values, is_poor_fit(predictor, solution), yields_Pa)
 
     @property
-    def points(self) -> int:
+    def n_points(self) -> int:
         """How many points the trials of a climb have."""
         return sum(trial_data.time_s.size for trial_data in self.data)
 
-    def here(self) -> float:
+    def null_deviance(self) -> float:
         """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
-        climb = self.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
+        climb = self.fit_hypothesis((), {}, iterations=SUBSET_FIRST_ITERATIONS, align_first=False)
         return math.inf if climb is None else climb.deviance
 
     def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
@@ -184,15 +184,15 @@ def _values(layout: ParameterMap, theta: Floats) -> tuple[dict[str, Value], dict
 def _one_of_each(data: Sequence[FitTrial]) -> list[int]:
     """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
     places = one_of_each_condition(data)
-    if len(places) <= MOST_CLIMBED:
+    if len(places) <= MAX_SUBSET_TRIALS:
         return places
     vines = {data[i].trial.vine for i in places}
-    take = [places[k] for k in np.unique(np.linspace(0, len(places) - 1, MOST_CLIMBED).round().astype(int))]
+    take = [places[k] for k in np.unique(np.linspace(0, len(places) - 1, MAX_SUBSET_TRIALS).round().astype(int))]
     lacking = vines - {data[i].trial.vine for i in take}
     return sorted({*take, *(next(i for i in places if data[i].trial.vine == vine) for vine in lacking)})
 
 
-def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
+def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     """Values of an effect's parameters to begin from: the predicted size brought inside what is possible.
 
     Parameters
@@ -251,18 +251,18 @@ def best_subset_fit(
     first = [
         subset_fit
         for effects, start in starts
-        if (subset_fit := slope.climb(effects, start, iterations=FIRST_ITERATIONS)) is not None
+        if (subset_fit := slope.fit_hypothesis(effects, start, iterations=SUBSET_FIRST_ITERATIONS)) is not None
     ]
     if not first:
         return None
     best = min(first, key=lambda subset_fit: subset_fit.deviance)
-    if best.deviance - goal > HOPELESS * slope.points:
+    if best.deviance - goal > HOPELESS_DEVIANCE_PER_POINT * slope.n_points:
         return best
     for _ in range(3):
-        again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS, search=search)
+        again = slope.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
         if again is None:
             break
-        least = CREEPING * slope.points if search and again.far_off else 0.1
+        least = CREEPING * slope.n_points if search and again.far_off else 0.1
         creeps = again.deviance > best.deviance - least
         best = min((best, again), key=lambda subset_fit: subset_fit.deviance)
         if creeps:
@@ -296,14 +296,16 @@ def full_fit(
     Fit or None
     """
     model = before.model.with_effects(climb.effects)
-    goal = before.log_likelihood + SHARE_OF_BEST * (best - before.log_likelihood) if climb.effects else -math.inf
+    goal = (
+        before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood) if climb.effects else -math.inf
+    )
     try:
         fit = refit(
             before,
             model,
             start=climb.values,
             yields_Pa=climb.yields_Pa,
-            most_iterations=FIRST_OF_FIT,
+            most_iterations=FULL_FIT_FIRST_ITERATIONS,
             thorough=False,
             afresh=afresh,
             led=led,
@@ -312,14 +314,14 @@ def full_fit(
         if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.
             return None
-        if fit.converged or fit.log_likelihood < best - FAR_BEHIND or is_poor_fit(fit.predictor, fit.solution):
+        if fit.converged or fit.log_likelihood < best - ABANDONED_BEHIND or is_poor_fit(fit.predictor, fit.solution):
             return fit
-        return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
+        return refit(fit, most_iterations=FULL_FIT_MAX_ITERATIONS, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 
 
-def from_other_starts(fit: Fit) -> Fit:
+def restart_exponents(fit: Fit) -> Fit:
     """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself.
 
     Parameters
@@ -331,14 +333,14 @@ def from_other_starts(fit: Fit) -> Fit:
     -------
     Fit
     """
-    starts = other_exponents(fit)
+    starts = exponent_starts(fit)
     if len(starts) == 1:
         return fit
     slope = SubsetFitter(fit)
-    return _from(slope, starts, slope.here(), LOWER_PER_POINT * slope.points)
+    return _from(slope, starts, slope.null_deviance(), MIN_DEVIANCE_FALL_PER_POINT * slope.n_points)
 
 
-def other_exponents(fit: Fit) -> list[Start]:
+def exponent_starts(fit: Fit) -> list[Start]:
     """Starts from several exponents n of the damping law; the fit's own numbers alone where n is not free.
 
     Parameters
@@ -352,10 +354,10 @@ def other_exponents(fit: Fit) -> list[Start]:
     """
     if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
         return [((), {})]
-    return [((), {EXPONENT: n}) for n in EXPONENTS]
+    return [((), {EXPONENT: n}) for n in START_EXPONENTS]
 
 
-def without(fit: Fit, other: Fit) -> Fit:
+def restart_without(fit: Fit, other: Fit) -> Fit:
     """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit.
 
     It is fitted where a climb from there makes up for half of what the other fit is better by.
@@ -373,8 +375,8 @@ def without(fit: Fit, other: Fit) -> Fit:
     """
     slope, names = SubsetFitter(fit), set(fit.model.parameter_names)
     added = [effect for effect in other.model if effect.name not in fit.model]
-    here, there = slope.here(), slope.climb(added, other.model.values, iterations=1)
-    lower = math.inf if there is None else max(LOWER, 0.5 * (here - there.deviance))
+    here, there = slope.null_deviance(), slope.fit_hypothesis(added, other.model.values, iterations=1)
+    lower = math.inf if there is None else max(MIN_DEVIANCE_FALL, 0.5 * (here - there.deviance))
     return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], here, lower)
 
 
@@ -388,7 +390,7 @@ def _from(slope: SubsetFitter, starts: Sequence[Start], here: float, lower: floa
     return other if other is not None and other.log_likelihood > fit.log_likelihood else fit
 
 
-def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
+def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
     """Starts of one effect from its shapes and the sizes predicted for them.
 
     Parameters
@@ -403,7 +405,7 @@ def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
     seen: set[str] = set()
     starts: list[Start] = []
     for shape, size in shapes:
-        start = start_of(shape, size)
+        start = start_values(shape, size)
         key = repr(start)
         if key not in seen:
             seen.add(key)
@@ -411,7 +413,7 @@ def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
     return starts
 
 
-def slip_starts(effect: Effect) -> list[Start]:
+def sheet_slip_starts(effect: Effect) -> list[Start]:
     """Starts of one effect from what common slips in the sheet leave.
 
     Parameters

@@ -25,9 +25,14 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.campaign_power import CampaignDesign, as_measured
 from vinetrack.diagnosis.candidates import testable
-from vinetrack.diagnosis.family_test import family_chance
+from vinetrack.diagnosis.family_test import family_p_value
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
-from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, LOUD_PROBE, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import (
+    FALSE_ALARM_LEVEL_FIRST_ROUND,
+    SINGLE_PROBE_LEVEL,
+    MisfitTests,
+    misfit_tests,
+)
 from vinetrack.diagnosis.power import Rate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
@@ -35,12 +40,12 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.planning.simulated_campaigns import make
 
 TESTS = {
-    "scores of all candidates": FIRST_LEVEL,
-    "any smooth force": 0.1 * FIRST_LEVEL,
-    "the loudest probe": LOUD_PROBE,
-    "replicates that err alike, noise in motion": 0.1 * FIRST_LEVEL,
+    "scores of all candidates": FALSE_ALARM_LEVEL_FIRST_ROUND,
+    "any smooth force": 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND,
+    "the loudest probe": SINGLE_PROBE_LEVEL,
+    "replicates that err alike, noise in motion": 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND,
 }
-"""Tests of a first model and the level that each is asked at, as `MisfitTests.something` sets them. Derived."""
+"""Tests of a first model and the level that each is asked at, as `MisfitTests.rejects_model` sets them. Derived."""
 
 FIT_LEVEL = 0.05
 """Level of the test by which the exponential tail is doubted. A convention."""
@@ -222,9 +227,11 @@ def chances_of(questions: MisfitTests) -> dict[str, float]:
     dict of float
         By name, as in `TESTS`.
     """
-    family = family_chance(questions.scores.cosines, questions.signs, questions.answers.effects, questions.possible)
+    family = family_p_value(
+        questions.scores.cosines, questions.signs, questions.sensitivities.effects, questions.one_sided_z
+    )
     structure = questions.structure
-    return dict(zip(TESTS, (family, structure.p, structure.loudest, questions.hidden), strict=True))
+    return dict(zip(TESTS, (family, structure.p, structure.smallest_probe_p, questions.trial_effect_p), strict=True))
 
 
 def null_chances(design: CampaignDesign, seed: int) -> TestChances:
@@ -249,7 +256,7 @@ def null_chances(design: CampaignDesign, seed: int) -> TestChances:
             warnings.simplefilter("ignore")
             fitted = initial_fit(design.to_fit, as_measured(design, pairs), questioned, profile=False)
             effects, _ = testable(questioned, fitted.predictor.data)
-            return TestChances(seed, chances_of(misfit_tests(fitted, effects, FIRST_LEVEL)))
+            return TestChances(seed, chances_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)))
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
         return TestChances(seed, {}, f"{type(error).__name__}: {error}")
 

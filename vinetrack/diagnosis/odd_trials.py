@@ -65,7 +65,7 @@ class OddTrial:
 
     name: str
     stated_Pa: float
-    like_Pa: float
+    implied_pressure_Pa: float
 
 
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:

@@ -15,13 +15,13 @@ from vinetrack.inference.left_out import aligned_to_trials, rest_is_seen
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
 
-STEPS = 5
+NEWTON_STEPS = 5
 """Newton steps. Chosen."""
 
 LARGEST_STEP = 0.3
 """Of ln B, or of a parameter's scale, at once: beyond, a straight line says little. Chosen as trust region."""
 
-ROOM = 3.0
+MAX_DEVIATION_SCALES = 3.0
 """How many scales a value may end up from the common one: a trial that does not feel it would go anywhere. Chosen:
 three scales cover the plausible range."""
 
@@ -116,13 +116,13 @@ def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstim
     scale = np.ones_like(base) if logarithmic else np.full_like(base, _scale(parameter, base))
     moved = np.zeros_like(base)
     projected = [np.zeros(0)] * base.size
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         moved, trial_effects, projected = _improved(predictor, trial_effects, column, base, moved, scale, logarithmic)
     felt = np.array([float(np.sum(answer**2)) for answer in projected])
     known = felt > 1e-12 * np.array(
         [np.ptp(trial_data.lead_position_m) ** 2 * trial_data.time_s.size for trial_data in predictor.data]
     )
-    known &= np.abs(moved) < 0.99 * ROOM
+    known &= np.abs(moved) < 0.99 * MAX_DEVIATION_SCALES
     deviation = np.where(known, moved * scale, np.nan)
     return PerTrialEstimates(
         key=key,
@@ -191,7 +191,9 @@ def _improved(
         left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - here.observed_position_m
         design = np.column_stack([answer, *others])
         best = np.linalg.lstsq(design, left, rcond=1e-9)[0]
-        moved[i] = np.clip(moved[i] + np.clip(best[0], -LARGEST_STEP, LARGEST_STEP), -ROOM, ROOM)
+        moved[i] = np.clip(
+            moved[i] + np.clip(best[0], -LARGEST_STEP, LARGEST_STEP), -MAX_DEVIATION_SCALES, MAX_DEVIATION_SCALES
+        )
         trial_effects[i, RELEASE] += np.clip(best[1], -2 * trial_data.frame_s, 2 * trial_data.frame_s)
         trial_effects[i, ORIGIN] += 0.0 if held[i] else best[2]
         projected.append(without(answer, np.column_stack(others)))

@@ -22,15 +22,15 @@ from vinetrack.diagnosis.force_laws import EDGE
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.likelihood_ratio import (
-    ANSWER_SET,
-    MOST_INFLATION,
+    ANSWER_SET_DELTA_CHI2,
+    MAX_INFLATION,
     LikelihoodRatio,
     answer_set,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import MENDS, SeenLaw, missing_force
-from vinetrack.diagnosis.multi_start import from_other_starts
+from vinetrack.diagnosis.multi_start import restart_exponents
 from vinetrack.diagnosis.proposed_table import WORTH, ProposedTable, proposed_table
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
@@ -197,8 +197,8 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     questioned = candidates_of(model, None, {})
     report("fitting the model")
     before = initial_fit(model, pairs, questioned, profile=False)
-    if before.chi2_per_dof > FAR_OFF:
-        before = from_other_starts(before)
+    if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
+        before = restart_exponents(before)
     report("drawing the missing force")
     seen = missing_force(before, learn=False).seen
     near = [law for law in seen if law.explained > seen[0].explained - BEHIND][:MOST_PROPOSED]
@@ -235,7 +235,7 @@ def _of_laws(model: Model, before: Fit, near: Sequence[SeenLaw], report: Callabl
 
 def _may_tie(ratio: LikelihoodRatio, most: float) -> bool:
     """Whether a law can be in the answer set, however much single trials disagree; of others nothing more is asked."""
-    return 2 * (most - ratio.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+    return 2 * (most - ratio.fit.log_likelihood) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
 
 
 def _judged(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:

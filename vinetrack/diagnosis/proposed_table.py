@@ -12,7 +12,7 @@ from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.learned_effect import table_name, table_text
 from vinetrack.diagnosis.learned_force import MISSES, LearnedForce
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.missing_force import MENDS, learned_alone
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
@@ -21,7 +21,7 @@ from vinetrack.inference.fit_result import Fit
 
 WORTH = 6.0
 """Standard deviations by which a law must mend the model to be proposed: some hundred laws are tried, and none is known
-beforehand. Chosen as SUSPECT_SIGMAS of the misfit tests; at half one is found in noise, at twice in gross misfits
+beforehand. Chosen as SEARCH_SIGMAS of the misfit tests; at half one is found in noise, at twice in gross misfits
 alone."""
 
 REPRODUCES = 0.9
@@ -93,7 +93,7 @@ def proposed_table(
         except FitError:
             return None
         ratio = likelihood_ratio(start, (effect,), after)
-        better = all(2 * (after.log_likelihood - fit.log_likelihood) > ANSWER_SET for fit in laws)
+        better = all(2 * (after.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
         mends = start.chi2_per_dof - after.chi2_per_dof > MENDS * misfit
         if not (better and mends and ratio.sigma > WORTH):
             return None

@@ -20,17 +20,17 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
 
-FIRST_GUESS = (0.01, 0.03, 0.2)
+START_VALUES = (0.01, 0.03, 0.2)
 """Start, least and largest values of the search: pressure, ln B, rest. Chosen."""
 
-LEAST, LARGEST = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
+LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
 """Chosen: from exact to worse than any rig; the search never ends there where replicates tell anything."""
 
 LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
 """Of pressure and B, for whoever needs both: replicates tell their sum much better than either. Chosen: half of a
 usual scatter."""
 
-EXACT_M = 1e-6
+POSITION_FLOOR_M = 1e-6
 """Stretches are no better known than this, m. Chosen: a hundredth of a good tracker's error."""
 
 
@@ -112,7 +112,7 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
     dof = sum(len(group.means_m) - 1 for group in groups)
     if dof < 1:
         spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]
-        return Scatter(spreads[0], spreads[1], FIRST_GUESS[2], 0)
+        return Scatter(spreads[0], spreads[1], START_VALUES[2], 0)
     parts = []
     for group in groups:
         if len(group.means_m) > 1:
@@ -120,7 +120,7 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
             parts.append((len(away) - 1, away.T @ away, group))
 
     def cost(logs: Floats) -> float:
-        variances = np.exp(2 * np.clip(logs, np.log(LEAST), np.log(LARGEST)))
+        variances = np.exp(2 * np.clip(logs, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS)))
         total = 0.0
         for count, square, group in parts:
             covariance = _covariance(group, variances)
@@ -128,8 +128,8 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
             total += float(np.trace(np.linalg.solve(covariance, square)))
         return total
 
-    best = minimize(cost, np.log(FIRST_GUESS), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
-    pressure, damping, residual = np.exp(np.clip(best.x, np.log(LEAST), np.log(LARGEST))).tolist()
+    best = minimize(cost, np.log(START_VALUES), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
+    pressure, damping, residual = np.exp(np.clip(best.x, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS))).tolist()
     return Scatter(pressure, damping, residual, dof)
 
 
@@ -153,7 +153,7 @@ def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
 def _covariance(group: Stretches, variances: Floats) -> Floats:
     shared = (group.answers * variances[:2]) @ group.answers.T
     residual = variances[2] * float(np.trace(shared)) / len(shared)
-    return np.asarray(shared + group.noise_m2 + (residual + EXACT_M**2) * np.eye(len(shared)))
+    return np.asarray(shared + group.noise_m2 + (residual + POSITION_FLOOR_M**2) * np.eye(len(shared)))
 
 
 def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:

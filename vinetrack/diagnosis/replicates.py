@@ -20,12 +20,12 @@ from vinetrack.inference.left_out import FEWEST_AT_REST, scaled_least_squares
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 from vinetrack.tracks.wild_points import FEWEST_POINTS, local_fit
 
-TELLS_APART = 0.05
+MIN_SINGULAR_VALUE = 0.05
 """Of a shift in time and one in position, the least singular value by which both are found. Chosen: below it the motion
 is so straight that a shift in time and one in position are one; at half noise drives both, at twice curved motions are
 left misaligned."""
 
-MOST_ROUNDS = 200
+MAX_ROUNDS = 200
 """Rounds of shifting every replicate onto their mean. A round moves a trial by two frames at most, so that this covers
 400 frames; it ends when nothing moves. Chosen as a safeguard; most conditions settle within twenty."""
 
@@ -157,7 +157,7 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
         [n >= FEWEST_AT_REST or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)]
     )
     earliest_s, latest_s = np.array([_within_reach(trial, reference) for trial in trials]).T
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
         later_s, higher_m = _shifts(deviation_m, speed_m_s, at_rest)
         later_s = np.clip(later_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
@@ -259,7 +259,7 @@ def _shifts(deviation_m: Floats, speed_m_s: Floats, at_rest: Floats) -> tuple[Fl
         if np.count_nonzero(use) > 2:
             free = 0.0 if at_rest[i] else 1.0
             design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-            shifts[:, i] = scaled_least_squares(design, left_m[use], TELLS_APART)
+            shifts[:, i] = scaled_least_squares(design, left_m[use], MIN_SINGULAR_VALUE)
     return shifts[0], shifts[1]
 
 

@@ -36,7 +36,7 @@ from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import at_correlation
 
-IMITATED = 1e-9
+ROUNDING_SHARE = 1e-9
 """Part of its information that rounding leaves of a shape that others imitate exactly. Derived: products of some
 hundred points agree to 1e-13, and to 1e-10 once what others explain is taken off."""
 
@@ -285,7 +285,7 @@ def _emptied(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bo
 
     `before` is the information before the others were taken off.
     """
-    gone = np.diag(information) < IMITATED * np.maximum(np.diag(before)[: len(information)], 1e-300)
+    gone = np.diag(information) < ROUNDING_SHARE * np.maximum(np.diag(before)[: len(information)], 1e-300)
     left = information.copy()
     left[gone, :] = left[:, gone] = 0.0
     return left, gone

@@ -14,53 +14,53 @@ from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import confounders_of
 from vinetrack.diagnosis.confounder import Confounder
 from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
-from vinetrack.diagnosis.effect_sets import MOST_EFFECTS, NO_BETTER, EffectSets
+from vinetrack.diagnosis.effect_sets import MAX_EFFECTS, MIN_LOG_LIKELIHOOD_GAIN, EffectSets
 from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
-    ANSWER_SET,
+    ANSWER_SET_DELTA_CHI2,
     LikelihoodRatio,
     best_of,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.mending import is_believable, mending
+from vinetrack.diagnosis.mending import has_credible_sizes, mending
 from vinetrack.diagnosis.misfit_tests import (
-    FAR_OFF,
-    FIRST_LEVEL,
-    LATER_LEVEL,
-    SUSPECT_SIGMAS,
+    FALSE_ALARM_LEVEL_FIRST_ROUND,
+    FALSE_ALARM_LEVEL_LATER_ROUNDS,
+    FAR_OFF_CHI2_PER_DOF,
+    SEARCH_SIGMAS,
     MisfitTests,
     misfit_tests,
 )
-from vinetrack.diagnosis.multi_start import from_other_starts, without
+from vinetrack.diagnosis.multi_start import restart_exponents, restart_without
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED
 from vinetrack.diagnosis.slack_hypothesis import slack_fit
-from vinetrack.diagnosis.trial_effect_tests import scatters_much
+from vinetrack.diagnosis.trial_effect_tests import has_excess_scatter
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
-MOST_AGAIN = 2
+MAX_RESTARTS = 2
 """Times that all is asked again of a better minimum. Chosen as a safeguard."""
 
-LOUD = 1.0
+CLEAR_SCORE_EXCESS = 1.0
 """Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
 
-LEFT = 0.7
+STALLED_CHI2_SHARE = 0.7
 """Part of χ² that a third or further effect may leave of a fit that stays far off, or no more are added. Chosen for
 time: on what no catalogue holds steps go on for ever; at half of it four equal effects would not be found, at twice no
 step is refused."""
 
-MOSTLY = 0.5
+PARTIAL_SHARE = 0.5
 """Part of the excess of χ² per degree of freedom over 1 that steps must take away for `unexplained` to show them as
 partial. Chosen: what explains less than half says little of where to look; at half of it a quarter is enough,
 at twice nothing is."""
 
-FIRST_TERMS, NEARLY_ALL = ("lens", "perspective"), 0.95
+LEADING_TERMS, LEADING_TERM_SHARE = ("lens", "perspective"), 0.95
 """Effects that are the first term of a series in the place in the picture, and the part of what a set gains that such a
 term gains alone where the rest of the set may stand for the next term. Derived: at the edge of the picture the fifth
 order of a lens is up to a fifth of its third, 4 % of the squares. At half, physics that is a few times weaker than a
 lens waits until that is put right; at twice (0.975) a strong lens is taken for a lens and physics."""
 
-NOT_PHYSICAL = ("measurement", BETWEEN_TRIALS)
+NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)
 """Kinds of hypotheses that are no physics."""
 
 
@@ -75,16 +75,16 @@ class SelectionStep:
     """
 
     verdict: str
-    questions: MisfitTests
-    kept: tuple[LikelihoodRatio, ...] = ()
-    tried: tuple[LikelihoodRatio, ...] = ()
-    aside: tuple[tuple[str, str], ...] = ()
-    answer: tuple[str, ...] = ()
+    tests: MisfitTests
+    answer_set: tuple[LikelihoodRatio, ...] = ()
+    fitted: tuple[LikelihoodRatio, ...] = ()
+    rejected: tuple[tuple[str, str], ...] = ()
+    answer_names: tuple[str, ...] = ()
     search: CandidateFits | None = None
     note: str = ""
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
-    unstated: tuple[LikelihoodRatio, ...] = ()
+    unstated_differences: tuple[LikelihoodRatio, ...] = ()
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
@@ -109,55 +109,55 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     -------
     list of SelectionStep
     """
-    if fit.chi2_per_dof > FAR_OFF and not again:
+    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and not again:
         report("fitting the model from other starts")
-        fit = from_other_starts(fit)
+        fit = restart_exponents(fit)
     report("questioning the model")
-    questions = misfit_tests(fit, effects, FIRST_LEVEL)
+    questions = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
     among = differences(fit)
-    apart = significant(among, FIRST_LEVEL)
+    apart = significant(among, FALSE_ALARM_LEVEL_FIRST_ROUND)
     differ = any(difference.stated for difference in apart)
-    if not questions.something and not questions.suspect and not differ:
-        return [SelectionStep(ADEQUATE, questions, unstated=tuple(between_fits(fit, apart, 0.0, report)))]
-    slack = _slack(questions, effects, report) if questions.something else None
-    if slack is not None and not _leaves_room(slack[0].kept) and not slack[-1].questions.suspect:
+    if not questions.rejects_model and not questions.needs_search and not differ:
+        return [SelectionStep(ADEQUATE, questions, unstated_differences=tuple(between_fits(fit, apart, 0.0, report)))]
+    slack = _slack(questions, effects, report) if questions.rejects_model else None
+    if slack is not None and not _leaves_room(slack[0].answer_set) and not slack[-1].tests.needs_search:
         return slack
     search = CandidateFits(questions, report)
-    search.singles()
-    tried = search.fit_in_full()
+    search.fit_singles()
+    tried = search.fit_to_all_trials()
     between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     by_rows = {difference.name for difference in apart if not difference.stated}
     unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in by_rows)
     tried += between
-    if slack is not None and not _is_better(tried, slack[0].kept[0]):
+    if slack is not None and not _is_better(tried, slack[0].answer_set[0]):
         return slack
-    if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
-        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, unstated=unstated)]
-    if tried and again < MOST_AGAIN and best_of(tried) not in between:
-        rival = without(fit, best_of(tried).fit)
-        if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
+    if not questions.rejects_model and not differ and (not tried or best_of(tried).sigma < SEARCH_SIGMAS):
+        return [SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, unstated_differences=unstated)]
+    if tried and again < MAX_RESTARTS and best_of(tried) not in between:
+        rival = restart_without(fit, best_of(tried).fit)
+        if rival.log_likelihood > fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
             return select_effects(rival, effects, report, again=again + 1)
     alone = None if _leaves_room(tried) else _alone(questions, search, tried)
     if alone is not None:
         return alone
     # Linear promises choose well near the truth, not far from it. Where the best of those they chose leaves room for a
     # better one, and before `unexplained`, all are fitted.
-    search.singles(all_of_them=True)
-    tried = [*search.fit_in_full(all_of_them=True), *between]
+    search.fit_singles(all_of_them=True)
+    tried = [*search.fit_to_all_trials(all_of_them=True), *between]
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone
-    if not questions.something and not questions.suspect:
-        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, unstated=unstated)]
+    if not questions.rejects_model and not questions.needs_search:
+        return [SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, unstated_differences=unstated)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
     credible = [hypothesis for hypothesis in tried if hypothesis.credible]
     if not credible or not _any_stands_out(credible, questions):
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
-        loud = questions.excess(questions.family) > LOUD
-        fails = questions.fails or questions.off or loud
+        loud = questions.largest_excess(questions.family) > CLEAR_SCORE_EXCESS
+        fails = questions.omnibus_rejects or questions.exceeds_slow_errors or loud
         verdict = UNEXPLAINED if fails else ADEQUATE
         told = unstated if verdict == ADEQUATE else ()
-        return [SelectionStep(verdict, questions, tried=tuple(tried), search=search, unstated=told)]
+        return [SelectionStep(verdict, questions, fitted=tuple(tried), search=search, unstated_differences=told)]
     return _together(questions, search, tried, report)
 
 
@@ -169,12 +169,12 @@ def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
     if not tried:
         return True
     best = best_of(tried).fit
-    return best.chi2_per_dof > FAR_OFF or scatters_much(best)
+    return best.chi2_per_dof > FAR_OFF_CHI2_PER_DOF or has_excess_scatter(best)
 
 
 def _is_better(tried: Sequence[LikelihoodRatio], than: LikelihoodRatio) -> bool:
     """Whether the best of these hypotheses is likelier than another."""
-    return bool(tried) and best_of(tried).fit.log_likelihood > than.fit.log_likelihood + NO_BETTER
+    return bool(tried) and best_of(tried).fit.log_likelihood > than.fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN
 
 
 def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
@@ -189,8 +189,8 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
     report("letting the tail go slack")
     slack = replace(slack, fit=with_host(slack.fit, questions.fit.predictor.host))
     # A model far off may gain by any freedom: the rule is named only where it leaves nothing to explain.
-    after = misfit_tests(slack.fit, effects, LATER_LEVEL)
-    if after.something or after.fails or after.off:
+    after = misfit_tests(slack.fit, effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
+    if after.rejects_model or after.omnibus_rejects or after.exceeds_slow_errors:
         return None
     first = SelectionStep(MISSING, questions, (slack,), (slack,), (), slack.names)
     return [first, SelectionStep(ADEQUATE, after)]
@@ -198,13 +198,17 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
 
 def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
     """Whether an effect is worth more standard deviations than chance alone gives one of the candidates."""
-    return hypothesis.sigma >= questions.family.of(hypothesis.names[-1])
+    return hypothesis.sigma >= questions.family.threshold(hypothesis.names[-1])
 
 
 def _any_stands_out(tried: Sequence[LikelihoodRatio], questions: MisfitTests) -> bool:
     """Whether the best does, or one that cannot be excluded beside it: each may scatter in its own way."""
     best = best_of(tried)
-    return any(_stands_out(known, questions) for known in tried if known.behind(best) <= ANSWER_SET * best.inflation)
+    return any(
+        _stands_out(known, questions)
+        for known in tried
+        if known.deviance_excess(best) <= ANSWER_SET_DELTA_CHI2 * best.inflation
+    )
 
 
 def _alone(
@@ -221,7 +225,7 @@ def _alone(
     verdict = verdict_of(kept)
     if verdict == MISSING and is_within_position_errors(questions.fit, kept[0].fit):
         return [
-            SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, note=_too_small(kept[0], questions))
+            SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, note=_too_small(kept[0], questions))
         ]
     first = SelectionStep(
         verdict,
@@ -258,7 +262,7 @@ def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
     -------
     str
     """
-    if all(effect.kind in NOT_PHYSICAL for hypothesis in kept for effect in hypothesis.effects):
+    if all(effect.kind in NONPHYSICAL_KINDS for hypothesis in kept for effect in hypothesis.effects):
         return ARTEFACT
     return MISSING if len(kept) == 1 else AMBIGUOUS
 
@@ -271,7 +275,7 @@ def _together(
     sets = EffectSets(search, ranked, report)
     size, again, reached = 2, 0, ranked[0]
     aside: dict[str, str] = {}
-    while size <= MOST_EFFECTS:
+    while size <= MAX_EFFECTS:
         report(f"{size} effects together")
         grown = sets.grow(size)
         if not grown or not any(hypothesis.credible for hypothesis in grown):
@@ -288,20 +292,20 @@ def _together(
         if leads_nowhere:
             break
         # What was added first may have stood for two that came later: the search goes on from the better smaller set.
-        back = size > 2 and again < MOST_AGAIN and sets.prune(grown[0])
+        back = size > 2 and again < MAX_RESTARTS and sets.prune(grown[0])
         size, again = (size - 1, again + 1) if back else (size + 1, again)
-    fitted = tuple(sets.known.values())
+    fitted = tuple(sets.fitted.values())
     why = _why_not((*ranked[:1], *sets.of_size(2)[:1], reached), aside)
     steps = _partial(questions, sets)
-    return [SelectionStep(UNEXPLAINED, questions, tried=fitted, search=search, aside=why, partial=steps)]
+    return [SelectionStep(UNEXPLAINED, questions, fitted=fitted, search=search, rejected=why, partial=steps)]
 
 
 def _leads_nowhere(grown: Sequence[LikelihoodRatio], smaller: LikelihoodRatio) -> bool:
     """Whether larger sets are not worth their time: no size is plausible, or the best stays as far off as before."""
-    if not any(is_believable(hypothesis) for hypothesis in grown):
+    if not any(has_credible_sizes(hypothesis) for hypothesis in grown):
         return True
     left = grown[0].fit.chi2_per_dof
-    return left > FAR_OFF and left > LEFT * smaller.fit.chi2_per_dof
+    return left > FAR_OFF_CHI2_PER_DOF and left > STALLED_CHI2_SHARE * smaller.fit.chi2_per_dof
 
 
 def _of_sets(
@@ -316,11 +320,11 @@ def _of_sets(
     Physics comes before faults of the measurement, and of either what mends most alone. A picture bent by so much that
     the first term of its bend mends nearly everything comes before all: what that leaves may be the next term.
     """
-    tried, out_of_the_race = tuple(sets.known.values()), tuple(aside.items())
+    tried, out_of_the_race = tuple(sets.fitted.values()), tuple(aside.items())
     gains = {single.names[0]: single.delta_chi2 for single in tried if len(single.names) == 1}
     kinds = {effect.name: effect.kind for hypothesis in kept for effect in hypothesis.effects}
 
-    bent = {name for name in FIRST_TERMS if gains.get(name, 0.0) > NEARLY_ALL * kept[0].delta_chi2}
+    bent = {name for name in LEADING_TERMS if gains.get(name, 0.0) > LEADING_TERM_SHARE * kept[0].delta_chi2}
 
     def order(name: str) -> tuple[bool, bool, float]:
         return name not in bent, kinds[name] == "measurement", -gains.get(name, 0.0)
@@ -338,13 +342,13 @@ def _of_sets(
             return [*steps, _shared_step(ARTEFACT, asked, sets, kept[0], added, name, tried, out_of_the_race)]
         steps.append(_shared_step(MISSING, asked, sets, kept[0], added, name, tried, out_of_the_race))
         added = (*added, next(effect for effect in kept[0].effects if effect.name == name))
-        alone = sets.of_effects(kept[0], added)
-        asked = sets.search.after(alone.fit if alone else kept[0].fit)
+        alone = sets.subset(kept[0], added)
+        asked = sets.search.tests_after(alone.fit if alone else kept[0].fit)
     further = tuple(_beside(asked, hypothesis, added) for hypothesis in kept)
     verdict = verdict_of(further)
     names = tuple(sorted(dict.fromkeys(name for hypothesis in further for name in hypothesis.names), key=order))
     confounded = confounders_of(after, kept[0].names) if verdict == MISSING else ()
-    steps.append(SelectionStep(verdict, asked, further, further, answer=names, confounded=confounded))
+    steps.append(SelectionStep(verdict, asked, further, further, answer_names=names, confounded=confounded))
     return [*steps, SelectionStep(ADEQUATE, after)] if verdict == MISSING else steps
 
 
@@ -366,7 +370,7 @@ def _shared_step(
     note = f"{several} effects are missing: none alone mends everything" if several else ""
     if not added:
         return SelectionStep(verdict, asked, (together,), tried, aside, (name,), sets.search, note)
-    alone = sets.of_effects(whole, (*added, left[0]))
+    alone = sets.subset(whole, (*added, left[0]))
     fits = (together,) if alone is None else (likelihood_ratio(asked.fit, left[:1], alone.fit), together)
     return SelectionStep(verdict, asked, (together,), fits, (), (name,), None, note)
 
@@ -379,9 +383,9 @@ def _beside(asked: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Eff
 
 def _partial(questions: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRatio, ...]:
     """The steps that mend most of a misfit at plausible sizes; none where they mend little."""
-    steps = sets.steps()
+    steps = sets.plausible_steps()
     before = questions.fit.chi2_per_dof - 1
-    mostly = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - MOSTLY) * before
+    mostly = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - PARTIAL_SHARE) * before
     return steps if mostly else ()
 
 

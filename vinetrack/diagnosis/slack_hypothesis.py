@@ -16,8 +16,8 @@ from types import MappingProxyType
 import numpy as np
 
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
-from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, other_exponents
-from vinetrack.diagnosis.trial_effect_tests import scatters_much
+from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, exponent_starts, full_fit
+from vinetrack.diagnosis.trial_effect_tests import has_excess_scatter
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -40,11 +40,11 @@ TAIL_SLACK = Effect(
 )
 """Stands for the rule in answer sets. It is no term of a model: `tail_slack: free` in `experiment.yaml` turns it on."""
 
-PUSHES = 0.02
+MIN_PUSH_FRACTION = 0.02
 """Part of the drive ½PA by which a tail must push to count. Chosen: the numbers of a fit are good to about 1 %; at half
 of it their errors ask for a fit in vain, at twice a push of 4 % of the drive goes untried."""
 
-REFUTED = 1.0
+REFUTED_DEVIANCE_PER_POINT = 1.0
 """By how much −2 ln L of a point rises on one trial of every condition where the rule is refuted without a refit, of
 trials that scatter much. Derived: −2 ln L of n points with noise s is n ln s², so their misfit is √e times as large.
 Measured: with hidden effects (tuning seeds 702, 703, 706) it rises by 6,500 to 20,000 in all, more than this a point;
@@ -87,7 +87,7 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
     ratio = trial.trial.travel_ratio
     damping_N = terms.tip_N.get("eversion_damping", np.zeros_like(since_s))
     tension_N = terms.tension_N + trial.damping_deviation * damping_N / ratio
-    return bool(np.any(tension_N < -PUSHES * terms.pressure_Pa * terms.area_m2 / ratio))
+    return bool(np.any(tension_N < -MIN_PUSH_FRACTION * terms.pressure_Pa * terms.area_m2 / ratio))
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
@@ -95,7 +95,7 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
 
     A fit that has bent its trials to do without the rule may have bent them until no tail pushes. So where they scatter
     much the rule is also tried from other exponents, with nothing of the deviations, on one trial of every condition
-    first: where it fits those far worse (REFUTED), nothing is fitted to all trials.
+    first: where it fits those far worse (REFUTED_DEVIANCE_PER_POINT), nothing is fitted to all trials.
 
     The model is compiled alone: with all candidates and tails that may go slack that takes the better part of a minute,
     for a rule that is mostly refuted.
@@ -109,7 +109,7 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     LikelihoodRatio or None
     """
     taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
-    bent = taut and scatters_much(fit)
+    bent = taut and has_excess_scatter(fit)
     if not bent and not pushes(fit):
         return None
     data = [
@@ -119,8 +119,11 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     climb = None
     if bent:
         slope = SubsetFitter(slack)
-        climb = best_subset_fit(slope, other_exponents(slack), math.inf)
-        if climb is not None and climb.deviance > SubsetFitter(fit).here() + REFUTED * slope.points:
+        climb = best_subset_fit(slope, exponent_starts(slack), math.inf)
+        if (
+            climb is not None
+            and climb.deviance > SubsetFitter(fit).null_deviance() + REFUTED_DEVIANCE_PER_POINT * slope.n_points
+        ):
             return None
     fits = []
     with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):

@@ -24,7 +24,7 @@ from vinetrack.inference.systematics import Systematics
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
 """Probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
 
-SHARE_LEFT = 1e-4
+MIN_INFORMATION_SHARE = 1e-4
 """Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own.
 Chosen: a hundredth of its amplitude."""
 
@@ -55,15 +55,15 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 class Structure:
     """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`.
 
-    `loudest` is the chance at which the loudest of as many probes stands out alone: something narrow shows in one of
-    them, and drowns in the sum over all.
+    `smallest_probe_p` is the smallest p-value of single probes, Bonferroni-corrected: a narrow feature shows in one
+    probe and is diluted in the sum over all.
     """
 
     chi2: float
     degrees: int
     p: float
     z: float
-    loudest: float = 1.0
+    smallest_probe_p: float = 1.0
 
 
 def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
@@ -85,11 +85,11 @@ def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) 
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    return structure_in(scores_of(fit, products_of(fit, columns, answers, systematics)))
+    return structure_from_scores(scores_of(fit, products_of(fit, columns, answers, systematics)))
 
 
-def structure_in(scores: Scores) -> Structure:
-    """What the scores of probes amount to together, and the loudest of them alone; see `structure_of`.
+def structure_from_scores(scores: Scores) -> Structure:
+    """What the scores of probes amount to together, and the largest of them alone; see `structure_of`.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def structure_in(scores: Scores) -> Structure:
     information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
     score = (scores.score / root)[live]
     values, vectors = np.linalg.eigh(information)
-    keep = values > SHARE_LEFT * values.max(initial=0.0)
+    keep = values > MIN_INFORMATION_SHARE * values.max(initial=0.0)
     along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
     turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
     single = scores.scores[:, live] @ turn
@@ -120,5 +120,5 @@ def structure_in(scores: Scores) -> Structure:
     each = np.einsum("njj->nj", scores.informations)[:, live]
     felt = each.sum(axis=0) ** 2 / np.maximum(np.sum(each**2, axis=0), 1e-300)
     chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
-    loudest = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
-    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), loudest)
+    smallest_probe_p = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
+    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), smallest_probe_p)

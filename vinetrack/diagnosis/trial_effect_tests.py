@@ -16,33 +16,33 @@ from vinetrack.core.records import Floats
 from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.fit_result import Fit
 
-STRETCH = 8
+STRETCH_FRAMES = 8
 """Frames over which noise is summed: slow against the noise, short enough for a rest of two dozen frames. Chosen:
 noise correlated by 0.6 is independent after eight frames to 2 %."""
 
-FEWEST_STRETCHES = 12
+MIN_STRETCHES = 12
 """Stretches, and degrees of freedom between replicates, below which the test is not made. Chosen: a variance is then
 known to 40 and 70 %."""
 
-FEWEST_REPLICATED = 4
+MIN_REPLICATE_DEGREES = 4
 """Degrees of freedom between replicates from which their scatter can be told. Chosen: a variance of four degrees of
 freedom is known to 70 %. At half chance scatter decides, at twice most campaigns are not asked."""
 
-MORE_THAN_STATED, MORE_THAN_VINES = 2.0, 0.04
+STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04
 """What conditions may differ by: twice the error that the sheet states of a pressure, and 4 % of B. Chosen: what a
 gauge and a batch of vines may do."""
 
-FEW_PER_CENT = 0.02
+CAREFUL_PRESSURE_SCATTER = 0.02
 """Relative deviation below which conditions that differ are within what vines do. Chosen: what a gauge and a batch of
 vines may do."""
 
-LIKE_REPLICATES = 0.05
+REPLICATE_LIKE_P_VALUE = 0.05
 """Chance from which conditions are taken to differ by no more than their replicates do. Chosen: a model that bends its
 trials passes for their scatter once in twenty times at most; at half seldomer, at twice one campaign in ten whose
 trials scatter on their own is searched throughout for nothing."""
 
 
-def conditions_apart(fit: Fit) -> float:
+def between_conditions_p(fit: Fit) -> float:
     """Chance at which conditions differ in their trials' own pressure, or B, by so much more than replicates do.
 
     1 where replicates are too few, or where conditions differ by no more than an experimenter's care allows.
@@ -61,8 +61,8 @@ def conditions_apart(fit: Fit) -> float:
         trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
     ]
     known = [part for part in stated if math.isfinite(part)]
-    pressure = max(MORE_THAN_STATED * float(np.median(known)) if known else 0.0, FEW_PER_CENT)
-    allowed = pressure, MORE_THAN_VINES
+    pressure = max(STATED_ERROR_FACTOR * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
+    allowed = pressure, CAREFUL_DAMPING_SCATTER
     chances = [
         _one_way(deviations, *_grouping(fit), most)
         for deviations, most in zip(_own_deviations(fit), allowed, strict=True)
@@ -70,7 +70,7 @@ def conditions_apart(fit: Fit) -> float:
     return min(2 * min(chances), 1.0)
 
 
-def scatters_much(fit: Fit) -> bool:
+def has_excess_scatter(fit: Fit) -> bool:
     """Whether trials deviate by more than an experimenter's care allows: a model may have bent them to fit.
 
     It has not where conditions differ by no more than replicates, or than care allows: what makes up for a model is
@@ -84,7 +84,7 @@ def scatters_much(fit: Fit) -> bool:
     -------
     bool
     """
-    allowed = FEW_PER_CENT, MORE_THAN_VINES
+    allowed = CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER
     return any(
         spread > most and not _like_replicates(deviations, *_grouping(fit), most)
         for spread, most, deviations in zip(fit.state.spread, allowed, _own_deviations(fit), strict=True)
@@ -111,8 +111,8 @@ def _like_replicates(values: Floats, groups: Sequence[str], fitted: int, allowed
     Of no more groups than numbers that were fitted to them nothing would show.
     """
     inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
-    told = inner >= FEWEST_REPLICATED and outer > 0
-    return told and _one_way(values, groups, fitted, allowed) > LIKE_REPLICATES
+    told = inner >= MIN_REPLICATE_DEGREES and outer > 0
+    return told and _one_way(values, groups, fitted, allowed) > REPLICATE_LIKE_P_VALUE
 
 
 def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
@@ -124,14 +124,14 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
     inner, outer = values.size - len(names), max(len(names) - fitted, 1)
     between = sum(member.size * float(member.mean()) ** 2 for member in members)
-    if inner < FEWEST_REPLICATED or not within > 0 or math.sqrt(between / values.size) < allowed:
+    if inner < MIN_REPLICATE_DEGREES or not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Those of replicates that hardly differ are held against what an experimenter's care allows.
     care = max(within / inner, allowed**2 / 9)
     return float(f.sf(between / outer / care, outer, inner))
 
 
-def noisier_in_motion(fit: Fit) -> float:
+def noise_in_motion_p(fit: Fit) -> float:
     """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
 
     Positions read from recordings are not asked, for a tracker's slow errors in motion are larger than those at rest,
@@ -166,7 +166,7 @@ def noisier_in_motion(fit: Fit) -> float:
         at_rest.append((here - here.mean()) * math.sqrt(here.size / (here.size - 1)))
         motion.append(_sums(trial.whitened[trial_data.n_rest :]))
         freedom += here.size - 1
-    if freedom < FEWEST_STRETCHES:
+    if freedom < MIN_STRETCHES:
         return 1.0
     still, moving = np.concatenate(at_rest), np.concatenate(motion)
     ratio = float(np.mean(moving**2) / np.mean(still**2))
@@ -175,8 +175,10 @@ def noisier_in_motion(fit: Fit) -> float:
 
 def _sums(white: Floats) -> Floats:
     """Sums over successive stretches, each of variance 1 where the noise is white."""
-    count = white.size // STRETCH
-    return np.asarray(white[: count * STRETCH].reshape(count, STRETCH).sum(axis=1) / math.sqrt(STRETCH))
+    count = white.size // STRETCH_FRAMES
+    return np.asarray(
+        white[: count * STRETCH_FRAMES].reshape(count, STRETCH_FRAMES).sum(axis=1) / math.sqrt(STRETCH_FRAMES)
+    )
 
 
 def _degrees(values: Floats, count: float) -> float:

@@ -22,7 +22,7 @@ from vinetrack.diagnosis.candidates import plausible_range, slip_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Fit, Number
 
-EXPECTED = 4.0
+RANGE_EDGE_DISTANCE = 4.0
 """Squared distance from the middle of a plausible range, in standard deviations of its prior, that is no surprise:
 the edge of the range."""
 
@@ -38,7 +38,7 @@ def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
     return (mean, sd) if slip is None else (slip[0] + (1 + slip[0]) * mean, (1 + slip[0]) * sd)
 
 
-def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
+def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     """By how much sizes lie beyond what is plausible, on the scale of −2 ln L; 0 inside the plausible ranges.
 
     Parameters
@@ -64,7 +64,7 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
         mean, sd = _prior_of(parameter, number)
         variance = number.sigma**2 + sd**2
         if variance > 0:
-            total += max((number.value - mean) ** 2 / variance - EXPECTED, 0.0)
+            total += max((number.value - mean) ** 2 / variance - RANGE_EDGE_DISTANCE, 0.0)
     return total
 
 

@@ -66,13 +66,13 @@ def explain(finding: SelectionStep) -> str:
     -------
     str
     """
-    questions = finding.questions
+    questions = finding.tests
     model = " + ".join(questions.fit.model.names)
     count = len(questions.fit.trials)
     trials = f"{count} trial{'s' if count != 1 else ''}"
     if finding.verdict == ADEQUATE:
         return _adequate(finding, model, trials)
-    kept = finding.kept
+    kept = finding.answer_set
     if finding.verdict == MISSING:
         best = kept[0]
         text = (
@@ -89,7 +89,7 @@ def explain(finding: SelectionStep) -> str:
             return text
         text += " With it in the model, no other candidate and no smooth force improves the fit."
         return text + _chamber(kept) + confounders_in_words(finding.confounded) + _runner_up(finding)
-    names = list(finding.answer)
+    names = list(finding.answer_names)
     if finding.verdict == AMBIGUOUS:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
@@ -115,7 +115,7 @@ def explain(finding: SelectionStep) -> str:
         f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any set of the best "
         "explain it."
     )
-    for name, why in finding.aside:
+    for name, why in finding.rejected:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     return text + _partial_in_words(finding)
 
@@ -137,7 +137,7 @@ def _partial_in_words(finding: SelectionStep) -> str:
         return ""
     best = finding.partial[-1]
     steps = joined([f"{step.names[-1]} (Δχ² = {step.delta_chi2:.0f} in all)" for step in finding.partial], "then")
-    before, after = finding.questions.fit.chi2_per_dof, best.fit.chi2_per_dof
+    before, after = finding.tests.fit.chi2_per_dof, best.fit.chi2_per_dof
     return (
         f" A part of it would be mended by {steps}: χ² per degree of freedom falls from {before:.1f} to {after:.1f}, "
         f"with {sizes_in_words(best.numbers)}. Since something is left, these steps are partial: none is shown to be "
@@ -245,10 +245,14 @@ def _films(hypothesis: LikelihoodRatio) -> set[str]:
 
 def _by_film(kept: Sequence[LikelihoodRatio]) -> str:
     """Which of an answer set need film that weighs a little other than stated; blank where none does."""
-    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, best_of
+    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, best_of
 
     best = best_of(kept)
-    need = [ratio.label.replace("+", " with ") for ratio in kept if ratio.behind(best) > ANSWER_SET * best.inflation]
+    need = [
+        ratio.label.replace("+", " with ")
+        for ratio in kept
+        if ratio.deviance_excess(best) > ANSWER_SET_DELTA_CHI2 * best.inflation
+    ]
     if not need:
         return ""
     names = joined(need)
@@ -264,7 +268,7 @@ def _with_the_fault(finding: SelectionStep) -> str:
     Those are all of effects added before, and of the base model n first, then others that leave their 95 % intervals.
     B of a vine with an n of its own is another quantity.
     """
-    fit, best = finding.questions.fit, finding.kept[0]
+    fit, best = finding.tests.fit, finding.answer_set[0]
     if best.names[-1] == N_BY_VINE:
         return ""
     before = {number.name: number for number in fit.numbers}
@@ -296,35 +300,35 @@ def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:
 
 
 def _remedies(finding: SelectionStep) -> str:
-    return remedies_in_words(finding.kept, [trial.trial for trial in finding.questions.fit.trials])
+    return remedies_in_words(finding.answer_set, [trial.trial for trial in finding.tests.fit.trials])
 
 
 def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
-    questions = finding.questions
+    questions = finding.tests
     if finding.note:
         return f"{model} explains {trials} as well as positions are known. {finding.note[0].upper()}{finding.note[1:]}."
     text = f"{model} explains {trials}: no missing effect can be detected."
-    if questions.possible.size:
-        names = questions.answers.effects
-        limits = [questions.family.of(name) for name in names]
-        place = int((questions.possible - limits).argmax())
+    if questions.one_sided_z.size:
+        names = questions.sensitivities.effects
+        limits = [questions.family.threshold(name) for name in names]
+        place = int((questions.one_sided_z - limits).argmax())
         text += (
             f" The most significant of {_count_testable(questions)} candidates, "
-            f"{names[place]}, has {questions.possible[place]:.1f} σ, and {limits[place]:.1f} σ are asked of it; by "
+            f"{names[place]}, has {questions.one_sided_z[place]:.1f} σ, and {limits[place]:.1f} σ are asked of it; by "
             f"chance any of them has what is asked of it once in {1 / questions.level:.0f} campaigns."
         )
         kind = next(effect.kind for effect in questions.effects if effect.name == names[place])
-        if kind == MEASUREMENT and questions.possible[place] >= WORTH_A_CHECK_SIGMA:
+        if kind == MEASUREMENT and questions.one_sided_z[place] >= WORTH_A_CHECK_SIGMA:
             text += f" It is an error of measurement, and soon checked: see `vinetrack effects {names[place]}`."
     return f"{text}{_unstated(finding)}"
 
 
 def _unstated(finding: SelectionStep) -> str:
     """Differences between trials by an order that the sheet does not state; blank where there are none."""
-    if not finding.unstated:
+    if not finding.unstated_differences:
         return ""
-    best = max(finding.unstated, key=lambda result: result.delta_chi2)
-    trials = [trial.trial for trial in finding.questions.fit.trials]
+    best = max(finding.unstated_differences, key=lambda result: result.delta_chi2)
+    trials = [trial.trial for trial in finding.tests.fit.trials]
     return (
         f" But trials seem to differ, and the numbers of the model hold what that does: {difference_in_words(best)}"
         f" (Δχ² = {best.delta_chi2:.0f}).{remedies_in_words([best], trials)}"
@@ -334,8 +338,11 @@ def _unstated(finding: SelectionStep) -> str:
 def _count_testable(questions: MisfitTests) -> int:
     """How many effects these trials could show: those that the ranking has as tested."""
     return sum(
-        effect.name not in questions.answers.silent
-        and (questions.largest(effect)[1] or questions.best_z(effect.name)[0] >= questions.family.of(effect.name))
+        effect.name not in questions.sensitivities.silent
+        and (
+            questions.upper_limits(effect)[1]
+            or questions.best_z(effect.name)[0] >= questions.family.threshold(effect.name)
+        )
         for effect in questions.effects
     )
 
@@ -343,13 +350,13 @@ def _count_testable(questions: MisfitTests) -> int:
 def _runner_up(finding: SelectionStep) -> str:
     from vinetrack.diagnosis.likelihood_ratio import best_of
 
-    kept, aside = {result.names for result in finding.kept}, dict(finding.aside)
-    others = [r for r in finding.tried if len(r.names) == 1 and r.names not in kept and r.label not in aside]
+    kept, aside = {result.names for result in finding.answer_set}, dict(finding.rejected)
+    others = [r for r in finding.fitted if len(r.names) == 1 and r.names not in kept and r.label not in aside]
     text = ""
     if others:
         best = best_of(others)
-        text = f" The next best, {best.names[0]}, is worse by Δχ² = {best.behind(finding.kept[0]):.0f}."
-    for name, why in finding.aside:
+        text = f" The next best, {best.names[0]}, is worse by Δχ² = {best.deviance_excess(finding.answer_set[0]):.0f}."
+    for name, why in finding.rejected:
         text += f" {name} fits as well, but {why}."
     return text
 
@@ -369,10 +376,10 @@ def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     names = joined([trial.name for trial in odd])
     alone = len(odd) == 1
     like = [
-        f"{'it' if alone else trial.name} moves as with {trial.like_Pa / 1e3:.3g} kPa, and"
+        f"{'it' if alone else trial.name} moves as with {trial.implied_pressure_Pa / 1e3:.3g} kPa, and"
         f" {trial.stated_Pa / 1e3:.3g} kPa is stated"
         for trial in odd
-        if trial.like_Pa > 0
+        if trial.implied_pressure_Pa > 0
     ]
     return (
         f"{names} {'does' if alone else 'do'} not go with the other {count - len(odd)} trials"

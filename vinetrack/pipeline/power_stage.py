@@ -374,7 +374,7 @@ def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration
     """The tests of the first model of measured trials, held against null campaigns of their design."""
     from vinetrack.diagnosis.candidates import testable
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
-    from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, misfit_tests
+    from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit_result import Fit
 
@@ -395,7 +395,7 @@ def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration
         questioned = candidates_of(model, candidates, measured.user_effects)
         fitted = initial_fit(model, measured.pairs, questioned, profile=False)
     effects, _ = testable(questioned, fitted.predictor.data)
-    observed = chances_of(misfit_tests(fitted, effects, FIRST_LEVEL))
+    observed = chances_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND))
     path = asked.answers or _answers_file(asked.target)
     path = path.with_name(f"{path.stem}_calibration.csv")
     how = Simulation(asked.calibrate, asked.first_seed, asked.jobs, path)
