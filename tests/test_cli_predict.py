@@ -16,7 +16,7 @@ import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
 from vinetrack.inference.summary_of_fit import summary_of
-from vinetrack.pipeline.prediction_inputs import Asked, inputs_of, read_ground
+from vinetrack.pipeline.prediction_inputs import PredictionRequest, inputs_of, read_basis
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 FAST = ("--diameter-mm", 25, "--thickness-um", 100, "--length-mm", 400, "--pressure-kPa", 62)
@@ -128,7 +128,7 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
     write_json(results / "fit.json", content)
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (inputs,) = inputs_of(read_ground(Asked(cells=values, results=results)))
+    (inputs,) = inputs_of(read_basis(PredictionRequest(cells=values, results=results)))
     assert inputs.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     done = run("predict", *FAST, "--fit", results)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from test_pipeline import ROOT, write_campaign
 
-from vinetrack.pipeline.run_lock import ENTRY
+from vinetrack.pipeline.run_lock import OWNER_FILE
 
 
 @pytest.mark.pipeline
@@ -36,5 +36,5 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None
     assert again.returncode == 0, again.stdout + again.stderr
     assert f"broken off (process {first.pid})" in again.stdout
     assert (results / "trials.csv").exists()
-    assert not (results / ENTRY).exists()
+    assert not (results / OWNER_FILE).exists()
     assert not list(tmp_path.rglob(".tmp-*"))

@@ -110,8 +110,8 @@ def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyte
     def diagnosed(target: Path, experiment: Path | None) -> tuple[Diagnosis, list[bytes], Path]:  # noqa: ARG001
         return said[0], data * 8, tmp_path
 
-    monkeypatch.setattr(sequence_stage, "_diagnosed", diagnosed)
-    monkeypatch.setattr(sequence_stage, "_mark", lambda pairs: pairs[0].decode())
+    monkeypatch.setattr(sequence_stage, "_diagnose_target", diagnosed)
+    monkeypatch.setattr(sequence_stage, "_data_fingerprint", lambda pairs: pairs[0].decode())
     first = look_at_folder(tmp_path, 0.05)
     assert [look.decision for look in first.looks] == [GO_ON]
     again = look_at_folder(tmp_path)

@@ -9,7 +9,7 @@ import pytest
 from hand_sheet import HEADER, TRACK, write
 
 from vinetrack.experiment.folder import check_experiment, read_experiment
-from vinetrack.experiment.trial_order import order_follows_pressure, trial_order
+from vinetrack.experiment.trial_order import order_pressure_correlation, trial_order
 
 PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
 
@@ -44,7 +44,7 @@ def test_rows_are_the_order_where_the_sheet_has_none(tmp_path: Path) -> None:
     ranks, stated = trial_order(trials)
     assert not stated
     assert ranks.tolist() == list(range(10))
-    assert order_follows_pressure(trials) == pytest.approx(0.985, abs=0.005)
+    assert order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
 
 
 @pytest.mark.parametrize(("column", "said"), [("", "is blank"), (",order", "follows the pressure")])

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.pipeline.model_stage import measured
+from vinetrack.pipeline.model_stage import measured_trials
 from vinetrack.results.folder_layout import Results
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
@@ -57,7 +57,7 @@ def gathered(
     run("gather", experiment, folder)
     with (folder / "trials.csv").open() as file:
         states = {row["trial"]: (row["status"], row["reason"]) for row in csv.DictReader(file)}
-    pairs, _ = measured(read_experiment(experiment), Results(folder))
+    pairs, _ = measured_trials(read_experiment(experiment), Results(folder))
     return states, {trial.name for trial, _ in pairs}
 
 

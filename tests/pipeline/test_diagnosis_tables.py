@@ -15,15 +15,15 @@ from vinetrack.diagnosis.result import Round
 from vinetrack.figures.registry import draw
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_tables import (
+    cosines_by_rank,
     figure_tables,
-    in_order_of_rank,
     predicted_trials,
-    question,
     ranking_table,
-    read_diagnosed,
+    read_diagnosis_tables,
+    round_heading,
     worst_condition,
 )
-from vinetrack.pipeline.figures_stage import figure_inputs, with_after
+from vinetrack.pipeline.figures_stage import figure_inputs, with_final_model
 from vinetrack.results.folder_layout import Results
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2
@@ -77,7 +77,7 @@ def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: boo
 
 
 def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Path) -> None:
-    found = read_diagnosed(folder(tmp_path / "r", diagnosis()), conditions())
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
     assert found.worst == "slow"
     assert set(found.before_after["trial"]) == {"a", "b"}
@@ -85,7 +85,7 @@ def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Pa
 
 
 def test_misfits_are_averaged_along_the_growth_before_and_after(tmp_path: Path) -> None:
-    found = read_diagnosed(folder(tmp_path / "r", diagnosis()), conditions())
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
     slow = found.where[found.where["condition"] == "slow"]
     middle = (slow["growth_from"] + slow["growth_to"]) / 2
@@ -100,7 +100,7 @@ def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: 
     row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
     row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
     pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
-    found = read_diagnosed(results, conditions())
+    found = read_diagnosis_tables(results, conditions())
     assert found is not None
     (slow,) = found.where[found.where["condition"] == "slow"].to_dict("records")
     assert (slow["growth_from"], slow["growth_to"]) == (0.5, 1.0)
@@ -110,7 +110,7 @@ def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, verdict: str) -> None:
-    found = read_diagnosed(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
     assert found is not None
     inputs = figure_inputs(found)
     assert set(inputs) == set(figure_tables(found)) <= PICTURES
@@ -123,7 +123,7 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, v
 
 @pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
 def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dict | None) -> None:
-    found = read_diagnosed(folder(tmp_path / "r", content), conditions())
+    found = read_diagnosis_tables(folder(tmp_path / "r", content), conditions())
     assert found is None
     assert figure_tables(found) == {}
 
@@ -131,7 +131,7 @@ def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dic
 def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
     results = Results(tmp_path)
     (tmp_path / "diagnosis.json").write_text(json.dumps(diagnosis()))
-    found = read_diagnosed(results, conditions())
+    found = read_diagnosis_tables(results, conditions())
     assert found is not None
     assert set(figure_tables(found)) == {"candidates", "cosines"}
     assert set(figure_inputs(found)) == {"candidates", "cosines"}
@@ -143,12 +143,12 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
         "slow": pd.read_csv(results.trajectories("slow")),
         "fast": pd.read_csv(results.trajectories("fast")),
     }
-    joined = with_after(trajectories, read_diagnosed(results, conditions()))
+    joined = with_final_model(trajectories, read_diagnosis_tables(results, conditions()))
     difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
     assert float(np.abs(difference).max()) < 1e-12
-    assert "model_after_m" not in with_after(trajectories, None)["slow"]
+    assert "model_after_m" not in with_final_model(trajectories, None)["slow"]
     shorter = {"slow": trajectories["slow"].iloc[1:]}
-    assert "model_after_m" not in with_after(shorter, read_diagnosed(results, conditions()))["slow"]
+    assert "model_after_m" not in with_final_model(shorter, read_diagnosis_tables(results, conditions()))["slow"]
 
 
 def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_added() -> None:
@@ -157,16 +157,16 @@ def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_adde
     table = ranking_table(rounds[0])
     assert table["effect"].tolist() == ["air_drag", "leak", "time_base", "payload_drag"]
     assert math.isnan(table["delta_chi2"].iloc[-1])
-    assert question(0, rounds) == "Which effect is missing from the initial model?"
-    assert question(1, rounds) == "Which is missing with air drag added?"
+    assert round_heading(0, rounds) == "Which effect is missing from the initial model?"
+    assert round_heading(1, rounds) == "Which is missing with air drag added?"
 
 
 def test_ties_stand_in_the_order_of_the_ranking() -> None:
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    names, matrix = in_order_of_rank(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    names, matrix = cosines_by_rank(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
     assert names == ["air_drag", "leak", "time_base"]
     assert matrix == [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]]
-    assert in_order_of_rank(Round.from_json({"verdict": ""})) == ([], [])
+    assert cosines_by_rank(Round.from_json({"verdict": ""})) == ([], [])
 
 
 def test_trials_in_which_nothing_grew_have_no_places_along_the_growth() -> None:
@@ -176,8 +176,8 @@ def test_trials_in_which_nothing_grew_have_no_places_along_the_growth() -> None:
 
     still = {"trial": ["a"] * 6, "time_s": range(6), "lead_position_m": [0.0] * 6}
     members = pd.DataFrame(still | {"model_before_m": [0.0] * 6, "model_after_m": [0.0] * 6})
-    assert diagnosis_tables._stretched(members) == []
+    assert diagnosis_tables._measured_sections(members) == []
     located = pd.DataFrame(
         {"vine": ["v"], "condition": ["c"], "from_m": [0.0], "to_m": [0.0], "mean_residual_m": [0.0], "sigma_m": [1.0]}
     )
-    assert diagnosis_tables._located(located, located, members) == []
+    assert diagnosis_tables._located_sections(located, located, members) == []

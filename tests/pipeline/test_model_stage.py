@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.pipeline.model_stage import fit_model, measured, read_back
+from vinetrack.pipeline.model_stage import fit_model, measured_trials, read_stored_track
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 COMPARISON_HEADER = (
@@ -133,7 +133,7 @@ def test_compare_of_a_folder_without_a_fit_says_what_to_run(tmp_path: Path) -> N
 
 def test_tracks_are_read_back_as_they_were_written(campaign: tuple[Path, Path, str]) -> None:
     experiment, results, _ = campaign
-    pairs, kinematics = measured(read_experiment(experiment), Results(results))
+    pairs, kinematics = measured_trials(read_experiment(experiment), Results(results))
     names = [trial.name for trial, _ in pairs]
     assert "torn" not in names
     assert list(kinematics) == names
@@ -149,7 +149,7 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
     trial = read_experiment(tmp_path).trial("a")
     time_s = np.arange(20) / 1000
     table = pd.DataFrame({"frame": range(20), "time_s": time_s, "edge_px": np.nan, "lead_position_m": time_s / 10})
-    track = read_back(trial, table.assign(lead_position_sigma_m=np.nan, flag=""))
+    track = read_stored_track(trial, table.assign(lead_position_sigma_m=np.nan, flag=""))
     assert track.pressure_Pa is not None
     np.testing.assert_allclose(track.pressure_Pa, 1e3 * (20 - np.arange(20) / 10))
 

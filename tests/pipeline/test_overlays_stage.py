@@ -17,14 +17,14 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import OverlaySettings
 from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 from vinetrack.pipeline.overlays_stage import (
-    REST_FRAMES,
+    MARGIN_FRAMES,
     chosen_trials,
     draw_overlays,
-    edges_of,
+    edges_to_draw,
     frames_to_show,
-    metres_to_px,
     overlay_one,
-    pace,
+    playback_rate,
+    position_to_px,
 )
 from vinetrack.results.folder_layout import Results, ResultsError, read_result
 from vinetrack.video.write import write_clip
@@ -103,7 +103,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path)
 def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone(tmp_path: Path) -> None:
     _, results = campaign(tmp_path, diagnosed=False)
     assert overlay_one(results, "a").stat().st_size > 1000
-    edges, release_s = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    edges, release_s = edges_to_draw("a", Results(results), read_result(Results(results).track("a")))
     assert [edge.name for edge in edges] == ["tracked edge"]
     assert release_s == pytest.approx(0.021)
 
@@ -111,7 +111,7 @@ def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone(tmp_path: Path) -> 
 def test_where_nothing_was_added_there_is_no_model_after(tmp_path: Path) -> None:
     _, results = campaign(tmp_path)
     (results / "diagnosis.json").write_text(json.dumps({"effects": []}))
-    edges, release_s = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    edges, release_s = edges_to_draw("a", Results(results), read_result(Results(results).track("a")))
     assert [edge.name for edge in edges] == ["tracked edge", "initial model"]
     assert release_s == 0.02
     assert edges[1].off_mm == pytest.approx(np.full(N, 20.0))
@@ -121,7 +121,7 @@ def test_no_model_is_drawn_before_the_first_frame_of_its_fit_nor_after_the_last(
     _, results = campaign(tmp_path)
     path = results / "diagnosis" / "predictions" / "a.csv"
     pd.read_csv(path).iloc[5:40].to_csv(path, index=False)
-    edges, _ = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    edges, _ = edges_to_draw("a", Results(results), read_result(Results(results).track("a")))
     assert np.isfinite(edges[1].along_px[5:40]).all()
     assert np.isnan(edges[1].along_px[:5]).all()
     assert np.isnan(edges[1].along_px[40:]).all()
@@ -154,7 +154,7 @@ def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:
     metres = 2.4e-4 * edge * (1 + 5e-5 * edge)
     track = pd.DataFrame({"edge_px": edge, "lead_position_m": metres})
     track.loc[3:9, "edge_px"] = math.nan
-    assert metres_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
+    assert position_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
 
 
 def test_one_recording_a_condition_unless_all_or_none_are_asked_for(tmp_path: Path) -> None:
@@ -181,13 +181,13 @@ def test_the_folder_is_there_even_without_a_clip(tmp_path: Path) -> None:
 
 def test_a_clip_begins_a_little_before_the_motion_and_ends_a_little_after() -> None:
     shown = frames_to_show(pd.DataFrame({"edge_px": edge_px()}))
-    assert shown.start == 21 - REST_FRAMES
-    assert 49 + REST_FRAMES <= shown.stop <= 51 + REST_FRAMES
+    assert shown.start == 21 - MARGIN_FRAMES
+    assert 49 + MARGIN_FRAMES <= shown.stop <= 51 + MARGIN_FRAMES
 
 
 @pytest.mark.parametrize("n_frames", [10, 30, 200, 1000, 20_000])
 def test_a_clip_lasts_about_as_long_as_asked_and_plays_at_a_rate_that_players_know(n_frames: int) -> None:
-    play_fps, stride = pace(n_frames, 6.0)
+    play_fps, stride = playback_rate(n_frames, 6.0)
     assert 4 <= play_fps <= 30
     lasts_s = n_frames / stride / play_fps
     assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)

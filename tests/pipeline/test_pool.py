@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.pipeline.pool import as_they_come, map_trials
+from vinetrack.pipeline.pool import map_trials, map_unordered
 
 PARENT = """
 import os, sys, time
-from vinetrack.pipeline.pool import as_they_come, map_trials
+from vinetrack.pipeline.pool import map_unordered, map_trials
 
 def task(number):
     os.write(1, b"%d\\n" % os.getpid())  # at once: two that print mix their lines
@@ -32,11 +32,11 @@ def square(number: int) -> int:
 
 def test_answers_come_in_the_order_of_their_arguments() -> None:
     assert list(map_trials(square, range(20), 2, "squares")) == [k**2 for k in range(20)]
-    assert sorted(as_they_come(square, range(20), 2)) == [k**2 for k in range(20)]
+    assert sorted(map_unordered(square, range(20), 2)) == [k**2 for k in range(20)]
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="which processes are there is read from /proc")
-@pytest.mark.parametrize(("share", "label"), [("map_trials", ", 'tasks'"), ("as_they_come", "")])
+@pytest.mark.parametrize(("share", "label"), [("map_trials", ", 'tasks'"), ("map_unordered", "")])
 def test_workers_of_a_killed_run_end_too(share: str, label: str, tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT.format(share=share, label=label))

@@ -19,8 +19,8 @@ from vinetrack.diagnosis.null_calibration import TESTS, TestChances
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer
 from vinetrack.figures.registry import draw
 from vinetrack.pipeline import simulated_answers
-from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
-from vinetrack.pipeline.simulated_answers import fingerprint, kept_answers
+from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
+from vinetrack.pipeline.simulated_answers import fingerprint, stored_answers
 
 SHEET = (
     "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
-    power = power_of_target(PowerAsked(folder, noise_mm=0.2))
+    power = power_of_target(PowerRequest(folder, noise_mm=0.2))
     origins = {entry.name: (entry.value, entry.origin) for entry in power.inputs}
     assert power.n_trials == 4
     assert origins["noise of a position"] == ("0.2 mm, correlation 0.00", "stated")
@@ -63,7 +63,7 @@ def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> No
 def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "trials.csv").write_text(SHEET)
     (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, new_vines: no}\n")
-    now = power_of_target(PowerAsked(folder))["leak"]
+    now = power_of_target(PowerRequest(folder))["leak"]
     rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
     arguments = ["power", str(tmp_path), "--effect", size, "--reach", "0.9", "--sheet", str(rows)]
     result = CliRunner().invoke(app, arguments)
@@ -72,7 +72,7 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     (tmp_path / "trials.csv").write_text(
         pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(index=False)
     )
-    again = power_of_target(PowerAsked(tmp_path))["leak"]
+    again = power_of_target(PowerRequest(tmp_path))["leak"]
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
 
 
@@ -87,8 +87,8 @@ def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeyp
     monkeypatch.setattr(simulated_answers, "fingerprint", lambda _: "design")
     how = simulated_answers.Simulation(2, 0, 1, tmp_path / "chances.csv")
     design: Any = None
-    first = simulated_answers.simulated_chances(design, how)
-    again = simulated_answers.simulated_chances(design, replace(how, campaigns=3))
+    first = simulated_answers.simulate_null_tests(design, how)
+    again = simulated_answers.simulate_null_tests(design, replace(how, campaigns=3))
     assert asked_for == [0, 1, 2]
     assert again[:2] == first
     assert again[2].chances["any smooth force"] == pytest.approx(0.3)
@@ -96,17 +96,17 @@ def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeyp
 
 def test_a_sheet_that_nobody_has_filmed_cannot_be_calibrated(folder: Path) -> None:
     with pytest.raises(ExperimentError, match="needs measured trials"):
-        power_of_target(PowerAsked(folder, calibrate=3))
+        power_of_target(PowerRequest(folder, calibrate=3))
 
 
 def test_trials_to_add_need_a_size(folder: Path) -> None:
     with pytest.raises(ExperimentError, match="needs a size"):
-        power_of_target(PowerAsked(folder, ("leak",), reach=0.9))
+        power_of_target(PowerRequest(folder, ("leak",), reach=0.9))
 
 
 def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:
     with pytest.raises(ExperimentError, match="leak"):
-        power_of_target(PowerAsked(folder, ("leek",)))
+        power_of_target(PowerRequest(folder, ("leek",)))
 
 
 def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,7 @@ def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monk
         return SimulatedAnswer(effect, value, seed, verdict, names, (), 1.0)
 
     monkeypatch.setattr(simulated_answers, "simulated_answer", answered)
-    asked = PowerAsked(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
+    asked = PowerRequest(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
     first = power_of_target(asked)
     assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]
     asked_for.clear()
@@ -136,7 +136,7 @@ def test_answers_about_another_design_are_passed_over(tmp_path: Path) -> None:
         "design,effect,value,seed,verdict,answer_set,effects,seconds,failed\n"
         "abc,,,1,adequate,,,1.0,\nabc,leak,0.5,1,ambiguous,leak|air_drag,,2.0,\nother,,,1,missing,leak,leak,1.0,\nabc,le"
     )
-    null, leak = kept_answers(path, "abc")
+    null, leak = stored_answers(path, "abc")
     assert (null.effect, math.isnan(null.value), null.answer_set) == ("", True, ())
     assert (leak.value, leak.answer_set, leak.is_found) == (0.5, ("leak", "air_drag"), True)
 
@@ -163,7 +163,7 @@ def test_a_fingerprint_changes_with_the_scatter(folder: Path) -> None:
 
 
 def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:
-    power = power_of_target(PowerAsked(folder))
+    power = power_of_target(PowerRequest(folder))
     ax, told = draw("power", power).axes[:2]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["leak, 1/τ", "air drag, C_D"]
     texts = {text.get_text() for text in told.texts}

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.pipeline.run_lock import ENTRY, begin_run, only_looks
+from vinetrack.pipeline.run_lock import OWNER_FILE, begin_run, executes_nothing
 from vinetrack.pipeline.run_stage import RunPaths, run_chain
 
 ROOT = Path(__file__).parents[2]
@@ -83,7 +83,7 @@ def test_vinetrack_run_refuses_before_it_touches_the_log(tmp_path: Path, other_r
 
 
 def test_a_process_number_given_to_another_program_is_not_the_run(tmp_path: Path) -> None:
-    entry = tmp_path / "results" / "vines" / ENTRY
+    entry = tmp_path / "results" / "vines" / OWNER_FILE
     begin(tmp_path)
     content = json.loads(entry.read_text()) | {"pid": os.getppid(), "started_s": 1e9}
     entry.write_text(json.dumps(content))
@@ -95,14 +95,14 @@ def test_a_run_that_ends_in_another_folder_leaves_no_entry(tmp_path: Path) -> No
     """Snakemake with --directory is back where it was called when its process ends."""
     short = "\n".join(BEGIN.splitlines()[:5]) + '\nassert Path("results/vines/.run.json").is_file()\nos.chdir(os.sep)'
     subprocess.run([sys.executable, "-c", short], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
-    assert not (tmp_path / "results" / "vines" / ENTRY).exists()
+    assert not (tmp_path / "results" / "vines" / OWNER_FILE).exists()
 
 
 def test_a_run_on_another_computer_counts_as_alive(tmp_path: Path) -> None:
-    entry = tmp_path / "results" / "vines" / ENTRY
+    entry = tmp_path / "results" / "vines" / OWNER_FILE
     begin(tmp_path)
     entry.write_text(json.dumps(json.loads(entry.read_text()) | {"pid": 1, "host": "elsewhere"}))
-    with pytest.raises(ExperimentError, match=rf"of the computer elsewhere.*remove .*{ENTRY}"):
+    with pytest.raises(ExperimentError, match=rf"of the computer elsewhere.*remove .*{OWNER_FILE}"):
         begin(tmp_path)
 
 
@@ -122,10 +122,10 @@ def test_files_that_were_never_finished_are_cleared_and_no_others(tmp_path: Path
 
 @pytest.mark.parametrize("option", ["-n", "-np", "--dry-run", "--unlock", "--report=a.html", "--list-rules"])
 def test_where_nothing_is_run_nothing_is_begun(option: str) -> None:
-    assert only_looks(["--cores", "2", option])
+    assert executes_nothing(["--cores", "2", option])
 
 
 def test_a_run_is_no_look() -> None:
-    assert not only_looks(
+    assert not executes_nothing(
         ["--cores", "2", "--config", "experiment=n", "--rerun-incomplete", "--quiet", "rules", "host"]
     )

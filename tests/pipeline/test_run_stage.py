@@ -15,7 +15,7 @@ from lsoda_vine import grown_position, vine_trial
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import run_stage
 from vinetrack.pipeline.run_folders import claim_results
-from vinetrack.pipeline.run_stage import RunError, RunPaths, check_first, run_chain, run_lines, run_paths
+from vinetrack.pipeline.run_stage import RunError, RunPaths, check_before_run, run_chain, run_lines, run_paths
 from vinetrack.pipeline.workflow import make_plan
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
@@ -62,13 +62,13 @@ def test_an_experiment_that_has_moved_keeps_its_results(tmp_path: Path) -> None:
 
 def test_a_sheet_of_errors_alone_stops_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="pressure_kPa"):
-        check_first(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,0\n"), print)
+        check_before_run(experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3,0\n"), print)
 
 
 def test_a_single_faulty_trial_is_said_and_the_rest_go_on(tmp_path: Path) -> None:
     lines: list[str] = []
     rows = "a,a.csv,12,100,300,20,3,0\nb,a.csv,12,100,300,9999,3,0\n"
-    check_first(experiment(tmp_path / "v", rows), lines.append)
+    check_before_run(experiment(tmp_path / "v", rows), lines.append)
     assert any("trial b" in line and line.startswith("error") for line in lines)
 
 

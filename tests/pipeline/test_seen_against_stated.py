@@ -13,7 +13,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Track, Trial, plain_track
 from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.pipeline.diagnosis_stage import beside_contradictions, seen_against_stated
+from vinetrack.pipeline.diagnosis_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.run_stage import run_lines
 from vinetrack.planning.scaling_priors import damping_prior
 from vinetrack.results.folder_layout import Results, empty_table
@@ -42,9 +42,9 @@ def written(folder: Path, *contradictions: tuple[str, dict[str, str]]) -> Result
 def test_right_trials_contradict_nothing(tmp_path: Path) -> None:
     pairs = [(replace(VINE, name=name), steady(VINE)) for name in "ab"]
     results = written(tmp_path)
-    assert seen_against_stated(results, pairs) == {}
+    assert sheet_contradictions(results, pairs) == {}
     made = Diagnosis.from_json(diagnosis("missing"))
-    assert beside_contradictions(made, results, pairs) == made
+    assert with_contradictions(made, results, pairs) == made
 
 
 def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path: Path) -> None:
@@ -52,11 +52,11 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     pairs = [(replace(typed, name=name), steady(VINE)) for name in "ab"]
     narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
     results = written(tmp_path, ("a", narrow), ("b", narrow))
-    seen = seen_against_stated(results, pairs)
+    seen = sheet_contradictions(results, pairs)
     assert list(seen) == ["diameter_mm", "pressure_kPa"]
     assert seen["diameter_mm"] == f"a: {narrow['reason']} (and 1 more trial)"
     assert "looks like psi, not kPa" in seen["pressure_kPa"]
-    told = beside_contradictions(Diagnosis.from_json(diagnosis("missing")), results, pairs)
+    told = with_contradictions(Diagnosis.from_json(diagnosis("missing")), results, pairs)
     assert "contradicts the sheet in diameter_mm and pressure_kPa" in told.explanation
     assert set(seen.values()) <= set(told.notes)
 
@@ -66,7 +66,7 @@ def test_the_last_lines_of_a_run_recall_them(tmp_path: Path, slip: bool) -> None
     narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: a factor 1.25"}
     results = written(tmp_path, *([("a", narrow)] if slip else []))
     made = Diagnosis.from_json(diagnosis("adequate"))
-    told = beside_contradictions(made, results, [(replace(VINE, name=name), steady(VINE)) for name in "ab"])
+    told = with_contradictions(made, results, [(replace(VINE, name=name), steady(VINE)) for name in "ab"])
     write_json(results.diagnosis, told.to_json())
     results.trials.write_text(",".join(empty_table(("trial", "status", "reason")).columns) + "\na,ok,\n")
     lines = run_lines(tmp_path)

@@ -102,7 +102,7 @@ def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_printed_and_the_process_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
-        workflow.plan_or_stop({"experiment": str(tmp_path / "gone")}, tmp_path)
+        workflow.make_plan_or_exit({"experiment": str(tmp_path / "gone")}, tmp_path)
     assert stopped.value.code == 1
     assert "gone: does not exist" in capsys.readouterr().err
 
@@ -162,10 +162,10 @@ def test_the_last_line_is_silent_about_a_report_older_than_its_sheet(
     plan.results.mkdir()
     report = plan.results / "report.html"
     report.write_text("")
-    workflow._say_where(plan)
+    workflow._print_report_path(plan)
     assert capsys.readouterr().out == f"Report: {report}\n"
     os.utime(folder / "trials.csv", (report.stat().st_mtime + 5,) * 2)
-    workflow._say_where(plan)
+    workflow._print_report_path(plan)
     assert capsys.readouterr().out == ""
 
 
@@ -219,7 +219,7 @@ def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> 
 
 
 def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) -> None:
-    names = [f"t{i}" for i in range(2 * workflow.TRIALS_A_JOB + 1)]
+    names = [f"t{i}" for i in range(2 * workflow.TRIALS_PER_JOB + 1)]
     rows = "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names)
     folder = experiment(tmp_path / "v", rows)
     (folder / "t1.csv").write_bytes((folder / "a.csv").read_bytes())

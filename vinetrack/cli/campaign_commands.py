@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, print_result
 
 
 def register(app: typer.Typer) -> None:
@@ -38,10 +38,10 @@ def _campaign(
                                              show_default=False)] = None,
 ) -> None:  # fmt: skip
     """Look at a campaign that goes on: verdict, next trials, and whether one name is left at the stated risk."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.sequence_stage import ledger_lines, look_at_folder
 
         ledger = look_at_folder(target, risk, experiment)
-        tell(ledger_lines(ledger), ledger.to_json(), json_file)
+        print_result(ledger_lines(ledger), ledger.to_json(), json_file)

@@ -9,11 +9,11 @@ from typing import Annotated
 import typer
 
 from vinetrack.cli.design_options import (
-    GUESSED_YIELD,
     INPUTS,
     OUT,
     RIG,
     VINE,
+    YIELD_MEANING,
     Anyway,
     AtFraction,
     Damping,
@@ -30,7 +30,7 @@ from vinetrack.cli.design_options import (
     column_options,
     say,
 )
-from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, print_result
 
 
 @column_options(
@@ -46,7 +46,7 @@ from vinetrack.cli.output import MORE, JsonFile, tell
     "growth_angle_deg",
     "chamber_l",
     "inlet_mm",
-    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+    meanings={"yield_pressure_kPa": YIELD_MEANING},
 )
 def _predict(
     sheet: Annotated[
@@ -84,15 +84,15 @@ def _predict(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """What a vine not yet built will do: position, speed, tension, ejection speed, with their uncertainty."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.predict_stage import predict_conditions
-        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
+        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
         if tail_slack not in (None, "taut", "free"):
             raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
-        asked = Asked(
+        asked = PredictionRequest(
             cells=cells,
             sheet=sheet,
             results=results,
@@ -119,7 +119,7 @@ def _predict(
     "growth_angle_deg",
     "chamber_l",
     "inlet_mm",
-    meanings={"pressure_kPa": "Highest gauge pressure of the supply.", "yield_pressure_kPa": GUESSED_YIELD},
+    meanings={"pressure_kPa": "Highest gauge pressure of the supply.", "yield_pressure_kPa": YIELD_MEANING},
 )
 def _vine(
     films: Annotated[
@@ -156,13 +156,13 @@ def _vine(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """The fastest vine within burst pressure, diameter, length, and films to choose from."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_vine
-        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
+        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = Asked(
+        asked = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
@@ -182,7 +182,7 @@ def _vine(
             at_fraction=at_fraction,
             figure=figure,
         )
-        tell(lines, {"lines": lines}, json_file)
+        print_result(lines, {"lines": lines}, json_file)
 
 
 @column_options(
@@ -199,7 +199,7 @@ def _vine(
     meanings={
         "chamber_l": "A chamber to look at as well.",
         "thickness_um": "Thickness of the wall: speeds are then told as well.",
-        "yield_pressure_kPa": GUESSED_YIELD,
+        "yield_pressure_kPa": YIELD_MEANING,
     },
 )
 def _reservoir(
@@ -226,13 +226,13 @@ def _reservoir(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """The chamber that keeps the gauge pressure within so many per cent, by the gas law in absolute pressure."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_reservoir
-        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
+        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = Asked(
+        asked = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
@@ -242,7 +242,7 @@ def _reservoir(
         )
         lines = fit_heading(asked)
         lines += design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure)
-        tell(lines, {"lines": lines}, json_file)
+        print_result(lines, {"lines": lines}, json_file)
 
 
 @column_options(
@@ -251,7 +251,7 @@ def _reservoir(
     "growth_angle_deg",
     "chamber_l",
     "inlet_mm",
-    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+    meanings={"yield_pressure_kPa": YIELD_MEANING},
 )
 def _campaign(
     vines: Annotated[
@@ -326,21 +326,21 @@ def _campaign(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Pressures, payloads and replicates that pin n and B to a wanted error, simulated before they are made."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
-        from vinetrack.pipeline.campaign_stage import Wanted, design_campaign
-        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
+    with _errors_as_sentences(log):
+        from vinetrack.pipeline.campaign_stage import CampaignRequest, design_campaign
+        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = Asked(
+        asked = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,
-            spreads=_spreads(pressure_spread, damping_spread),
+            spreads=_relative_spreads(pressure_spread, damping_spread),
         )
-        wanted = Wanted(
+        wanted = CampaignRequest(
             vines=tuple(vines or ()),
             pressure=pressure,
             payloads=payloads,
@@ -350,8 +350,8 @@ def _campaign(
             noise_mm=noise,
             correlation=correlation,
             longest_s=longest,
-            pressures=_counts(pressures, "--pressures", 2, 13),
-            replicates=_counts(replicates, "--replicates", 1, 50),
+            pressures=_count_range(pressures, "--pressures", 2, 13),
+            replicates=_count_range(replicates, "--replicates", 1, 50),
             most_trials=most_trials,
             burst_share=burst_share,
             check=check,
@@ -359,17 +359,17 @@ def _campaign(
             power=power,
         )
         lines = fit_heading(asked) + design_campaign(asked, wanted, sheet=sheet, figure=figure)
-        tell(lines, {"lines": lines}, json_file)
+        print_result(lines, {"lines": lines}, json_file)
 
 
-def _spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
+def _relative_spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
     """Relative spreads from trial to trial, where either is given; the other as a batch of vines shows it."""
     if pressure is None and damping is None:
         return None
     return (1.0 if pressure is None else pressure) / 100, (3.0 if damping is None else damping) / 100
 
 
-def _counts(text: str, name: str, least: int, most: int) -> tuple[int, int]:
+def _count_range(text: str, name: str, least: int, most: int) -> tuple[int, int]:
     """Two numbers of things from `low:high` or one number."""
     try:
         values = [int(part) for part in text.split(":")]

@@ -61,7 +61,7 @@ class RenamedOptions(typer.core.TyperCommand):
         return super().parse_args(ctx, current)
 
 
-GUESSED_YIELD = "Yield pressure; a scaling prior where it is not given."
+YIELD_MEANING = "Yield pressure; a scaling prior where it is not given."
 
 _Command = Callable[..., None]
 

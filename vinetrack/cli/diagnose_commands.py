@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, print_result
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
@@ -48,27 +48,27 @@ def _diagnose(
     log: LogFile = None,
 ) -> None:
     """What the model lacks: verdict, candidates with their sizes, errors before and after, what to do next."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.experiment.provenance import PROVENANCE
         from vinetrack.pipeline.run_folders import find_experiment
 
-        with _told() as report:
+        with _progress_line() as report:
             if (target / PROVENANCE).exists():
                 from vinetrack.pipeline.diagnosis_stage import diagnose_pairs, write_diagnosis
-                from vinetrack.pipeline.model_stage import measured
-                from vinetrack.pipeline.source_experiment import experiment_behind
+                from vinetrack.pipeline.model_stage import measured_trials
+                from vinetrack.pipeline.source_experiment import read_source_experiment
                 from vinetrack.results.folder_layout import Results
 
-                read = experiment_behind(target, experiment)
-                diagnosis = diagnose_pairs(read, measured(read, Results(target))[0], report)
+                read = read_source_experiment(target, experiment)
+                diagnosis = diagnose_pairs(read, measured_trials(read, Results(target))[0], report)
                 if json_file is None:
                     write_diagnosis(Results(target), diagnosis)
             else:
                 diagnosis = diagnose(_tracks_only(find_experiment(target)), report=report)
-        tell([str(diagnosis)], diagnosis.to_json(), json_file)
+        print_result([str(diagnosis)], diagnosis.to_json(), json_file)
 
 
 def _add(
@@ -80,19 +80,19 @@ def _add(
     log: LogFile = None,
 ) -> None:
     """Put an effect in the model, refit, and show the error before and after."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.diagnosis_stage import add_effect
-        from vinetrack.pipeline.source_experiment import experiment_behind
+        from vinetrack.pipeline.source_experiment import read_source_experiment
 
-        read = experiment_behind(results, experiment)
+        read = read_source_experiment(results, experiment)
         own_file = Path(effect) if effect.endswith(".py") else None
         if save and own_file is not None and own_file.resolve().parent != read.folder.resolve():
             raise UserError(
                 f"{effect}: to save it, put the file into {read.folder} first: an experiment is one folder."
             )
-        with _told() as report:
+        with _progress_line() as report:
             lines = add_effect(read, results, effect, report)
         if save:
             from vinetrack.pipeline.source_experiment import save_model
@@ -100,7 +100,7 @@ def _add(
             name = effect if own_file is None else own_file.stem
             path = save_model(read.folder, [*read.settings.model, name], [] if own_file is None else [own_file.name])
             lines.append(f"Saved to {path}; run vinetrack run, or snakemake, again to have everything with it.")
-        tell(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
+        print_result(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
 
 
 def _propose(
@@ -111,16 +111,16 @@ def _propose(
     log: LogFile = None,
 ) -> None:
     """Where no known effect mends the model: the law of force that does best, as an effect file of your own."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.proposed_effects import propose_effect
-        from vinetrack.pipeline.source_experiment import experiment_behind
+        from vinetrack.pipeline.source_experiment import read_source_experiment
 
-        with _told() as report:
-            proposal = propose_effect(experiment_behind(results, experiment), results, to, report)
+        with _progress_line() as report:
+            proposal = propose_effect(read_source_experiment(results, experiment), results, to, report)
         lines, files = list(proposal.lines), [path.as_posix() for path in proposal.files]
-        tell(lines, {"lines": lines, "files": files}, json_file)
+        print_result(lines, {"lines": lines, "files": files}, json_file)
 
 
 def _diagnosis(
@@ -132,14 +132,14 @@ def _diagnosis(
     log: LogFile = None,
 ) -> None:
     """What the model lacks, as diagnosis.json, ladder.csv and the folder diagnosis."""
-    from vinetrack.cli.main import _run_settings, _sentences
+    from vinetrack.cli.main import _errors_as_sentences, _run_settings
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.experiment.folder import read_experiment
         from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
         from vinetrack.pipeline.run_folders import find_experiment
 
-        with _told() as report:
+        with _progress_line() as report:
             diagnose_results(read_experiment(find_experiment(experiment)), results, report, _run_settings(settings))
         for line in diagnosis_lines(results):
             typer.echo(line)
@@ -160,7 +160,7 @@ def _tracks_only(folder: Path) -> Experiment:
 
 
 @contextmanager
-def _told() -> Iterator[Callable[[str], None]]:
+def _progress_line() -> Iterator[Callable[[str], None]]:
     """Say on a terminal what is being done, on one line that is wiped at the end; nothing elsewhere."""
     shown = sys.stderr.isatty()
 

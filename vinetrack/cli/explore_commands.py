@@ -51,9 +51,9 @@ def _explore(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """A local page to see where the model fails, try effects, refit, and watch the error fall."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.explorer.command import ExploreOptions, explore
 
         asked = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)

@@ -21,7 +21,7 @@ from vinetrack.cli.campaign_commands import register as register_campaign
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
-from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, print_result
 from vinetrack.cli.power_commands import register as register_power
 from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
@@ -55,11 +55,11 @@ def main() -> None:
     try:
         app()
     except SystemExit as ending:
-        _leave_threads_behind(ending.code)
+        _exit_despite_threads(ending.code)
         raise
 
 
-def _leave_threads_behind(status: str | int | None) -> None:
+def _exit_despite_threads(status: str | int | None) -> None:
     """End at once where a page's fit or film is still at work in a thread.
 
     The interpreter takes such a thread down in the middle of compiled code, which then aborts the whole process
@@ -105,14 +105,14 @@ def _settings(
     ] = None,
 ) -> None:
     """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
-    with _sentences(None):
+    with _errors_as_sentences(None):
         from vinetrack.core.tables import write_text
         from vinetrack.experiment.reference import reference_content, reference_lines, reference_page
 
         if page is not None:
             write_text(page, reference_page())
             return
-        tell(reference_lines(), reference_content(), json_file)
+        print_result(reference_lines(), reference_content(), json_file)
 
 
 @app.command("effects", rich_help_panel=MORE)
@@ -127,23 +127,23 @@ def _effects(
     json_file: JsonFile = None,
 ) -> None:
     """The catalogue of effects, with formulas, parameters and units; or one explained."""
-    with _sentences(None):
+    with _errors_as_sentences(None):
         from vinetrack.pipeline.effects_stage import describe_effects, effects_content
         from vinetrack.pipeline.run_folders import find_experiment
 
         folder = None if experiment is None else find_experiment(experiment)
-        tell(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
+        print_result(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
 
 
 @app.command("compare", rich_help_panel=MORE)
 def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
     """The model against the measurement of every condition, beside what repeated trials differ by."""
-    with _sentences(None):
+    with _errors_as_sentences(None):
         from vinetrack.pipeline.model_stage import comparison_lines
         from vinetrack.results.folder_layout import Results, read_result
 
         lines = comparison_lines(results)
-        tell(lines, read_result(Results(results).comparison).to_dict("records"), json_file)
+        print_result(lines, read_result(Results(results).comparison).to_dict("records"), json_file)
 
 
 @app.command("overlay", rich_help_panel=MORE)
@@ -159,12 +159,12 @@ def _overlay(
     json_file: JsonFile = None,
 ) -> None:
     """The recording of one trial, slowed down, with the tracked edge and the models' edges drawn."""
-    with _sentences(None):
+    with _errors_as_sentences(None):
         from vinetrack.pipeline.overlays_stage import overlay_one
 
-        with _busy(f"drawing over {trial}", None):
+        with _activity_sign(f"drawing over {trial}", None):
             path = overlay_one(results, trial, experiment, seconds)
-        tell([f"Clip: {path}"], {"clip": path}, json_file)
+        print_result([f"Clip: {path}"], {"clip": path}, json_file)
 
 
 @app.command("overlays", rich_help_panel="Stages of the workflow")
@@ -176,7 +176,7 @@ def _overlays(
     log: LogPath = None,
 ) -> None:
     """Clips of the recordings that the settings choose, with the tracked edge and the models' edges drawn."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.overlays_stage import draw_overlays
 
         for line in draw_overlays(_read(experiment), results, _run_settings(settings).overlays, threads):
@@ -198,13 +198,13 @@ def _recording(
     log: LogPath = None,
 ) -> None:
     """One recording to its track, kinematics and strip."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.recordings_stage import analyse_recording
 
         read = _read(experiment)
         if trial not in [filmed.name for filmed in read.trials if filmed.video is not None]:
             raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
-        with _busy(f"tracking {trial}", log):
+        with _activity_sign(f"tracking {trial}", log):
             outcome = analyse_recording(read, trial, results, _run_settings(settings))
         typer.echo(outcome)
 
@@ -219,7 +219,7 @@ def _tracks(
     log: LogPath = None,
 ) -> None:
     """Positions measured elsewhere to tracks, kinematics and steady windows."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import analyse_tracks
 
         read = _read(experiment)
@@ -233,7 +233,7 @@ def _gather(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """What every trial gave, as trials.csv, conditions.csv, steady.csv and damping_points.csv."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import gather as gather_trials
 
         table = gather_trials(_read(experiment), results, _run_settings(settings))
@@ -243,11 +243,11 @@ def _gather(
 @app.command("damping", rich_help_panel="Stages of the workflow")
 def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Steady points to the damping law, damping.json."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.narrative.law_text import headline
         from vinetrack.pipeline.damping_stage import fit_law
 
-        with _busy("fitting the law and resampling its trials", log):
+        with _activity_sign("fitting the law and resampling its trials", log):
             law = fit_law(results, _run_settings(settings).damping)
         typer.echo(headline(law))
 
@@ -257,10 +257,10 @@ def _model(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """The model in use fitted to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.model_stage import comparison_lines, fit_model
 
-        with _busy("fitting the model", log):
+        with _activity_sign("fitting the model", log):
             fit_model(_read(experiment), results, _run_settings(settings))
         for line in comparison_lines(results):
             typer.echo(line)
@@ -277,7 +277,7 @@ def _figures(
     log: LogPath = None,
 ) -> None:
     """Draw the figures of the trials, of the whole experiment, or both."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
 
         if of not in ("trials", "campaign", "all"):
@@ -287,7 +287,7 @@ def _figures(
         if of != "campaign":
             draw_trials(read, results, chosen, threads, _trial_names(trials, read))
         if of != "trials":
-            with _busy("drawing the experiment", log):
+            with _activity_sign("drawing the experiment", log):
                 draw_campaign(read, results, chosen)
 
 
@@ -296,11 +296,11 @@ def _paper(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Set the paper's published numbers and figures beside ours: paper.csv."""
-    with _sentences(log):
-        from vinetrack.pipeline.paper_stage import draw_paper, set_beside_paper
+    with _errors_as_sentences(log):
+        from vinetrack.pipeline.paper_stage import compare_with_paper, draw_paper
         from vinetrack.report.paper_section import tally
 
-        typer.echo(f"Beside the paper: {tally(set_beside_paper(_read(experiment), results))}")
+        typer.echo(f"Beside the paper: {tally(compare_with_paper(_read(experiment), results))}")
         draw_paper(results, _run_settings(settings).figures)
 
 
@@ -309,10 +309,10 @@ def _report(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Put everything in report.html, and what it was made with in provenance.json."""
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.pipeline.report_stage import write_report
 
-        with _busy("writing the report", log):
+        with _activity_sign("writing the report", log):
             path = write_report(
                 _read(experiment),
                 results,
@@ -321,7 +321,7 @@ def _report(
         typer.echo(f"Report: {path}")
 
 
-def _busy(what: str, log: Path | None) -> AbstractContextManager[object]:
+def _activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
     """A sign of life while a stage runs; none in the workflow, where each has a log and Snakemake tells how it goes."""
     from vinetrack.core.terminal import waiting
 
@@ -366,9 +366,9 @@ def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
 
 
 @contextmanager
-def _sentences(log: Path | None) -> Iterator[None]:
+def _errors_as_sentences(log: Path | None) -> Iterator[None]:
     """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
-    from vinetrack.core.files import is_full
+    from vinetrack.core.files import is_disk_full
     from vinetrack.core.problems import ExperimentError, UserError, format_problems
 
     try:
@@ -377,24 +377,24 @@ def _sentences(log: Path | None) -> Iterator[None]:
     except (typer.Exit, typer.BadParameter, typer.Abort):
         raise
     except ExperimentError as error:
-        _stop("\n".join(format_problems(error.problems)))
+        _exit_with("\n".join(format_problems(error.problems)))
     except KeyboardInterrupt:
-        _stop("Stopped; what was finished is kept.")
+        _exit_with("Stopped; what was finished is kept.")
     except BrokenPipeError:
         # Whoever reads (`| head`) has seen enough; Python would complain once more when it closes the pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except Exception as error:
-        if is_full(error):
-            _stop("The disk is full: make room and run the same command again; what was finished is kept.")
+        if is_disk_full(error):
+            _exit_with("The disk is full: make room and run the same command again; what was finished is kept.")
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
-            _stop(str(error))
+            _exit_with(str(error))
         place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
-        _stop(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")
+        _exit_with(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")
 
 
-def _stop(message: str) -> None:
+def _exit_with(message: str) -> None:
     from vinetrack.core.terminal import severity_first
 
     typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)

@@ -18,7 +18,7 @@ JsonFile = Annotated[
 ]  # fmt: skip
 
 
-def as_json(json_file: Path | None) -> bool:
+def json_to_terminal(json_file: Path | None) -> bool:
     """Whether JSON goes to the terminal in place of lines.
 
     Parameters
@@ -34,7 +34,7 @@ def as_json(json_file: Path | None) -> bool:
     return json_file == STANDARD_OUTPUT
 
 
-def tell(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
+def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
     """Print lines, or `content` as JSON; into a file beside the lines, or in their place on the terminal.
 
     Parameters
@@ -46,7 +46,7 @@ def tell(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
     from vinetrack.core.tables import write_json
     from vinetrack.core.terminal import severity_first
 
-    for line in () if as_json(json_file) else lines:
+    for line in () if json_to_terminal(json_file) else lines:
         typer.echo(severity_first(line))
     if json_file is not None:
         write_json(json_file, content)

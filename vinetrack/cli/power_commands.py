@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vinetrack.cli.design_options import INPUTS, OUT, FigurePath, LogPath
-from vinetrack.cli.output import MORE, tell
+from vinetrack.cli.output import MORE, print_result
 
 SIMULATION, FURTHER = "Simulation", "What to add"
 
@@ -110,18 +110,18 @@ def _power(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """What these trials can see: detectable sizes of every effect, what each is taken for, false alarms."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         import pandas as pd
 
         from vinetrack.core.tables import write_csv
-        from vinetrack.pipeline.power_stage import PowerAsked, power_of_target, sheet_rows
+        from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
         from vinetrack.pipeline.prediction_inputs import check_figure, write_figure
 
         check_figure(figure)
         power = power_of_target(
-            PowerAsked(
+            PowerRequest(
                 target=target,
                 effects=tuple(effects or ()),
                 noise_mm=_or_nan(noise),
@@ -147,7 +147,7 @@ def _power(
         if sheet is not None and power.further:
             write_csv(sheet, pd.DataFrame(sheet_rows(power)))
             lines.append(f"Rows of the sheet: {sheet}")
-        tell(lines, power.to_json(), json_file)
+        print_result(lines, power.to_json(), json_file)
 
 
 def _or_nan(value: float | None) -> float:

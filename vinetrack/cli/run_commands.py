@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.output import START, JsonFile, as_json, tell
+from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
 def register(app: typer.Typer) -> None:
@@ -27,15 +27,17 @@ def _check(
     json_file: JsonFile = None,
 ) -> None:
     """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(None):
+    with _errors_as_sentences(None):
         from vinetrack.pipeline.check_stage import check_folder
         from vinetrack.pipeline.run_folders import find_experiment
 
         checked = check_folder(find_experiment(experiment))
         lines = checked.lines()
-        tell(lines if checked.problems else [*lines, f"{experiment}: no problems found."], checked.to_json(), json_file)
+        print_result(
+            lines if checked.problems else [*lines, f"{experiment}: no problems found."], checked.to_json(), json_file
+        )
         if checked.failed:
             raise typer.Exit(1)
 
@@ -55,22 +57,22 @@ def _run(
     json_file: JsonFile = None,
 ) -> None:  # fmt: skip
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(None):
-        from vinetrack.pipeline.run_stage import check_first, run_chain, run_lines, run_paths
+    with _errors_as_sentences(None):
+        from vinetrack.pipeline.run_stage import check_before_run, run_chain, run_lines, run_paths
         from vinetrack.results.folder_layout import Results, read_json
 
         def say(line: str) -> None:
             """A line of progress: to the terminal, or beside it where JSON goes there."""
-            typer.echo(line, err=as_json(json_file))
+            typer.echo(line, err=json_to_terminal(json_file))
 
         paths = run_paths(folder, results)
-        check_first(paths.experiment, say)
+        check_before_run(paths.experiment, say)
         run_chain(paths, cores, say)
         content: dict[str, Any] = {
             "results": paths.results,
             "report": Results(paths.results).report,
             "diagnosis": read_json(Results(paths.results).diagnosis),
         }
-        tell(run_lines(paths.results), content, json_file)
+        print_result(run_lines(paths.results), content, json_file)

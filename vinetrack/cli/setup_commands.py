@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.output import START, JsonFile, as_json, tell
+from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
 def register(app: typer.Typer) -> None:
@@ -33,9 +33,9 @@ def _setup(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """A local page that makes trials.csv and experiment.yaml of a folder of recordings, or both with blanks to fill."""
-    from vinetrack.cli.main import _sentences
+    from vinetrack.cli.main import _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         if page:
             from vinetrack.setup_page.page_server import serve
 
@@ -76,9 +76,9 @@ def _track(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """The leading edge of one recording, without an experiment: a table, a strip and a clip."""
-    from vinetrack.cli.main import _busy, _sentences
+    from vinetrack.cli.main import _activity_sign, _errors_as_sentences
 
-    with _sentences(log):
+    with _errors_as_sentences(log):
         from vinetrack.core.numbers import or_nan
         from vinetrack.pipeline.track_stage import TrackOptions, track_file
 
@@ -88,10 +88,10 @@ def _track(
             body=body, out=out,
         )  # fmt: skip
         lines: list[str] = []
-        say = lines.append if as_json(json_file) else _say
-        with _busy(f"tracking {recording.name}", log):
+        say = lines.append if json_to_terminal(json_file) else _say
+        with _activity_sign(f"tracking {recording.name}", log):
             content = track_file(recording, options, say)
-        tell((), content, json_file)
+        print_result((), content, json_file)
 
 
 def _say(line: str) -> None:

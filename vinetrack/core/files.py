@@ -11,15 +11,15 @@ import os
 import stat
 from pathlib import Path
 
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Errors of a disk, or a share of one, on which nothing more can be written."""
 
 
-NO_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
+NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
 """What is said of a FIFO, a socket, a terminal or anything like `/dev/zero`."""
 
 
-def absence(path: Path) -> tuple[str, str]:
+def missing_file_message(path: Path) -> tuple[str, str]:
     """What is said of a file that is not there, and what to do.
 
     Parameters
@@ -73,7 +73,7 @@ def file_size(path: Path) -> int:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
     if not stat.S_ISREG(status.st_mode):
-        raise OSError(errno.EINVAL, NO_FILE, str(path))
+        raise OSError(errno.EINVAL, NOT_A_FILE, str(path))
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, "permission denied; allow it to be read", str(path))
     return status.st_size
@@ -96,7 +96,7 @@ def is_readable(path: Path) -> bool:
         return False
 
 
-def is_full(error: BaseException) -> bool:
+def is_disk_full(error: BaseException) -> bool:
     """Whether an error says that the disk is full.
 
     Parameters
@@ -107,4 +107,4 @@ def is_full(error: BaseException) -> bool:
     -------
     True for a full disk or a quota that is used up.
     """
-    return isinstance(error, OSError) and error.errno in FULL
+    return isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS

@@ -37,7 +37,7 @@ def secret_path() -> str:
     return f"/{secrets.token_urlsafe(TOKEN_BYTES)}"
 
 
-def own_hosts(port: int) -> frozenset[str]:
+def allowed_hosts(port: int) -> frozenset[str]:
     """Names under which a page of this machine is asked for; another name that leads here is somebody else's page.
 
     Parameters
@@ -51,7 +51,7 @@ def own_hosts(port: int) -> frozenset[str]:
     return frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
 
 
-def on_a_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
+def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
     """A server on a port, or on the first that is free.
 
     Parameters
@@ -76,7 +76,7 @@ def on_a_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
 
 
 @contextlib.contextmanager
-def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
+def stop_on_signals(end: Callable[[], object]) -> Iterator[None]:
     """Ctrl-C and SIGTERM end a server between two turns of its loop, in the middle of nothing.
 
     Parameters

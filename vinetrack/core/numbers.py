@@ -12,12 +12,12 @@ from typing import Any
 _FIXED_EXPONENTS = (-4, 6)
 """Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
 
-_FINEST_PLACES = 6
+_MAX_FIXED_DECIMALS = 6
 """Decimals beyond which a value and its error share a power of ten. Chosen: six zeros can still be counted."""
 
-_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-_MOST_DECIMALS = 12
+_MAX_DECIMALS = 12
 """Derived: an error below 1e-11 is the rounding of a double of order 1e5."""
 
 
@@ -32,7 +32,7 @@ def decimals(sigma: float) -> int:
     -------
     decimals : int, 0 to 12.
     """
-    return min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS) if 0 < sigma < math.inf else 0
+    return min(max(1 - math.floor(math.log10(sigma)), 0), _MAX_DECIMALS) if 0 < sigma < math.inf else 0
 
 
 def or_nan(value: Any) -> float:
@@ -93,12 +93,12 @@ def with_error(value: float | None, sigma: float | None) -> str:
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return number(value)
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 is written 0.010, and counts as that
-    if places > _FINEST_PLACES:
+    if places > _MAX_FIXED_DECIMALS:
         power = 3 * ((places - 1) // 3)
         shown = max(places - power, 0)
         scaled = value * 10.0**power
         scaled = 0.0 if abs(scaled) < 0.5 * 10.0**-shown else scaled  # no "-0.0"
-        return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{str(power).translate(_RAISED)}"
+        return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{str(power).translate(_SUPERSCRIPTS)}"
     return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"
 
 

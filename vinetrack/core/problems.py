@@ -10,10 +10,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-COMES_CLOSE = 0.6
+CLOSE_NAME_RATIO = 0.6
 """Chosen: part of the letters that two names share from which one may be a slip for the other; difflib's default."""
 
-LONGEST_VALUE = 60
+MAX_QUOTED_LENGTH = 60
 """Of a value quoted in a message; chosen: half a line, as a paragraph pasted in a cell would hide the message."""
 
 
@@ -106,7 +106,7 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     >>> format_problems([Problem(message="is blank", column=f"c{i}") for i in range(4)], limit=3)
     ['error: c0 is blank', 'error: c1 is blank', '… and 2 more (2 errors, 0 warnings)']
     """
-    ordered = sorted(_once(problems), key=lambda problem: problem.severity != "error")
+    ordered = sorted(_merged(problems), key=lambda problem: problem.severity != "error")
     if len(ordered) <= limit:
         return [str(problem) for problem in ordered]
     remaining = ordered[limit - 1 :]
@@ -115,7 +115,7 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     return [*(str(problem) for problem in ordered[: limit - 1]), more]
 
 
-def _once(problems: Iterable[Problem]) -> list[Problem]:
+def _merged(problems: Iterable[Problem]) -> list[Problem]:
     """Problems that differ in trial, line and what was measured alone as one that names the first, counting others."""
     alike: dict[Problem, list[Problem]] = {}
     for problem in problems:
@@ -145,14 +145,14 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
     if not nearest:
         return ""
-    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < COMES_CLOSE:
+    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < CLOSE_NAME_RATIO:
         return f"the nearest are {', '.join(nearest)}; vinetrack settings lists all"
     others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
     return f"did you mean {nearest[0]}?{others}"
 
 
 def _shorten(text: str) -> str:
-    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
+    return text if len(text) <= MAX_QUOTED_LENGTH else text[: MAX_QUOTED_LENGTH - 1] + "…"
 
 
 def _one_line(text: str) -> str:

@@ -25,7 +25,7 @@ FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "correct
 """Every flag a point of a track can carry; several are joined by `;` in this order. `corrected`: a person has moved,
 dropped or confirmed the point. `gap`: frames are missing before it; `retimed`: the times from it on were put right."""
 
-_RETIMED_BEFORE = "gap;corrected"
+_FORMER_RETIMED_FLAGS = "gap;corrected"
 """What releases before `retimed` wrote for `gap;retimed`; `corrected` stands before `gap` since, so that the two can be
 told apart. Read for one release."""
 
@@ -199,7 +199,7 @@ def split_flags(flag: str) -> list[str]:
     >>> split_flags("doubtful;gap;corrected"), split_flags("corrected;gap")
     (['doubtful', 'gap', 'retimed'], ['corrected', 'gap'])
     """
-    return [part for part in flag.replace(_RETIMED_BEFORE, "gap;retimed").split(";") if part]
+    return [part for part in flag.replace(_FORMER_RETIMED_FLAGS, "gap;retimed").split(";") if part]
 
 
 def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:

@@ -23,22 +23,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.files import absence, file_size
+from vinetrack.core.files import file_size, missing_file_message
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-LARGEST_TABLE_BYTES = 200_000_000
+MAX_TABLE_BYTES = 200_000_000
 """Beyond this a file is no table: probably a recording named in the wrong column. Chosen: an hour of positions at 1000
 frames a second takes 150 MB. At half such a file is refused, at twice a recording takes memory first."""
 
 STANDARD_OUTPUT = Path("-")  # convention of commands: a file of this name is the terminal
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
+_AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
 """1,069 or 1.069: a decimal mark or a thousands separator, depending on the country."""
-_PLAIN_COLUMN = re.compile(r"[0-9eE+.\n-]*")
+_PLAIN_NUMBERS = re.compile(r"[0-9eE+.\n-]*")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
 
@@ -84,7 +84,7 @@ class Table:
         # Plain numbers, the usual case, are read 10 times faster without looking at each cell.
         joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
         unambiguous = self.decimal == "." or (self.decimal == "," and not any("." in cell for cell in cells))
-        if unambiguous and _PLAIN_COLUMN.fullmatch(joined):
+        if unambiguous and _PLAIN_NUMBERS.fullmatch(joined):
             with contextlib.suppress(ValueError):
                 values = np.array([float(cell) for cell in joined.split("\n")], dtype=float)
                 if len(values) == len(cells) and np.all(np.isfinite(values)):
@@ -129,7 +129,7 @@ def parse_number(text: str, decimal: str = ".") -> float:
     if not _NUMBER.fullmatch(text):
         raise TableError("is not a number: write digits only, without unit or separators")
     mark = "," if "," in text else "."
-    if _GROUPED.fullmatch(text) and mark != decimal:
+    if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
         joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
         mended = f"{pointed}0 or {joined}"
         raise TableError(f"may be thousands or decimals: write {mended}, whichever is meant")
@@ -168,7 +168,7 @@ def decode_text(data: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Decoded text of a file of at most `LARGEST_TABLE_BYTES`.
+    """Decoded text of a file of at most `MAX_TABLE_BYTES`.
 
     Parameters
     ----------
@@ -184,11 +184,11 @@ def read_text(path: Path) -> str:
         If there is no such file, it cannot be opened, is too large or is not text.
     """
     try:
-        if file_size(path) > LARGEST_TABLE_BYTES:
+        if file_size(path) > MAX_TABLE_BYTES:
             raise TableError("is too large to be a table: is it a recording?")
         return decode_text(path.read_bytes())
     except FileNotFoundError:
-        raise TableError(": ".join(absence(path))) from None
+        raise TableError(": ".join(missing_file_message(path))) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it cannot be opened"
         raise TableError(f"cannot be read: {reason}") from None
@@ -291,7 +291,7 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
     doubtful: set[str] = set()
     for cell in cells:
         if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
-            (doubtful if _GROUPED.fullmatch(cell) else marks).add("," if "," in cell else ".")
+            (doubtful if _AMBIGUOUS_NUMBER.fullmatch(cell) else marks).add("," if "," in cell else ".")
     if not marks and delimiter == ";":
         marks = doubtful
     if len(marks) == 2:

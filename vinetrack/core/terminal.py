@@ -17,18 +17,18 @@ from typing import Any, Generic, TextIO, TypeVar
 
 Item = TypeVar("Item")
 
-SHOWS_AFTER_S = 0.5
+PROGRESS_DELAY_S = 0.5
 """Chosen: work done within half a second needs no bar; work of two seconds shows one for most of its time."""
 
-GAP = "  "
-CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
-SEVERITIES = {"error": "red", "warning": "yellow"}
+COLUMN_GAP = "  "
+STYLE_CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
+SEVERITY_COLOURS = {"error": "red", "warning": "yellow"}
 
-_STYLED = re.compile(r"\x1b\[[0-9;]*m")
+_ESCAPE_CODE = re.compile(r"\x1b\[[0-9;]*m")
 _NUMBER = re.compile(
     r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
 )
-_NOTHING = frozenset({"", "–", "-", "—", "nan", "open"})
+_NO_VALUE = frozenset({"", "–", "-", "—", "nan", "open"})
 
 
 def colour_wanted(stream: TextIO | None = None) -> bool:
@@ -49,12 +49,12 @@ def colour_wanted(stream: TextIO | None = None) -> bool:
 
 
 def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
-    """The text in these styles (see `CODES`) where the stream wants colour, else as it is.
+    """The text in these styles (see `STYLE_CODES`) where the stream wants colour, else as it is.
 
     Parameters
     ----------
     text : what is printed.
-    *styles : keys of `CODES`.
+    *styles : keys of `STYLE_CODES`.
     stream : where it is printed; standard output if None.
 
     Returns
@@ -63,7 +63,7 @@ def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
     """
     if not styles or not text or not colour_wanted(stream):
         return text
-    return f"\x1b[{';'.join(CODES[style] for style in styles)}m{text}\x1b[0m"
+    return f"\x1b[{';'.join(STYLE_CODES[style] for style in styles)}m{text}\x1b[0m"
 
 
 def severity_first(line: str, stream: TextIO | None = None) -> str:
@@ -79,7 +79,11 @@ def severity_first(line: str, stream: TextIO | None = None) -> str:
     the line.
     """
     word, colon, message = line.partition(":")
-    return styled(word, SEVERITIES[word], "bold", stream=stream) + colon + message if word in SEVERITIES else line
+    return (
+        styled(word, SEVERITY_COLOURS[word], "bold", stream=stream) + colon + message
+        if word in SEVERITY_COLOURS
+        else line
+    )
 
 
 def width(text: str) -> int:
@@ -93,7 +97,7 @@ def width(text: str) -> int:
     -------
     columns.
     """
-    plain = _STYLED.sub("", text)
+    plain = _ESCAPE_CODE.sub("", text)
     return sum(
         0 if unicodedata.combining(char) else 2 if unicodedata.east_asian_width(char) in "WF" else 1 for char in plain
     )
@@ -134,7 +138,7 @@ def table(
         ">" if _is_numeric([line[k] for line in lines[len(above) :]]) else "<" for k in range(count)
     )
     widths = [max(width(line[k]) for line in lines) for k in range(count)]
-    return [(indent + GAP.join(map(_padded, line, widths, sides))).rstrip() for line in lines]
+    return [(indent + COLUMN_GAP.join(map(_padded, line, widths, sides))).rstrip() for line in lines]
 
 
 def _padded(cell: str, columns: int, side: str) -> str:
@@ -144,7 +148,7 @@ def _padded(cell: str, columns: int, side: str) -> str:
 
 def _is_numeric(cells: Sequence[str]) -> bool:
     """Whether a column holds numbers, or marks where there is none."""
-    known = [cell for cell in (_STYLED.sub("", cell).strip() for cell in cells) if cell not in _NOTHING]
+    known = [cell for cell in (_ESCAPE_CODE.sub("", cell).strip() for cell in cells) if cell not in _NO_VALUE]
     return bool(known) and all(_NUMBER.fullmatch(cell) for cell in known)
 
 
@@ -160,7 +164,7 @@ class Progress(Generic[Item]):
             total=total,
             desc=description,
             unit=unit,
-            delay=SHOWS_AFTER_S,
+            delay=PROGRESS_DELAY_S,
             disable=not sys.stderr.isatty(),
             dynamic_ncols=True,
             leave=False,
@@ -270,8 +274,8 @@ class waiting:  # noqa: N801 - used as a context, like a function
         while not self._done.wait(self.STEP_S):
             turns += 1
             gone_s = turns * self.STEP_S
-            if gone_s >= SHOWS_AFTER_S:
+            if gone_s >= PROGRESS_DELAY_S:
                 sign = self.SIGNS[turns % len(self.SIGNS)]
                 print(f"\r{sign} {self.description} … {gone_s:.0f} s", end="", file=sys.stderr, flush=True)
-        if turns * self.STEP_S >= SHOWS_AFTER_S:
+        if turns * self.STEP_S >= PROGRESS_DELAY_S:
             print("\r\x1b[2K", end="", file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ import yaml
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, read_text
 
-MOST_KEYS = 10_000
+MAX_KEYS = 10_000
 """Keys of a document at most. Chosen: fifty times what an experiment of 200 trials needs; half or twice changes
 nothing but how soon a hostile file is refused."""
 
@@ -115,7 +115,7 @@ def _walk(
 ) -> None:
     """Note the line of every key below a node, and every key that is written twice."""
     # Aliases of aliases can stand for more keys than memory holds; no settings come near either limit.
-    if len(path) > 20 or len(lines) > MOST_KEYS:
+    if len(path) > 20 or len(lines) > MAX_KEYS:
         raise ValueError("too large")
     if isinstance(node, yaml.MappingNode):
         for key_node, value_node in node.value:
@@ -180,11 +180,11 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
     else:
         begin, end = node.start_mark.index, node.end_mark.index
         changed = text[:begin] + (" " if begin == end else "") + flow + text[end:]
-    refuse_harm(changed, {**before, key: list(values)}, key, flow, file)
+    verify_edit(changed, {**before, key: list(values)}, key, flow, file)
     return changed
 
 
-def refuse_harm(changed: str, expected: dict[Any, Any], key: str, shown: str, file: str) -> None:
+def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, file: str) -> None:
     """Make sure that a text in which a key was set holds what it should and nothing else has changed.
 
     Parameters

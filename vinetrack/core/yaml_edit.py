@@ -10,10 +10,10 @@ from typing import Any
 import yaml
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.core.yaml_document import parse_yaml, refuse_harm, top_level_value
+from vinetrack.core.yaml_document import parse_yaml, top_level_value, verify_edit
 
-_PLAIN_WORD = re.compile(r"[A-Za-z_./][\w./ -]*")
-_SPECIAL = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
+_PLAIN_TEXT = re.compile(r"[A-Za-z_./][\w./ -]*")
+_YAML_WORDS = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
 _Edit = tuple[int, int, str]
 """Text to put in place of that between two indices."""
 
@@ -56,7 +56,7 @@ def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -
         changed = text
         for begin, end, new in sorted(_edits(text, node, value), reverse=True):
             changed = changed[:begin] + new + changed[end:]
-    refuse_harm(changed, {**before, key: _plain(value)}, key, _inline(value), file)
+    verify_edit(changed, {**before, key: _plain(value)}, key, _inline(value), file)
     return changed
 
 
@@ -148,7 +148,7 @@ def _inline(value: Any) -> str:
     if isinstance(value, int | float):
         return f"{value:.15g}"
     text = "" if value is None else str(value)
-    plain = _PLAIN_WORD.fullmatch(text) and text.strip() == text and text.lower() not in _SPECIAL
+    plain = _PLAIN_TEXT.fullmatch(text) and text.strip() == text and text.lower() not in _YAML_WORDS
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 

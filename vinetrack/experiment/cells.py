@@ -17,15 +17,15 @@ from vinetrack.experiment.column import Column
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
-LEAST_AXIS_PX = 10
+SHORTEST_AXIS_PX = 10
 """Chosen: a shorter axis has no direction to speak of: ends picked by hand, off by half a pixel each, turn this one by
 4 degrees. At half, by 8; at twice, by 2, but growth over 15 px is refused."""
-LEAST_APART_PX = 2
+SMALLEST_POINT_SPACING_PX = 2
 """Least distance between neighbouring points of a path that bends. Chosen: a point picked by hand is off by half a
 pixel, so that nearer ones tell no direction. At half, a double click makes a kink; at twice, dense curves of programs
 are refused."""
 
-YES_NO = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
+TRUTH_WORDS = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
 
 class CellError(ValueError):
@@ -66,9 +66,9 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
     is above 1000 kPa | looks like Pa: 24000 Pa is 24 kPa
     """
     if column.kind == "yes_no":
-        if text.lower() not in YES_NO:
+        if text.lower() not in TRUTH_WORDS:
             raise CellError("is neither yes nor no", "yes or no")
-        return YES_NO[text.lower()]
+        return TRUTH_WORDS[text.lower()]
     if column.kind == "window":
         return _read_window(text, decimal)
     if column.kind == "bends":
@@ -108,7 +108,7 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def steps_between(low: float, high: float) -> list[float]:
+def interior_values(low: float, high: float) -> list[float]:
     """Return three values between two others, in equal ratios where both are positive.
 
     Parameters
@@ -185,14 +185,14 @@ def _check_number(column: Column, value: float) -> float:
         if value not in (column.low, column.high):
             raise CellError("is not a travel ratio", "2 for eversion, 1 for a body that moves as a whole")
     elif value > column.high:
-        raise CellError(f"is above {column.high:g} {column.unit}", column.allowed, _slip(column, value))
+        raise CellError(f"is above {column.high:g} {column.unit}", column.allowed, _likely_unit(column, value))
     elif value < column.low or (column.above_low and value == column.low):
         relation = "is not above" if column.above_low else "is below"
-        raise CellError(f"{relation} {column.low:g} {column.unit}".strip(), column.allowed, _slip(column, value))
+        raise CellError(f"{relation} {column.low:g} {column.unit}".strip(), column.allowed, _likely_unit(column, value))
     return value
 
 
-def oddity(column: Column, value: float) -> str:
+def unusual_value_hint(column: Column, value: float) -> str:
     """Why a legal value is suspicious, or blank. Zero never is: it is written on purpose.
 
     Parameters
@@ -207,7 +207,7 @@ def oddity(column: Column, value: float) -> str:
     return "" if value == 0 or column.usual[0] <= value <= column.usual[1] else column.unusual_hint
 
 
-def _slip(column: Column, value: float) -> str:
+def _likely_unit(column: Column, value: float) -> str:
     """The unit that was probably meant, where the value is allowed in it."""
     unit_of_column = column.unit_key or split_unit(column.name)[1]
     for key in column.slips:
@@ -250,10 +250,10 @@ def _read_axis(text: str) -> PictureAxis:
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
         raise CellError("is no axis", allowed)
     points = [(_number(x, ".", allowed), _number(y, ".", allowed)) for x, y in (point.split(",") for point in written)]
-    if sum(math.dist(*pair) for pair in pairwise(points)) < LEAST_AXIS_PX:
-        raise CellError(f"is shorter than {LEAST_AXIS_PX} pixels", allowed, "give two points far apart")
-    if len(points) > 2 and min(math.dist(*pair) for pair in pairwise(points)) < LEAST_APART_PX:
-        message = f"has neighbouring points less than {LEAST_APART_PX} pixels apart"
+    if sum(math.dist(*pair) for pair in pairwise(points)) < SHORTEST_AXIS_PX:
+        raise CellError(f"is shorter than {SHORTEST_AXIS_PX} pixels", allowed, "give two points far apart")
+    if len(points) > 2 and min(math.dist(*pair) for pair in pairwise(points)) < SMALLEST_POINT_SPACING_PX:
+        message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
         raise CellError(message, allowed, "leave out the second of the two")
     if len(parts) > len(written):
         width = _number(parts[-1], ".", allowed) / 1000

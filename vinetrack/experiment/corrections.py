@@ -17,8 +17,8 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import CORRECTION_ACTIONS, Correction
 from vinetrack.core.tables import Table, TableError, parse_number, read_table
 
-CORRECTIONS = "corrections.csv"
-COLUMNS_OF_CORRECTIONS = ("trial", "frame", "action", "edge_px")
+CORRECTIONS_FILE = "corrections.csv"
+CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
 
 
 def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
@@ -32,17 +32,17 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     -------
     corrections, problems : both empty where there is no such file.
     """
-    path = folder / CORRECTIONS
+    path = folder / CORRECTIONS_FILE
     if not os.path.lexists(path):
         return {}, []
     try:
         table = read_table(path)
     except TableError as error:
-        return {}, [Problem.from_error(error, CORRECTIONS)]
-    missing = [name for name in COLUMNS_OF_CORRECTIONS if name not in table.columns]
+        return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
+    missing = [name for name in CORRECTION_COLUMNS if name not in table.columns]
     if missing:
-        remedy = f"its columns are {', '.join(COLUMNS_OF_CORRECTIONS)}"
-        return {}, [Problem(message="is missing", file=CORRECTIONS, column=missing[0], remedy=remedy)]
+        remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
+        return {}, [Problem(message="is missing", file=CORRECTIONS_FILE, column=missing[0], remedy=remedy)]
     by_trial: dict[str, dict[int, Correction]] = {}
     problems: list[Problem] = []
     for i, row in enumerate(table.rows):
@@ -85,7 +85,7 @@ def _problem(table: Table, index: int, column: str, message: str, remedy: str) -
     row = table.rows[index]
     return Problem(
         message=message,
-        file=CORRECTIONS,
+        file=CORRECTIONS_FILE,
         line=table.lines[index],
         trial=row["trial"],
         column=column,
@@ -94,7 +94,9 @@ def _problem(table: Table, index: int, column: str, message: str, remedy: str) -
     )
 
 
-def strangers(corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]) -> list[Problem]:
+def unmatched_corrections(
+    corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]
+) -> list[Problem]:
     """A warning for every trial that corrections name and that is not in the sheet, or is no recording.
 
     Parameters
@@ -111,7 +113,7 @@ def strangers(corrections: Mapping[str, object], names: Iterable[str], filmed: I
     return [
         Problem(
             message="is no recording, and its corrections are ignored" if trial in known else "is not in the sheet",
-            file=CORRECTIONS,
+            file=CORRECTIONS_FILE,
             column="trial",
             value=trial,
             severity="warning",
@@ -134,7 +136,7 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS_OF_CORRECTIONS)
+    writer.writerow(CORRECTION_COLUMNS)
     for trial, of_trial in corrections.items():
         for correction in of_trial:
             place = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.files import absence, file_size
-from vinetrack.core.problems import COMES_CLOSE, ExperimentError, Problem, format_problems
+from vinetrack.core.files import file_size, missing_file_message
+from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem, format_problems
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
-from vinetrack.experiment.cells import oddity
-from vinetrack.experiment.corrections import read_corrections, strangers
+from vinetrack.experiment.cells import unusual_value_hint
+from vinetrack.experiment.corrections import read_corrections, unmatched_corrections
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.other_units import in_sheet_units, keys_in_other_units
 from vinetrack.experiment.schema import COLUMNS, SHARED
@@ -28,9 +28,9 @@ from vinetrack.experiment.settings import ExperimentSettings, read_experiment_se
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
+    check_pressures,
+    check_row,
     find_missing,
-    judge_pressures,
-    judge_row,
     make_trial,
     read_row,
     unknown_columns,
@@ -41,7 +41,7 @@ from vinetrack.tracks.importers import TrackError, load_track, read_pressure_tra
 __all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
 
 SETTINGS = "experiment.yaml"
-EXPECTED = (
+EXPECTED_FOLDER = (
     f"expected a folder with {SHEET} (one row a trial) and, with videos, {SETTINGS}; vinetrack setup FOLDER makes both "
     "of a folder of recordings"
 )
@@ -136,19 +136,21 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     absent: set[str] = set()
     for row in rows:
         if row.in_use:
-            judge_row(row, folder)
+            check_row(row, folder)
             # Without the shared settings nobody knows what is missing.
             absent |= find_missing(row, folder, table.columns) if table and settings else set()
-    problems += _compare_names(rows)
+    problems += _name_problems(rows)
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
     corrections, faults = read_corrections(folder)
     problems += faults
-    problems += strangers(corrections, [row.name for row in rows], [row.name for row in rows if "video" in row.values])
+    problems += unmatched_corrections(
+        corrections, [row.name for row in rows], [row.name for row in rows if "video" in row.values]
+    )
     sheet_is_sound = not any(problem.severity == "error" for problem in problems)
     for row in rows:
         if sheet_is_sound and row.in_use and not row.failed:
             _take_pressure_from_recording(row, folder)
-            judge_pressures(row)
+            check_pressures(row)
     problems += _merge_warnings(problem for row in rows for problem in row.problems)
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
@@ -201,7 +203,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
             problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
-        if COLUMNS[name].kind == "number" and value is not None and (hint := oddity(COLUMNS[name], value)):
+        if COLUMNS[name].kind == "number" and value is not None and (hint := unusual_value_hint(COLUMNS[name], value)):
             place: dict[str, Any] = {"file": SETTINGS, "column": name, "value": f"{value:g}"}
             problems.append(Problem(message=f"is unusual: {hint}", severity="warning", **place))
     return settings
@@ -218,7 +220,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
     """The sheet as a table, or None; notes columns that are missing or not known."""
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
-        problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED))
+        problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED_FOLDER))
         return None
     if not os.path.lexists(folder / SHEET):
         problems.append(Problem(message="is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
@@ -244,7 +246,7 @@ def _missing_sheet_remedy(folder: Path) -> str:
         return f"save {close[0]} as {SHEET}"
     if close:
         return f"rename {close[0]} to {SHEET}"
-    return EXPECTED if names else f"the folder is empty; {EXPECTED}"
+    return EXPECTED_FOLDER if names else f"the folder is empty; {EXPECTED_FOLDER}"
 
 
 def _judge_columns(table: Table) -> list[Problem]:
@@ -267,7 +269,7 @@ def _absent_column(name: str) -> Problem:
     return Problem(message="is missing", file=SHEET, column=name, remedy=remedy)
 
 
-def _compare_names(rows: list[Row]) -> list[Problem]:
+def _name_problems(rows: list[Row]) -> list[Problem]:
     """Names used twice (errors) and names that differ in case alone, which some file systems take for one."""
     problems, seen = [], dict[str, Row]()
     for row in rows:
@@ -322,10 +324,10 @@ def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
     ]
 
 
-Survey = Callable[[Experiment, list[Trial]], Iterable[Problem]]
+OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
 
-def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> list[Problem]:
+def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = None) -> list[Problem]:
     """Every problem of an experiment that can be found in seconds: sheet, settings, tracks, and that videos exist.
 
     `open_videos` may look into the recordings that are there, and the calibration; see `vinetrack.video.survey`.
@@ -346,7 +348,7 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
     problems = list(experiment.problems)
     for key, relative in _settings_paths(experiment.settings):
         if not safe_join(experiment.folder, relative).exists():
-            message, remedy = absence(safe_join(experiment.folder, relative))
+            message, remedy = missing_file_message(safe_join(experiment.folder, relative))
             problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
     problems += order_problems(experiment.trials, SHEET)
     of_trials: list[Problem] = []
@@ -359,10 +361,10 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
             there.append(trial)
     if there and open_videos is not None:
         of_trials += open_videos(experiment, there)
-    return problems + [_placed(problem, experiment) for problem in of_trials]
+    return problems + [_with_location(problem, experiment) for problem in of_trials]
 
 
-def _placed(problem: Problem, experiment: Experiment) -> Problem:
+def _with_location(problem: Problem, experiment: Experiment) -> Problem:
     """A problem of a trial with its place: the line of the sheet, or the settings where those alone state the value."""
     if not problem.trial:
         return problem
@@ -410,7 +412,7 @@ def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
         if file_size(path) == 0:
             return [Problem(message="is an empty file", remedy="copy it anew", **place)]
     except (FileNotFoundError, ValueError):
-        message, remedy = absence(path)
+        message, remedy = missing_file_message(path)
         remedy = remedy if path.is_symlink() else _nearest_file(path, used)
         return [Problem(message=message, remedy=remedy, **place)]
     except OSError as error:
@@ -424,7 +426,7 @@ def _nearest_file(path: Path, used: Set[Path]) -> str:
         names = sorted(entry.name for entry in path.parent.iterdir() if entry not in used)
     except (OSError, ValueError):
         names = []
-    close = difflib.get_close_matches(path.name.lower(), [name.lower() for name in names], 1, COMES_CLOSE)
+    close = difflib.get_close_matches(path.name.lower(), [name.lower() for name in names], 1, CLOSE_NAME_RATIO)
     if not close:
         return "check the path and its upper and lower case"
     return f"did you mean {next(name for name in names if name.lower() == close[0])}?"

@@ -28,7 +28,7 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     -------
     the trials, in the same order.
     """
-    shown = [further for further in _FURTHER if len({further(trial) for trial in trials}) > 1]
+    shown = [further for further in _OPTIONAL_PARTS if len({further(trial) for trial in trials}) > 1]
     yields: dict[str, set[str]] = {}
     for trial in trials:
         yields.setdefault(_vine(trial), set()).add(_yield_pressure(trial))
@@ -68,7 +68,7 @@ def _bends(trial: Trial) -> str:
     return f"bends{'-'.join(bends)}" if trial.bends else ""
 
 
-_FURTHER: tuple[Callable[[Trial], str], ...] = (
+_OPTIONAL_PARTS: tuple[Callable[[Trial], str], ...] = (
     lambda trial: f"{_digits(math.degrees(trial.growth_angle_rad))}deg",
     lambda trial: f"chamber{_digits(trial.chamber_m3 * 1000)}l" if math.isfinite(trial.chamber_m3) else "",
     lambda trial: f"inlet{_digits(trial.inlet_m * 1000)}mm" if math.isfinite(trial.inlet_m) else "",

@@ -21,20 +21,20 @@ from vinetrack.experiment.settings import ExperimentSettings, read_experiment_se
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
-    judge_pressures,
-    judge_wall,
+    check_pressures,
+    check_wall,
     make_trial,
     read_row,
     unknown_columns,
 )
 
-NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
+REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 """What must be known of a vine before anything can be said of it; its yield pressure can be guessed."""
 
-_RECORDED = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
+_RECORDING_COLUMNS = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
 """Columns about recordings, which a trial that is only planned may lack or have."""
 
-Shown = Callable[[Problem], Problem]
+Relocate = Callable[[Problem], Problem]
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class PlannedTrials:
 
 
 def planned_trial(
-    values: Mapping[str, str], settings: ExperimentSettings | None = None, needed: Sequence[str] = NEEDED
+    values: Mapping[str, str],
+    settings: ExperimentSettings | None = None,
+    needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
 ) -> PlannedTrials:
     """A trial from texts by name of column, as they come from the command line.
 
@@ -82,7 +84,7 @@ def planned_trial(
     settings = settings or ExperimentSettings()
     cells = {"trial": "planned", **{name: text.strip() for name, text in values.items()}}
     table = Table(tuple(cells), (cells,), (0,), ((),), ",", ".")
-    return _assembled(table, settings, None, needed, shown)
+    return _planned_trials(table, settings, None, needed, shown)
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
@@ -116,15 +118,15 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     settings = read_experiment_settings(file.parent / "experiment.yaml")
     if not table.rows:
         raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
-    header = [*converted, *_judge_header(table, settings, file.name)]
+    header = [*converted, *_check_header(table, settings, file.name)]
 
     def shown(problem: Problem) -> Problem:
         return replace(problem, file=file.name)
 
-    return _assembled(table, settings, file.parent, NEEDED, shown, header, every_row=every_row)
+    return _planned_trials(table, settings, file.parent, REQUIRED_FOR_PREDICTION, shown, header, every_row=every_row)
 
 
-def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
+def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
     """Warnings about columns that no sheet has.
 
     Raises
@@ -135,12 +137,12 @@ def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list
     unknown = unknown_columns(table, file)
     absent = [
         name
-        for name in NEEDED
+        for name in REQUIRED_FOR_PREDICTION
         if name not in table.columns and not (name in SHARED and getattr(settings, name) is not None)
     ]
     if absent:
         message = f"has no column {', '.join(absent)}"
-        if len(absent) == len(NEEDED):
+        if len(absent) == len(REQUIRED_FOR_PREDICTION):
             raise ExperimentError([Problem(message=message, file=file, remedy="give a trial sheet, one row a trial")])
         raise ExperimentError([Problem(message=message, file=file, remedy="add what is missing"), *unknown])
     return unknown
@@ -155,12 +157,12 @@ def _nearest(file: Path) -> str:
     return f"did you mean {close[0]}?" if close else ""
 
 
-def _assembled(
+def _planned_trials(
     table: Table,
     settings: ExperimentSettings,
     folder: Path | None,
     needed: Sequence[str],
-    shown: Shown,
+    shown: Relocate,
     header: Sequence[Problem] = (),
     *,
     every_row: bool = False,
@@ -168,18 +170,18 @@ def _assembled(
     """Read, judge and name the rows; refuse them all if one has a fault."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     for row in rows:
-        _judge(row, needed)
-    of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDED)
+        _check_row(row, needed)
+    of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDING_COLUMNS)
     problems = [*header, *of_rows]
     if any(problem.severity == "error" for problem in problems) or not rows:
         nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
         raise ExperimentError([*problems, *nothing])
     trials = with_names([_trial(row, settings) for row in rows])
     kept = tuple(trials) if every_row else _one_a_condition(trials)
-    return PlannedTrials(kept, settings, folder, tuple(_once(problems)))
+    return PlannedTrials(kept, settings, folder, tuple(_without_repeats(problems)))
 
 
-def _judge(row: Row, needed: Sequence[str]) -> None:
+def _check_row(row: Row, needed: Sequence[str]) -> None:
     broken = {problem.column for problem in row.problems}
     for name in needed:
         if name not in row.values and name not in broken:
@@ -188,13 +190,13 @@ def _judge(row: Row, needed: Sequence[str]) -> None:
             )
     if row.travel_ratio != 2:
         row.add("is that of a body that moves as a whole", "travel_ratio", remedy="only everting vines are predicted")
-    judge_wall(row)
-    judge_pressures(row)
+    check_wall(row)
+    check_pressures(row)
 
 
 def _trial(row: Row, settings: ExperimentSettings) -> Trial:
     """The trial of a row, without its recording; NaN where the yield pressure is not given."""
-    kept = {name: value for name, value in row.values.items() if name not in _RECORDED}
+    kept = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
     trial = make_trial(replace(row, values=kept), Path(), settings)
     fps = row.values.get("capture_fps", math.nan)
     trial = replace(trial, capture_fps=float(fps))
@@ -210,7 +212,7 @@ def _one_a_condition(trials: Iterable[Trial]) -> tuple[Trial, ...]:
     return tuple(first.values())
 
 
-def _once(problems: Iterable[Problem]) -> list[Problem]:
+def _without_repeats(problems: Iterable[Problem]) -> list[Problem]:
     """The same warning about the same value in many rows is said once."""
     first: dict[object, Problem] = {}
     for problem in problems:

@@ -28,7 +28,7 @@ from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
-from vinetrack.experiment.cells import LEAST_APART_PX, read_limit, read_range, read_value, steps_between
+from vinetrack.experiment.cells import SMALLEST_POINT_SPACING_PX, interior_values, read_limit, read_range, read_value
 from vinetrack.experiment.other_units import in_key_units
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 
@@ -70,8 +70,10 @@ class AxisSettings(_Strict):
     @model_validator(mode="after")
     def _has_a_direction(self) -> AxisSettings:
         through = (self.from_px, *(self.via_px or ()), self.to_px)
-        if self.via_px and any(math.dist(a, b) < LEAST_APART_PX for a, b in pairwise(through)):
-            raise ValueError(f"neighbouring points are less than {LEAST_APART_PX} pixels apart: leave out the second")
+        if self.via_px and any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
+            raise ValueError(
+                f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart: leave out the second"
+            )
         if not self.via_px and self.from_px == self.to_px:
             raise ValueError("from_px and to_px are the same point: name two")
         return self
@@ -161,7 +163,7 @@ class Limits(_LimitedColumns):
         column = COLUMNS[info.field_name]
         if isinstance(value, str) and ":" in value:
             low, high = read_range(column, value)
-            return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps_between(low, high)), high}))
+            return tuple(sorted({low, *(float(f"{step:.3g}") for step in interior_values(low, high)), high}))
         if isinstance(value, list | tuple):
             if not value:
                 raise ValueError("is empty: name at least one value, or remove the key")

@@ -14,25 +14,25 @@ from typing import Any
 from vinetrack.core.problems import Problem, did_you_mean
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
-from vinetrack.experiment.cells import CellError, oddity, read_cell
+from vinetrack.experiment.cells import CellError, read_cell, unusual_value_hint
 from vinetrack.experiment.column import Column
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
-LONGEST_NAME = 100
+MAX_NAME_LENGTH = 100
 """Longer trial names leave no room for suffixes within the 255 bytes a file name may have. Chosen: 155 bytes remain
 for suffixes; at twice 55 remain, at half names that people write are refused."""
 
-NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
+REQUIRED_COLUMNS = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
 """What a trial of an everting vine must have; a body that moves as a whole needs its diameter only."""
 
-PRESSURE_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
+PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
 """Errors where the sheet states none, part of the contract: 1 % of the pressure, and 0.2 kPa for the yield pressure.
 Chosen: a usual gauge is of class 1, and a yield pressure is read off a slowly rising one. At half or twice the errors
 of forces near the yield pressure halve or double where the sheet states none."""
 
-STATE_THEIR_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})
+SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})
 """Endings of files that carry the rate of capture."""
 
 RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
@@ -91,7 +91,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     """
     cells, line = table.rows[index], table.lines[index]
     row = Row(cells.get("trial", f"line-{line}"), line)
-    _judge_name(row)
+    _check_name(row)
     for name, column in COLUMNS.items():
         text = cells.get(name, "")
         if text == "":
@@ -103,7 +103,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         except CellError as error:
             row.add(error.message, name, value=text, allowed=error.allowed, remedy=error.remedy)
             continue
-        if column.kind == "number" and (hint := oddity(column, row.values[name])):
+        if column.kind == "number" and (hint := unusual_value_hint(column, row.values[name])):
             row.add(f"is unusual: {hint}", name, "warning", value=text)
     if table.extra[index]:
         remedy = "put decimal commas and text with separators in quotes"
@@ -135,21 +135,21 @@ def unknown_columns(table: Table, file: str) -> list[Problem]:
     return problems
 
 
-def _judge_name(row: Row) -> None:
+def _check_name(row: Row) -> None:
     """Give a row without a usable name one that can stand in files and messages."""
     allowed = "letters, digits, _ and -"
     given = row.name
-    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII) and len(given) <= LONGEST_NAME:
+    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII) and len(given) <= MAX_NAME_LENGTH:
         return
     row.name = f"line-{row.line}"
-    message = "is blank" if not given else "is too long" if len(given) > LONGEST_NAME else "is no name for a trial"
+    message = "is blank" if not given else "is too long" if len(given) > MAX_NAME_LENGTH else "is no name for a trial"
     if given.startswith("-"):
         message = "begins with a hyphen, as options of commands do"
-    remedy = f"at most {LONGEST_NAME} characters, no blanks or dots; it names files"
+    remedy = f"at most {MAX_NAME_LENGTH} characters, no blanks or dots; it names files"
     row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
 
 
-def judge_row(row: Row, folder: Path) -> None:
+def check_row(row: Row, folder: Path) -> None:
     """Judge a row as a whole: paths that lead out, and values that contradict each other.
 
     Parameters
@@ -157,8 +157,8 @@ def judge_row(row: Row, folder: Path) -> None:
     row : its problems are noted in it.
     folder : of the experiment, which paths must not leave.
     """
-    _judge_paths(row, folder)
-    judge_wall(row)
+    _check_paths(row, folder)
+    check_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
     # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist, and a frame and
     # a half is no rounding.
@@ -191,7 +191,7 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     absent: set[str] = set()
     if "travel_ratio" in broken:
         return absent
-    needed = [name for name in _needed(row, folder) if name not in row.values and name not in broken]
+    needed = [name for name in _required_columns(row, folder) if name not in row.values and name not in broken]
     for name in needed:
         if name in columns:
             remedy = RATE_REMEDY if name == "capture_fps" else "fill it in"
@@ -201,9 +201,9 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     return absent
 
 
-def _needed(row: Row, folder: Path) -> list[str]:
+def _required_columns(row: Row, folder: Path) -> list[str]:
     """Columns that a row with this travel ratio and these recordings cannot do without."""
-    needed = list(NEEDED if row.travel_ratio == 2 else NEEDED[:1])
+    needed = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
     if "pressure_kPa" in needed and ("pressure_trace" in row.values or "track" in row.values):
         needed.remove("pressure_kPa")
     if "video" in row.values and "track" not in row.values and not _states_its_rate(folder, row.values["video"]):
@@ -211,7 +211,7 @@ def _needed(row: Row, folder: Path) -> list[str]:
     return needed
 
 
-def _judge_paths(row: Row, folder: Path) -> None:
+def _check_paths(row: Row, folder: Path) -> None:
     """Exactly one recording, and no path that leaves the folder."""
     for name in ("video", "track", "pressure_trace"):
         if name in row.values:
@@ -231,12 +231,12 @@ def _states_its_rate(folder: Path, video: str) -> bool:
     try:
         path = safe_join(folder, video)
         files = path.iterdir() if path.is_dir() else [path, path.with_suffix(".cih"), path.with_suffix(".cihx")]
-        return any(file.suffix.lower() in STATE_THEIR_RATE and file.exists() for file in files)
+        return any(file.suffix.lower() in SUFFIXES_WITH_RATE and file.exists() for file in files)
     except (TableError, OSError, ValueError):
         return False
 
 
-def judge_wall(row: Row) -> None:
+def check_wall(row: Row) -> None:
     """Refuse a wall that no tube of this diameter can have.
 
     Parameters
@@ -250,7 +250,7 @@ def judge_wall(row: Row) -> None:
         row.add(message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
 
 
-def judge_pressures(row: Row) -> None:
+def check_pressures(row: Row) -> None:
     """Warn of pressures that are legal but hardly meant.
 
     Parameters
@@ -291,7 +291,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
     """
     values: dict[str, Any] = dict(row.values)
     pressure_kPa = values.setdefault("pressure_kPa", 0.0)
-    values.setdefault("pressure_sigma_kPa", PRESSURE_SIGMA * pressure_kPa)
+    values.setdefault("pressure_sigma_kPa", PRESSURE_REL_SIGMA * pressure_kPa)
     values.setdefault("yield_pressure_kPa", 0.0)
     values.setdefault("yield_pressure_sigma_kPa", YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0)
     values["trial"] = row.name

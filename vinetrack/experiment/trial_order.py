@@ -15,11 +15,11 @@ import numpy as np
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import Floats, Trial
 
-FOLLOWS_PRESSURE = 0.7
+CONFOUNDING_CORRELATION = 0.7
 """Rank correlation from which the order counts as following the pressure. Derived: a drift fitted beside an effect of
 pressure has its variance multiplied by 1/(1 − r²), and 1/(1 − 0.7²) = 2: half of the information is gone."""
 
-FEWEST_RANKED = 8
+FEWEST_TRIALS = 8
 """Trials from which the correlation is asked. Derived: in random order |r| of 8 passes 0.7 by chance in 5 %."""
 
 REMEDY = "make trials in random order, or repeat six of them in random order, and number them in the column order"
@@ -43,7 +43,7 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     return ranks.astype(float), stated
 
 
-def order_follows_pressure(trials: Sequence[Trial]) -> float:
+def order_pressure_correlation(trials: Sequence[Trial]) -> float:
     """Spearman's rank correlation of order and set pressure among the trials of a vine, all vines together.
 
     Parameters
@@ -53,7 +53,7 @@ def order_follows_pressure(trials: Sequence[Trial]) -> float:
     Returns
     -------
     float
-        −1 to 1; NaN where there are fewer than `FEWEST_RANKED` trials or each vine has one pressure.
+        −1 to 1; NaN where there are fewer than `FEWEST_TRIALS` trials or each vine has one pressure.
     """
     from scipy.stats import rankdata
 
@@ -65,7 +65,7 @@ def order_follows_pressure(trials: Sequence[Trial]) -> float:
         if len(members) > 1 and np.ptp(pressures) > 0:
             both = np.array([rankdata(ranks[members]), rankdata(pressures)])
             pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
-    if sum(pair.shape[1] for pair in pairs) < FEWEST_RANKED:
+    if sum(pair.shape[1] for pair in pairs) < FEWEST_TRIALS:
         return math.nan
     order, pressure = np.hstack(pairs)
     return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
@@ -83,25 +83,25 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
     ------
     warnings.
     """
-    correlation = order_follows_pressure(trials)
+    correlation = order_pressure_correlation(trials)
     _, stated = trial_order(trials)
-    if abs(correlation) >= FOLLOWS_PRESSURE and stated:
+    if abs(correlation) >= CONFOUNDING_CORRELATION and stated:
         message = f"follows the pressure (rank correlation {correlation:.2f}): any drift looks like physics"
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
-    elif abs(correlation) >= FOLLOWS_PRESSURE:
+    elif abs(correlation) >= CONFOUNDING_CORRELATION:
         message = (
             f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if they were made "
             "in this order, any drift looks like physics"
         )
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     for column in ("specimen", "day"):
-        if _one_a_condition(trials, column):
+        if _confounded_with_condition(trials, column):
             message = f"is another for each condition: what differs between {column}s looks like physics"
             remedy = f"spread every condition over two {column}s"
             yield Problem(message=message, file=file, column=column, severity="warning", remedy=remedy)
 
 
-def _one_a_condition(trials: Sequence[Trial], column: str) -> bool:
+def _confounded_with_condition(trials: Sequence[Trial], column: str) -> bool:
     """Whether no condition has two of the column's values, though conditions of one vine have different ones.
 
     Parameters

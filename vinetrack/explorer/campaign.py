@@ -24,7 +24,7 @@ from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.parameters import group_names
 from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.starts import initial_trial_effects
-from vinetrack.pipeline.model_stage import measured
+from vinetrack.pipeline.model_stage import measured_trials
 from vinetrack.results.folder_layout import Results, ResultsError, read_result
 from vinetrack.results.stored_fit import read_fit
 
@@ -218,7 +218,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         If a stage before the model has not run, or no trial has a track that can be used.
     """
     results = Results(folder)
-    pairs, kinematics = measured(experiment, results)
+    pairs, kinematics = measured_trials(experiment, results)
     data, left_out = prepare(pairs)
     if not data:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"

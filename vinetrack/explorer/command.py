@@ -55,9 +55,9 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """
     from vinetrack.explorer.campaign import read_campaign
     from vinetrack.pipeline.effects_stage import effects_of
-    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.pipeline.source_experiment import read_source_experiment
 
-    read = experiment_behind(folder, experiment)
+    read = read_source_experiment(folder, experiment)
     return read_campaign(folder, read, effects_of(read.folder))
 
 

@@ -16,7 +16,7 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from tornado.web import ErrorHandler
 
-from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port, own_hosts, secret_path
+from vinetrack.core.local_page import LOOPBACK, allowed_hosts, secret_path, serve_on_free_port, stop_on_signals
 from vinetrack.explorer.fitting import BackgroundFit
 
 QUIET = ("bokeh", "tornado")
@@ -66,7 +66,7 @@ def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
     PageError
         If it is taken.
     """
-    return on_a_free_port(lambda number: _serve(ground, number), port)
+    return serve_on_free_port(lambda number: _serve(ground, number), port)
 
 
 def _serve(ground: BackgroundFit, port: int) -> Server:
@@ -75,7 +75,7 @@ def _serve(ground: BackgroundFit, port: int) -> Server:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((LOOPBACK, port))
         free_port = int(probe.getsockname()[1])
-    hosts = own_hosts(free_port)
+    hosts = allowed_hosts(free_port)
     server = Server(
         {"/": application(ground)},
         prefix=secret_path(),
@@ -148,7 +148,7 @@ def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = 
     say("For this machine alone. Ctrl-C ends it.")
     if browser:
         threading.Thread(target=webbrowser.open, args=(where,), daemon=True).start()
-    with ended_by_signals(lambda: server.io_loop.add_callback_from_signal(server.io_loop.stop)):
+    with stop_on_signals(lambda: server.io_loop.add_callback_from_signal(server.io_loop.stop)):
         server.io_loop.start()
     server.stop()
     say("Explorer ended.")

@@ -111,7 +111,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
         tracks, or pairs of trial and track.
     *effects : names, or `name=size` in the unit of the parameter; all where none is given.
     **options
-        Of `vinetrack.pipeline.power_stage.PowerAsked`: `noise_mm`, `noise_correlation`, `spread_P` and `spread_B`
+        Of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and `spread_B`
         (relative), `capture_fps`, `B`, `n`; and `simulate`, `jobs`, `first_seed`, `answers` for complete diagnoses of
         simulated campaigns; `calibrate`, how many null campaigns a verdict's tests are held against; `reach`, a
         probability, for the fewest further trials that find `name=size` so often.
@@ -134,16 +134,16 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     >>> round(power["leak"].probability_at(1.0), 2)
     1.0
     """
-    from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
+    from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
     if isinstance(source, LoadedResults):
         source = source.folder
     if isinstance(source, (str, Path)):
-        return power_of_target(PowerAsked(Path(source), effects, **options))
+        return power_of_target(PowerRequest(Path(source), effects, **options))
     if isinstance(source, Experiment):
-        return power_of_target(PowerAsked(source.folder, effects, **options))
+        return power_of_target(PowerRequest(source.folder, effects, **options))
     given = source if isinstance(source, Fit) else read_source(source).pairs
-    return power_of_target(PowerAsked(Path("trials"), effects, **options), given)
+    return power_of_target(PowerRequest(Path("trials"), effects, **options), given)
 
 
 def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:

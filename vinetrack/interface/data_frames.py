@@ -17,7 +17,7 @@ from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.other_units import in_sheet_units
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import ExperimentSettings
-from vinetrack.experiment.sheet import judge_pressures, judge_wall, make_trial, read_row
+from vinetrack.experiment.sheet import check_pressures, check_wall, make_trial, read_row
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -101,8 +101,8 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
         for name in needed:
             if name not in row.values and all(problem.column != name for problem in row.problems):  # noqa: PD011
                 row.add("is missing", name, allowed=COLUMNS[name].allowed, remedy="give it as a column of the frame")
-        judge_wall(row)
-        judge_pressures(row)
+        check_wall(row)
+        check_pressures(row)
         problems += [replace(problem, file="the frame", line=0) for problem in row.problems]
         if not row.failed:
             # A track that somebody measured elsewhere: what is assumed of its smooth errors follows from that.

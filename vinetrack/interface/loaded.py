@@ -46,9 +46,9 @@ class LoadedResults:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment that the results were made from; ResultsError where it has moved."""
-        from vinetrack.pipeline.source_experiment import experiment_behind
+        from vinetrack.pipeline.source_experiment import read_source_experiment
 
-        return experiment_behind(self.folder)
+        return read_source_experiment(self.folder)
 
     @cached_property
     def trials(self) -> pd.DataFrame:

@@ -51,32 +51,32 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
     'Figure'
     """
     if isinstance(shown, LoadedResults):
-        return _of_results(shown, name, trial)
+        return _results_figure(shown, name, trial)
     if isinstance(shown, Fit):
         from vinetrack.interface.calls import compare
 
         shown = compare(shown)
     if isinstance(shown, Power):
-        return _drawn({"power": (shown,)}, name or "power")
-    inputs = _of_comparison(shown) if isinstance(shown, Comparison) else _of_diagnosis(shown)
-    return _drawn(inputs, name or next(iter(inputs), "none"))
+        return _draw_figure({"power": (shown,)}, name or "power")
+    inputs = _comparison_inputs(shown) if isinstance(shown, Comparison) else _diagnosis_inputs(shown)
+    return _draw_figure(inputs, name or next(iter(inputs), "none"))
 
 
-def _drawn(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
+def _draw_figure(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
     if name not in inputs:
         known = ", ".join(inputs) or "none"
         raise ResultsError(f"There is nothing to draw as {name!r}; the figures with content are {known}.")
     return draw(name, *inputs[name])
 
 
-def _of_comparison(shown: Comparison) -> dict[str, tuple[Any, ...]]:
+def _comparison_inputs(shown: Comparison) -> dict[str, tuple[Any, ...]]:
     from vinetrack.pipeline.figures_stage import label_conditions
 
-    table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
+    table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
     return {name: (table, dict(shown.trajectories)) for name in MODEL_FIGURES}
 
 
-def _described(trials: list[Trial]) -> Any:
+def _condition_labels(trials: list[Trial]) -> Any:
     import pandas as pd
 
     from vinetrack.pipeline.figures_stage import describe_conditions
@@ -92,7 +92,7 @@ def _described(trials: list[Trial]) -> Any:
     return describe_conditions(rows, tuple(trials))
 
 
-def _of_diagnosis(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
+def _diagnosis_inputs(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
     """Inputs of the figures that the diagnosis has something for; one that was read back knows no trajectories."""
     from vinetrack.pipeline.figures_stage import figure_inputs
 
@@ -109,7 +109,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     nothing = pd.DataFrame()
     if not shown.fits:
         curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
-        return assemble_tables(shown, _described([]), curves, nothing, nothing, nothing)
+        return assemble_tables(shown, _condition_labels([]), curves, nothing, nothing, nothing)
     before, after = shown.fits[0], shown.fits[-1]
     later = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
     parts = []
@@ -128,12 +128,12 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         located = shown.failure.along_position
         drifting = drift_groups(shown.failure.drift, after if later else None)
     force = nothing if shown.force_table is None else shown.force_table
-    conditions = _described([fitted.trial for fitted in before.trials])
+    conditions = _condition_labels([fitted.trial for fitted in before.trials])
     trials = pd.concat(parts, ignore_index=True)
     return assemble_tables(shown, conditions, trials, located, drifting, force, shown.learned_table)
 
 
-def _of_results(shown: LoadedResults, name: str, trial: str) -> Figure:
+def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
     from vinetrack.pipeline.figures_stage import campaign_inputs, draw_trial
 
     known: tuple[Trial, ...] = ()
@@ -151,4 +151,4 @@ def _of_results(shown: LoadedResults, name: str, trial: str) -> Figure:
         )
     inputs = campaign_inputs(shown.folder, known)
     chosen = name or ("ladder" if "ladder" in inputs else "damping_law")
-    return _drawn(inputs, chosen)
+    return _draw_figure(inputs, chosen)

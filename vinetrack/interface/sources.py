@@ -56,8 +56,8 @@ def read_source(source: Source) -> TrialSource:
         If a stage of a results folder has not run, or its experiment has moved.
     """
     from vinetrack.inference.fit_data import pairs_of
-    from vinetrack.pipeline.model_stage import measured
-    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.pipeline.model_stage import measured_trials
+    from vinetrack.pipeline.source_experiment import read_source_experiment
     from vinetrack.results.folder_layout import Results
 
     if isinstance(source, LoadedResults):
@@ -65,8 +65,8 @@ def read_source(source: Source) -> TrialSource:
     if isinstance(source, pd.DataFrame):
         return TrialSource(tracks_from_frame(source))
     if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
-        experiment = experiment_behind(Path(source))
-        pairs, kinematics = measured(experiment, Results(Path(source)))
+        experiment = read_source_experiment(Path(source))
+        pairs, kinematics = measured_trials(experiment, Results(Path(source)))
         return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
     if isinstance(source, (str, Path)):
         source = read_experiment(source)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.numbers import decimals
 from vinetrack.diagnosis.result import BETWEEN_SUMMARIES, BETWEEN_TRIALS, DAY, N_BY_VINE, ORDER_DRIFT, SPECIMEN
-from vinetrack.experiment.trial_order import FOLLOWS_PRESSURE, order_follows_pressure, trial_order
+from vinetrack.experiment.trial_order import CONFOUNDING_CORRELATION, order_pressure_correlation, trial_order
 from vinetrack.inference.fit_result import Number
 
 if TYPE_CHECKING:
@@ -108,8 +108,8 @@ def remedies_in_words(kept: Sequence[LikelihoodRatio], trials: Sequence[Trial]) 
     _, stated = trial_order(trials)
     if not stated:
         text = f" The order of the rows was taken for that of the trials.{text}"
-    correlation = order_follows_pressure(trials)
-    if math.isfinite(correlation) and abs(correlation) >= FOLLOWS_PRESSURE:
+    correlation = order_pressure_correlation(trials)
+    if math.isfinite(correlation) and abs(correlation) >= CONFOUNDING_CORRELATION:
         text = f" Trials were made in the order of pressure (rank correlation {correlation:.2f}).{text}"
     return text
 

@@ -15,7 +15,14 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_csv
 from vinetrack.narrative.campaign_text import campaign_lines, simulation_lines
 from vinetrack.pipeline.design_stage import read_list, read_range
-from vinetrack.pipeline.prediction_inputs import Asked, as_option, check_figure, inputs_of, read_ground, write_figure
+from vinetrack.pipeline.prediction_inputs import (
+    PredictionRequest,
+    check_figure,
+    inputs_of,
+    name_missing_option,
+    read_basis,
+    write_figure,
+)
 from vinetrack.results.folder_layout import ResultsError
 
 if TYPE_CHECKING:
@@ -28,12 +35,12 @@ if TYPE_CHECKING:
     from vinetrack.planning.simulated_campaigns import SimulatedCampaigns
 
 _VINE = re.compile(r"\s*([^x×]+)[x×]([^x×]+)[x×]([^x×]+)\s*")
-STAND_IN_KPA = "100"
+PLACEHOLDER_KPA = "100"
 """A vine needs some pressure to be read; those of the campaign take its place."""
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CampaignRequest:
     """What the command asks of a campaign; errors are standard errors, that of B relative.
 
     `power` asks what the campaign could see of effects beside those of its model.
@@ -78,7 +85,7 @@ def _read_vine(text: str) -> dict[str, str]:
 
 
 def design_campaign(
-    asked: Asked, wanted: Wanted, *, sheet: Path | None = None, figure: Path | None = None
+    asked: PredictionRequest, wanted: CampaignRequest, *, sheet: Path | None = None, figure: Path | None = None
 ) -> list[str]:
     """Lines for the terminal about the campaign; a sheet to film it by and a figure are written where asked for.
 
@@ -116,9 +123,9 @@ def design_campaign(
     try:
         with waiting("weighing conditions"):
             planned = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
-        simulated = _simulated(planned, vine_inputs, camera, wanted)
+        simulated = _simulated_campaigns(planned, vine_inputs, camera, wanted)
     except EffectError as error:
-        raise as_option(error) from None
+        raise name_missing_option(error) from None
     except (SimulationError, FitError, CampaignError) as error:
         raise ResultsError(str(error)) from None
     lines = list(campaign_lines(planned, vine_inputs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
@@ -126,7 +133,7 @@ def design_campaign(
         lines += simulation_lines(planned, simulated)
     shown = planned.best or planned.nearest
     if wanted.power:
-        lines += _seen(planned.candidates, shown, vine_inputs, camera)
+        lines += _power_lines(planned.candidates, shown, vine_inputs, camera)
     if sheet is not None:
         write_csv(sheet, _film_sheet(planned.candidates, shown, wanted))
         lines.append(f"Sheet, in an order drawn at random: {sheet}")
@@ -136,7 +143,7 @@ def design_campaign(
     return lines
 
 
-def _vine_inputs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
+def _vine_inputs(asked: PredictionRequest, wanted: CampaignRequest) -> list[PredictiveInputs]:
     """One for each vine."""
     if not wanted.vines:
         raise ExperimentError(
@@ -144,12 +151,12 @@ def _vine_inputs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
         )
     vine_inputs = []
     for text in dict.fromkeys(wanted.vines):
-        cells = {**asked.cells, **_read_vine(text), "pressure_kPa": STAND_IN_KPA}
-        vine_inputs += inputs_of(read_ground(replace(asked, cells=cells)))
+        cells = {**asked.cells, **_read_vine(text), "pressure_kPa": PLACEHOLDER_KPA}
+        vine_inputs += inputs_of(read_basis(replace(asked, cells=cells)))
     return vine_inputs
 
 
-def _scope(wanted: Wanted) -> Scope:
+def _scope(wanted: CampaignRequest) -> Scope:
     from vinetrack.planning.campaign_design import Scope
 
     pressure = (math.nan, math.nan) if wanted.pressure is None else read_range("pressure_kPa", wanted.pressure)
@@ -163,8 +170,8 @@ def _scope(wanted: Wanted) -> Scope:
     )
 
 
-def _simulated(
-    planned: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
+def _simulated_campaigns(
+    planned: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: CampaignRequest
 ) -> SimulatedCampaigns | None:
     """The campaign made so many times and fitted; None where there is none to make."""
     from vinetrack.core.terminal import Progress, progress
@@ -187,7 +194,9 @@ def _simulated(
         )
 
 
-def _seen(shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan) -> list[str]:
+def _power_lines(
+    shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan
+) -> list[str]:
     """What the campaign could see of effects that are not in its model."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.campaign_power import CampaignDesign, design_power
@@ -212,7 +221,7 @@ def _seen(shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInput
         raise ResultsError(str(error)) from None
 
 
-def _film_sheet(shown: Candidates, design: Plan, wanted: Wanted) -> pd.DataFrame:
+def _film_sheet(shown: Candidates, design: Plan, wanted: CampaignRequest) -> pd.DataFrame:
     """A trial sheet to film the campaign by, in an order drawn at random: what drifts must not look like pressure."""
     import pandas as pd
 

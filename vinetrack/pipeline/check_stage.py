@@ -12,7 +12,7 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckReport:
     """Problems of an experiment; `recordings` what was understood of each; `notes` what a blank cell stands for."""
 
     problems: tuple[Problem, ...]
@@ -36,7 +36,7 @@ class Checked:
         return {"recordings": list(self.recordings), "notes": list(self.notes), "problems": problems}
 
 
-def check_folder(folder: Path) -> Checked:
+def check_folder(folder: Path) -> CheckReport:
     """Check sheet, settings, effects, tracks and recordings of an experiment.
 
     Parameters
@@ -45,7 +45,7 @@ def check_folder(folder: Path) -> Checked:
 
     Returns
     -------
-    Checked
+    CheckReport
     """
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
@@ -62,7 +62,7 @@ def check_folder(folder: Path) -> Checked:
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
-        return Checked(tuple(problems), (), (), ())
+        return CheckReport(tuple(problems), (), (), ())
     facts = {trial.name: known for trial, known in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
@@ -90,4 +90,4 @@ def check_folder(folder: Path) -> Checked:
             f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"
             " hand them in with all digits that were measured."
         )
-    return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))
+    return CheckReport(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.experiment.schema import option
 from vinetrack.pipeline.prediction_inputs import (
-    Asked,
-    as_option,
+    PredictionRequest,
     check_figure,
+    describe_trial,
+    display_value,
+    format_volume,
     inputs_of,
-    litres,
-    read_ground,
-    shown,
-    trial_words,
+    name_missing_option,
+    read_basis,
     write_figure,
 )
 from vinetrack.results.folder_layout import ResultsError
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from vinetrack.planning.predictive_inputs import PredictiveInputs
     from vinetrack.planning.reservoir_design import Chamber
 
-MOST_FILMS = 12
+MAX_FILMS = 12
 """Chosen for time: each film takes a search of its own. Half still covers what a shop sells; twice doubles the wait."""
 
 FILMS = "--films-um"
@@ -112,7 +112,7 @@ def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "
 
 
 def design_vine(
-    asked: Asked,
+    asked: PredictionRequest,
     *,
     films: str,
     diameter: str,
@@ -161,7 +161,7 @@ def design_vine(
     from vinetrack.planning.fastest_vine import Room, fastest
 
     check_figure(figure)
-    ground = read_ground(asked, needed=("pressure_kPa",))
+    ground = read_basis(asked, needed=("pressure_kPa",))
     room = Room(
         films_m=read_list("thickness_um", films, FILMS),
         diameter_m=read_range("diameter_mm", diameter),
@@ -171,12 +171,12 @@ def design_vine(
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
-    _check(room, films, diameter)
+    _check_films(room, films, diameter)
     try:
         with waiting("looking for the fastest vine"):
             choices = fastest(room, ground.stated, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     except EffectError as error:
-        raise as_option(error) from None
+        raise name_missing_option(error) from None
     except (SimulationError, FitError) as error:
         raise ResultsError(str(error)) from None
     _refuse_standstill(room, choices)
@@ -187,11 +187,11 @@ def design_vine(
     return lines
 
 
-def _check(room: Room, films: str, diameter: str) -> None:
+def _check_films(room: Room, films: str, diameter: str) -> None:
     """Refuse films that no tube of the smallest diameter can have, and none or too many of them."""
-    if not 0 < len(room.films_m) <= MOST_FILMS:
+    if not 0 < len(room.films_m) <= MAX_FILMS:
         words = f"names {len(room.films_m)} films"
-        raise _refusal("thickness_um", films, words, f"name 1 to {MOST_FILMS}", name=FILMS)
+        raise _refusal("thickness_um", films, words, f"name 1 to {MAX_FILMS}", name=FILMS)
     if max(room.films_m) > room.diameter_m[0] / 4:
         words = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
         raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")
@@ -234,8 +234,8 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
                 f"{1e3 * trial.length_m:.3g}",
                 f"{trial.pressure_Pa / 1e3:.3g}",
                 f"{hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m) / 1e6:.2f}",
-                shown(final.median, "m/s"),
-                f"{shown(final.low, 'm/s')} to {shown(final.high, 'm/s')}",
+                display_value(final.median, "m/s"),
+                f"{display_value(final.low, 'm/s')} to {display_value(final.high, 'm/s')}",
                 f"{choice.odds:.0%}",
                 ", ".join(choice.limits),
             )
@@ -248,9 +248,9 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
             f"the choice of film is open: {1e6 * choices[0].thickness_m:g} µm is the fastest in {choices[0].odds:.0%} "
             "of the draws only; measuring B and P_y of the first two would decide it"
         )
-    yield f"uncertainties of the fastest, {trial_words(best.inputs.trial)}: final speed by each alone"
+    yield f"uncertainties of the fastest, {describe_trial(best.inputs.trial)}: final speed by each alone"
     rows_of = [
-        (f"  {share.name}", f"{shown(share.low, 'm/s')} to {shown(share.high, 'm/s')} m/s", share.words)
+        (f"  {share.name}", f"{display_value(share.low, 'm/s')} to {display_value(share.high, 'm/s')} m/s", share.words)
         for share in best.shares
     ]
     yield from table(rows_of)
@@ -275,11 +275,16 @@ def _vine_picture(choices: Sequence[Choice]) -> Figure:
     return draw_choice(films, choices[0].prediction.final.name, choices[0].prediction.final.y_over_L)
 
 
-SIZED = ("diameter_mm", "length_mm", "pressure_kPa")
+REQUIRED_FOR_RESERVOIR = ("diameter_mm", "length_mm", "pressure_kPa")
 
 
 def design_reservoir(
-    asked: Asked, *, within_percent: float, supply_s: float | None, at_fraction: float, figure: Path | None = None
+    asked: PredictionRequest,
+    *,
+    within_percent: float,
+    supply_s: float | None,
+    at_fraction: float,
+    figure: Path | None = None,
 ) -> list[str]:
     """Lines for the terminal about the chambers worth looking at; the figure is written where asked for.
 
@@ -311,7 +316,7 @@ def design_reservoir(
     from vinetrack.effects import EffectError
 
     check_figure(figure)
-    ground = read_ground(asked, needed=SIZED)
+    ground = read_basis(asked, needed=REQUIRED_FOR_RESERVOIR)
     trial = ground.planned.trials[0]
     inputs = inputs_of(ground)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100
@@ -319,9 +324,9 @@ def design_reservoir(
         with waiting("simulating"):
             lines = [*_reservoir_lines(trial, inputs, loss, at_fraction)]
             if supply_s is not None and inputs is not None:
-                lines += _supplied(inputs, loss, supply_s)
+                lines += _supplied_lines(inputs, loss, supply_s)
     except EffectError as error:
-        raise as_option(error) from None
+        raise name_missing_option(error) from None
     if supply_s is not None and inputs is None:
         lines.append("! how fast the vine draws gas depends on its wall: give --thickness-um to use --supply-s")
     if figure is not None:
@@ -335,11 +340,11 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     from vinetrack.planning.reservoir_design import GAMMAS, chambers, swept_m3
 
     words = (
-        trial_words(trial)
+        describe_trial(trial)
         if inputs is not None
         else (f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa")
     )
-    yield f"{words}: it sweeps {litres(swept_m3(trial))}"
+    yield f"{words}: it sweeps {format_volume(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""
     listed = chambers(trial, loss)
@@ -351,7 +356,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     if inputs is not None:
         steady = _final(inputs, math.inf, 1.0, at_fraction)
         place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
-        yield f"speed: final speed at the medians{place}; {shown(steady, 'm/s')} m/s at constant pressure"
+        yield f"speed: final speed at the medians{place}; {display_value(steady, 'm/s')} m/s at constant pressure"
     yield ("slow: γ = 1, the gas stays at room temperature; fast: γ = 1.4, it takes up no heat, as within milliseconds")
 
 
@@ -362,9 +367,9 @@ def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) 
     speeds = (
         []
         if inputs is None
-        else [shown(_final(inputs, chamber.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
+        else [display_value(_final(inputs, chamber.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
     )
-    return chamber.name, litres(chamber.volume_m3), *losses, *speeds
+    return chamber.name, format_volume(chamber.volume_m3), *losses, *speeds
 
 
 def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
@@ -376,11 +381,11 @@ def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction
     return final_with(inputs, volume_m3, gamma, at_fraction)
 
 
-def _supplied(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
+def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
     from vinetrack.planning.reservoir_design import GAMMAS, supplied_chamber
 
     volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
-    words = ", ".join(f"{litres(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
+    words = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
     return [f"with a supply that closes the gap in {1e3 * supply_s:g} ms, at the medians: {words}"]
 
 

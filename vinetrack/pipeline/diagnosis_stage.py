@@ -20,7 +20,7 @@ from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.diagnosis_text import to_go_on, verdict_line
 from vinetrack.narrative.power_text import power_brief
 from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
-from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
+from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured_trials, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-CAVEAT = "But what was seen contradicts the sheet in"
+CONTRADICTION_WARNING = "But what was seen contradicts the sheet in"
 _BETWEEN_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
@@ -71,9 +71,9 @@ def diagnose_results(
         If a stage before this one has not run.
     """
     results = Results(folder)
-    pairs, _ = measured(experiment, results)
+    pairs, _ = measured_trials(experiment, results)
     try:
-        diagnosis = beside_contradictions(diagnose_pairs(experiment, pairs, report), results, pairs)
+        diagnosis = with_contradictions(diagnose_pairs(experiment, pairs, report), results, pairs)
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
@@ -102,23 +102,23 @@ def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report 
     return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report)
 
 
-def beside_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
+def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
     """The verdict with what was seen that contradicts the sheet: a wrong scale or unit passes for physics.
 
     Parameters
     ----------
     diagnosis : as made from the trials.
-    results, pairs : as of `seen_against_stated`.
+    results, pairs : as of `sheet_contradictions`.
 
     Returns
     -------
     Diagnosis
     """
-    contradicted = seen_against_stated(results, pairs)
+    contradicted = sheet_contradictions(results, pairs)
     if not contradicted:
         return diagnosis
     columns = joined(list(contradicted))
-    caveat = f"{CAVEAT} {columns}: put that right before you believe this verdict."
+    caveat = f"{CONTRADICTION_WARNING} {columns}: put that right before you believe this verdict."
     return replace(
         diagnosis,
         explanation=f"{diagnosis.explanation} {caveat}",
@@ -126,7 +126,7 @@ def beside_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequenc
     )
 
 
-def seen_against_stated(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
+def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
     """What recordings and speeds contradict in the sheet, in a sentence for each column.
 
     Parameters
@@ -169,14 +169,14 @@ def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dic
     words = f"No diagnosis could be made: {reason}"
     refusal = Diagnosis(rounds=(), effects=(), explanation=words, refused=reason)
     content = {**refusal.to_json(), "model": list(experiment.settings.model)}
-    _emptied(results)
+    _emptied_folder(results)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS))
     write_json(results.diagnosis, content)
     log.info("%s", content["explanation"])
     return content
 
 
-def _emptied(results: Results) -> Path:
+def _emptied_folder(results: Results) -> Path:
     folder = results.folder / "diagnosis"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -198,7 +198,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
     """
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
 
-    folder = _emptied(results)
+    folder = _emptied_folder(results)
     for name, table in _tables_of(diagnosis).items():
         write_csv(folder / name, table)
     numbers = moved(diagnosis.fits, ("", *diagnosis.effects)) if len(diagnosis.fits) > 1 else empty_table(MOVED_COLUMNS)
@@ -319,7 +319,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     from vinetrack.narrative.diagnosis_text import added_in_words
 
     results = Results(folder)
-    pairs, _ = measured(experiment, results)
+    pairs, _ = measured_trials(experiment, results)
     before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
     history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
     rows = table if not len(history) else table.iloc[1:]
@@ -353,12 +353,12 @@ def diagnosis_lines(folder: Path) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    reasons, _, contradicted = diagnosis.explanation.partition(CAVEAT)
+    reasons, _, contradicted = diagnosis.explanation.partition(CONTRADICTION_WARNING)
     sizes = [fact.answer for fact in facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))]
     told = f" ({'; '.join(sizes)})" if sizes else ""
     headline = f"{verdict_line(diagnosis)}{told}"
     return [
-        f"{headline}. {CAVEAT}{contradicted}" if contradicted else headline,
+        f"{headline}. {CONTRADICTION_WARNING}{contradicted}" if contradicted else headline,
         *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
         *([f"{beside[0].upper()}{beside[1:]}"] if beside and beside not in headline else []),
         *_damping_line(diagnosis),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
-STRETCHES = 8
+N_SECTIONS = 8
 """Parts of the growth in which misfits are averaged where the diagnosis did not say. Chosen: as many as a page shows
 side by side. At half a misfit at the start alone is averaged away, at twice each mean rests on few frames."""
 
@@ -57,7 +57,7 @@ class DiagnosisTables:
     learned: pd.DataFrame | None = None
 
 
-def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
+def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
     """Tables of a results folder; None where it has not been diagnosed, or that was refused.
 
     Parameters
@@ -94,7 +94,7 @@ def assemble_tables(
     ----------
     diagnosis : with a verdict.
     conditions : DataFrame
-        As of `read_diagnosed`.
+        As of `read_diagnosis_tables`.
     trials : DataFrame
         Columns `CURVE_COLUMNS`.
     located, drifting, force, learned : DataFrame
@@ -109,7 +109,7 @@ def assemble_tables(
 
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
     worst = worst_condition(trials)
-    names, matrix = in_order_of_rank(diagnosis.rounds[0])
+    names, matrix = cosines_by_rank(diagnosis.rounds[0])
     return DiagnosisTables(
         ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
@@ -118,7 +118,9 @@ def assemble_tables(
         cells=_cosine_cells(names, matrix),
         drift=drifting,
         force=force,
-        rounds=[(question(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)],
+        rounds=[
+            (round_heading(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)
+        ],
         cosines=(names, matrix),
         worst=worst,
         added=listed(diagnosis.effects),
@@ -127,7 +129,7 @@ def assemble_tables(
     )
 
 
-def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult | None:
+def read_diagnosis_section(results: Results, experiment: Experiment) -> DiagnosisResult | None:
     """What the page says of the diagnosis; None where there is none.
 
     Parameters
@@ -178,7 +180,7 @@ def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
 
     Parameters
     ----------
-    diagnosed : from `read_diagnosed`.
+    diagnosed : from `read_diagnosis_tables`.
 
     Returns
     -------
@@ -292,19 +294,21 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
         of_condition = known_rows[known_rows["condition"] == condition] if len(known_rows) else known_rows
         rows += [
             {"condition": condition, "condition_label": labels[condition], **row}
-            for row in (_located(of_condition, located, members) if len(of_condition) else _stretched(members))
+            for row in (
+                _located_sections(of_condition, located, members) if len(of_condition) else _measured_sections(members)
+            )
         ]
     return pd.DataFrame(rows)
 
 
-def _located(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
+def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
     vine = str(of_condition["vine"].iloc[0])
     whole_m = float(located.loc[located["vine"] == vine, "to_m"].max())
     if not whole_m > 0:
         return []  # Nothing grew: there is no place along the growth.
     rows = []
     for row in iter_rows(of_condition):
-        after = _means(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
+        after = _mean_misfits(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
         rows.append(
             {
                 "n_trials": int(members["trial"].nunique()),
@@ -318,16 +322,16 @@ def _located(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.Data
     return rows
 
 
-def _stretched(members: pd.DataFrame) -> list[dict[str, Any]]:
+def _measured_sections(members: pd.DataFrame) -> list[dict[str, Any]]:
     """Stretches of what was measured; chance is what trials differ by, less their own mean over the growth."""
     whole_m = float(members["lead_position_m"].max())
     if not whole_m > 0:
         return []
-    edges = np.linspace(0.0, whole_m, STRETCHES + 1)
+    edges = np.linspace(0.0, whole_m, N_SECTIONS + 1)
     count = int(members["trial"].nunique())
     rows = []
     for low, high in itertools.pairwise(edges):
-        means = _means(members, "lead_position_m", low, high if high < whole_m else math.inf)
+        means = _mean_misfits(members, "lead_position_m", low, high if high < whole_m else math.inf)
         before, after = means["model_before_m"], means["model_after_m"]
         if not np.isfinite(before).any():
             continue
@@ -345,7 +349,7 @@ def _stretched(members: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
+def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
     """Mean misfit of each trial, by model, where `along` lies from `low` to `high`; NaN for one that never does."""
     chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
     means: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
@@ -358,7 +362,7 @@ def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[s
     return {model: np.array(values) for model, values in means.items()}
 
 
-def question(index: int, rounds: Sequence[Round]) -> str:
+def round_heading(index: int, rounds: Sequence[Round]) -> str:
     """What a round asks, in words.
 
     Parameters
@@ -399,7 +403,7 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def in_order_of_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
+def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
     """Names and matrix of the cosines of a round with the answer first, then as it ranks its candidates.
 
     Parameters

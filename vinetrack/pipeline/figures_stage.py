@@ -160,7 +160,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
     from vinetrack.figures.size_figures import PAYLOAD_LINE
     from vinetrack.narrative.law_text import METHOD_NAMES
-    from vinetrack.pipeline.diagnosis_tables import read_diagnosed
+    from vinetrack.pipeline.diagnosis_tables import read_diagnosis_tables
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
@@ -172,7 +172,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     points = points.assign(used=points["used"] & bool(in_fit))
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
-    scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
+    scaling, diagnosed = read_json(results.scaling), read_diagnosis_tables(results, described)
     payload, line = read_result(results.payload_model), PAYLOAD_LINE
     diagnosis = read_diagnosis(results)
     if diagnosis is not None and diagnosis.refutes:
@@ -187,7 +187,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
         "payload_speed": (read_result(results.conditions), payload, "", line) if len(payload) else (),
         "overview": (described, moved) if moved else (),
         "pixel_places": (places,) if len(places) >= FEWEST_PLACES else (),
-        "model_comparison": (compared, with_after(trajectories, diagnosed)) if len(compared) else (),
+        "model_comparison": (compared, with_final_model(trajectories, diagnosed)) if len(compared) else (),
         "model_residuals": (compared, trajectories) if len(compared) else (),
     }
     inputs |= {} if diagnosed is None else figure_inputs(diagnosed)
@@ -276,7 +276,7 @@ def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
     Parameters
     ----------
     tables
-        From `read_diagnosed`.
+        From `read_diagnosis_tables`.
 
     Returns
     -------
@@ -300,7 +300,9 @@ def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
     return {name: inputs[name] for name in DIAGNOSIS_FIGURES if name in there}
 
 
-def with_after(trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
+def with_final_model(
+    trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
+) -> dict[str, pd.DataFrame]:
     """Trajectories by condition with what the last model says of them, where effects were added.
 
     Parameters
@@ -308,7 +310,7 @@ def with_after(trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTab
     trajectories : dict of DataFrame
         By condition, as `comparison/` holds them.
     diagnosed
-        From `read_diagnosed`.
+        From `read_diagnosis_tables`.
 
     Returns
     -------

@@ -67,16 +67,16 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
 
     results = Results(folder)
     damping = read_json(results.damping)
-    pairs, kinematics = measured(experiment, results)
+    pairs, kinematics = measured_trials(experiment, results)
     tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
     tables[results.payload_model] = CURVE_COLUMNS
     written: dict[Path, pd.DataFrame] = {}
     content: dict[str, Any] = {}
     trajectories: dict[str, pd.DataFrame] = {}
     try:
-        fit, comparison = _fitted(experiment, pairs, kinematics, settings)
-        checked, check_message = _checked(fit, damping)
-        weighed = _audited(fit, comparison, pairs, kinematics)
+        fit, comparison = _fit_and_compare(experiment, pairs, kinematics, settings)
+        checked, check_message = _damping_check(fit, damping)
+        weighed = _audit(fit, comparison, pairs, kinematics)
         curves = payload_curves(fit, settings.final_at_fraction)
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
@@ -93,7 +93,9 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     return content
 
 
-def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
+def measured_trials(
+    experiment: Experiment, results: Results
+) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
     """Trials with the tracks and kinematics that the results folder holds; those that failed have none.
 
     Parameters
@@ -122,12 +124,12 @@ def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial
     for trial in experiment.trials:
         table = read_result(results.track(trial.name))
         if len(table) and trial.name not in failed:
-            pairs.append((trial, read_back(trial, table)))
+            pairs.append((trial, read_stored_track(trial, table)))
             kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
     return pairs, kinematics
 
 
-def read_back(trial: Trial, table: pd.DataFrame) -> Track:
+def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """A track as `tracks/<trial>.csv` holds it, with the pressure that was measured along with it.
 
     The pressure stands with what the user brought: in the track itself, or in a trace beside it.
@@ -184,7 +186,7 @@ def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
     )
 
 
-def _fitted(
+def _fit_and_compare(
     experiment: Experiment,
     pairs: list[tuple[Trial, Track]],
     kinematics: dict[str, Kinematics],
@@ -202,7 +204,7 @@ def _fitted(
     return fit, compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
 
 
-def _checked(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
+def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
     """`model_check.csv`, and why it is empty where it is."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.inference.model_check import CHECK_COLUMNS, check_damping
@@ -215,7 +217,7 @@ def _checked(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
         return empty_table(CHECK_COLUMNS), str(error)
 
 
-def _audited(
+def _audit(
     fit: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
 ) -> Audit:
     from vinetrack.dynamics.audit import audit, measured_motion

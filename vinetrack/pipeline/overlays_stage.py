@@ -39,11 +39,11 @@ FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0
 is what players and eyes follow, 4 still reads as motion. At half or twice clips play jerkily or skip frames; nothing
 else depends on it."""
 
-REST_FRAMES = 8
+MARGIN_FRAMES = 8
 """Frames of rest before and after the motion that a clip shows. Chosen: a third of a second at 25 a second, so that
 start and end are seen."""
 
-FEWEST_PAIRS = 5
+FEWEST_POINTS = 5
 """Points known in pixels and in metres without which a prediction has no place in the picture. Derived: a parabola
 takes three, two more show whether it fits."""
 
@@ -175,7 +175,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
     track = read_result(results.track(trial.name))
     shown = frames_to_show(track)
     rate = 1.0 / float(np.median(np.diff(track["time_s"].to_numpy()))) if len(track) > 1 else math.nan
-    play_fps, stride = pace(shown.stop - shown.start, settings.seconds)
+    play_fps, stride = playback_rate(shown.stop - shown.start, settings.seconds)
     path = results.overlay(trial.name)
     try:
         pictures = _pictures(trial, results, track, shown, stride, rate / play_fps / stride, settings)
@@ -204,15 +204,15 @@ def frames_to_show(track: pd.DataFrame) -> range:
     """
     edge = track["edge_px"].to_numpy(dtype=float)
     known = np.flatnonzero(np.isfinite(edge))
-    if known.size < FEWEST_PAIRS:
+    if known.size < FEWEST_POINTS:
         raise ResultsError("its edge was not found, so there is nothing to draw")
     low, high = float(np.nanmin(edge)), float(np.nanmax(edge))
     begun = known[edge[known] > low + 0.01 * (high - low)][0]
     ended = known[edge[known] < high - 0.002 * (high - low)][-1]
-    return range(max(int(begun) - REST_FRAMES, 0), min(int(ended) + REST_FRAMES, int(known[-1])) + 1)
+    return range(max(int(begun) - MARGIN_FRAMES, 0), min(int(ended) + MARGIN_FRAMES, int(known[-1])) + 1)
 
 
-def pace(n_frames: int, seconds: float) -> tuple[float, int]:
+def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
     """Pictures a second, and every how many frames one is taken, so that the clip lasts about `seconds`.
 
     Parameters
@@ -229,9 +229,9 @@ def pace(n_frames: int, seconds: float) -> tuple[float, int]:
 
     Examples
     --------
-    >>> pace(120, 6.0)
+    >>> playback_rate(120, 6.0)
     (20.0, 1)
-    >>> pace(3420, 6.0)
+    >>> playback_rate(3420, 6.0)
     (30.0, 19)
     """
     stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
@@ -264,7 +264,7 @@ def _pictures(
     view = ClipView(
         trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px
     )
-    edges, release_s = edges_of(trial.name, results, track)
+    edges, release_s = edges_to_draw(trial.name, results, track)
     shake_px = shake_along(line, len(track))
     edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
     time_ms = 1e3 * (track["time_s"].to_numpy(dtype=float) - release_s)
@@ -323,7 +323,7 @@ def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
     return shake_px
 
 
-def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
+def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
     """The tracked edge, those that were predicted where there are any, and the time of release, s.
 
     Parameters
@@ -351,7 +351,7 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
     if not path.exists():
         return [*edges, *corrected], float(_first_moving_s(track))
     predicted = read_result(path)
-    to_px = metres_to_px(track)
+    to_px = position_to_px(track)
     added = _added_effects(results)
     names = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
     time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
@@ -366,7 +366,7 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
     return [*edges, *corrected], _release_s(trial, results, track)
 
 
-def metres_to_px(track: pd.DataFrame) -> Any:
+def position_to_px(track: pd.DataFrame) -> Any:
     """A function from metres to pixels along the axis, by what the track holds in both: lens and tilt bend it a little.
 
     Parameters
@@ -386,7 +386,7 @@ def metres_to_px(track: pd.DataFrame) -> Any:
     """
     both = track[["lead_position_m", "edge_px"]].dropna()
     metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)
-    if len(both) < FEWEST_PAIRS or np.ptp(metres) <= 0:
+    if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
         raise ResultsError("too few of its positions are known in pixels and in metres")
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
     bent = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
@@ -405,4 +405,4 @@ def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:
 
 
 def _first_moving_s(track: pd.DataFrame) -> float:
-    return float(track["time_s"].iloc[min(frames_to_show(track).start + REST_FRAMES, len(track) - 1)])
+    return float(track["time_s"].iloc[min(frames_to_show(track).start + MARGIN_FRAMES, len(track) - 1)])

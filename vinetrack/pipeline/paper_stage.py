@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DRAWN_FROM = ("paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures")
-DRAWN_FROM_SPEEDS = ("paper_speeds", "paper_speed_curves")
+TABLES_FOR_FIGURES = ("paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures")
+SPEED_TABLES = ("paper_speeds", "paper_speed_curves")
 
 FIG5_NOTE = "B of this vine and the payloads other than 35.6 g are not printed; the paper's points are drawn only"
 FIG7_VIRTUAL = (
@@ -36,7 +36,7 @@ FIG8_VIRTUAL = ": virtual vines grown with them test neither figure on the other
 FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are drawn only"
 
 
-def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
+def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     """Write `paper.csv` and the tables behind the figures; return `paper.csv` as written.
 
     Parameters
@@ -65,7 +65,7 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     results = Results(folder)
     mark = SIMULATED if kind == "simulated" else MEASURED
     tables = _tables(experiment, results)
-    results_given = _found(mark, results, tables)
+    results_given = _experiment_results(mark, results, tables)
     rows = [
         *protocol_rows(experiment.trials, read_result(results.steady), mark),
         *result_rows(results_given),
@@ -112,7 +112,7 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures that stand beside the paper's, from the tables of `set_beside_paper`.
+    """Draw the figures that stand beside the paper's, from the tables of `compare_with_paper`.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _figure_inputs(results: Results) -> dict[str, tuple[Any, ...]]:
     from vinetrack.core import published
     from vinetrack.paper.rows import SIMULATED
 
-    tables = {name: read_result(results.folder / f"{name}.csv") for name in (*DRAWN_FROM, *DRAWN_FROM_SPEEDS)}
+    tables = {name: read_result(results.folder / f"{name}.csv") for name in (*TABLES_FOR_FIGURES, *SPEED_TABLES)}
     damping, scaling = read_json(results.damping), read_json(results.scaling)
     virtual = (tables["paper"]["mark"] == SIMULATED).any()
     fig7, fig8 = (FIG7_VIRTUAL, FIG8_NOTE + FIG8_VIRTUAL) if virtual else ("", FIG8_NOTE)
@@ -174,7 +174,7 @@ def _printed_B(damping: dict[str, Any]) -> dict[str, float]:
     return printed
 
 
-def _found(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
+def _experiment_results(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
     from vinetrack.paper.result_rows import ExperimentResults
 
     return ExperimentResults(

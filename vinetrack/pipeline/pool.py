@@ -15,7 +15,7 @@ from vinetrack.core.terminal import progress
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
-SMALLEST_POOL = 8
+MIN_ITEMS_FOR_POOL = 8
 """Below this many items a second process costs more to start than it saves. Chosen: starting a process takes as long as
 a few trials. At half small experiments take longer, at twice larger ones are not shared out."""
 
@@ -43,7 +43,7 @@ def map_trials(
     Answer
         In the order of `items`.
     """
-    if n_workers < 2 or len(items) < SMALLEST_POOL:
+    if n_workers < 2 or len(items) < MIN_ITEMS_FOR_POOL:
         yield from progress(map(function, items), label, total=len(items))
         return
     chunk = max(len(items) // (8 * n_workers), 1)
@@ -51,7 +51,7 @@ def map_trials(
         yield from progress(pool.map(function, items, chunksize=chunk), label, total=len(items))
 
 
-def as_they_come(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
+def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
     """Yield `function(item)` of every item as soon as it is there, in any order.
 
     `function` and items travel to other processes, so both must be picklable.

@@ -16,7 +16,7 @@ from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.settings import Limits
-from vinetrack.pipeline.simulated_answers import Simulation, key_of, simulated, simulated_chances
+from vinetrack.pipeline.simulated_answers import Simulation, simulate_answers, simulate_null_tests, size_key
 from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
 
-GUESSED_NOISE_MM, GUESSED_FPS = 0.1, 1069.0
+DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0
 """Noise of a position and frame rate where nothing states them. Chosen: the defaults of `vinetrack design campaign`; at
 half the noise, effects that noise hides are seen at half the size, those that scatter hides are not."""
 
 
 @dataclass(frozen=True)
-class PowerAsked:
+class PowerRequest:
     """What stands on the command line; NaN and None where nothing is said. Spreads are relative.
 
     `effects` are names, or `name=size` in the unit of the parameter; with `simulate`, campaigns are made with them.
@@ -67,7 +67,7 @@ class _Campaign:
     limits: Limits = field(default_factory=Limits)
 
 
-def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Power:
+def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Power:
     """Work out what the trials can see, by linear theory and, where asked for, by complete diagnoses.
 
     Parameters
@@ -88,22 +88,22 @@ def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Powe
     from vinetrack.core.terminal import waiting
 
     with waiting("working out what the trials can see"):
-        campaign = _campaign(asked) if given is None else _given(asked, given)
+        campaign = _campaign(asked) if given is None else _campaign_in_memory(asked, given)
     names = [text.partition("=")[0] for text in asked.effects]
     power = campaign.power
     for name in names:
         if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
-            _refuse(name, power)
+            _refuse_effect(name, power)
     if asked.simulate:
-        power = replace(power, simulated=tuple(_simulated(asked, campaign)))
+        power = replace(power, simulated=tuple(_simulated_rates(asked, campaign)))
     if asked.calibrate:
-        power = replace(power, calibration=_calibrated(asked, given))
+        power = replace(power, calibration=_null_calibration(asked, given))
     if math.isfinite(asked.reach):
-        power = replace(power, further=tuple(_further(asked, campaign)))
+        power = replace(power, further=tuple(_further_trials(asked, campaign)))
     return power.of_effects(names)
 
 
-def _further(asked: PowerAsked, campaign: _Campaign) -> Iterator[FurtherTrials]:
+def _further_trials(asked: PowerRequest, campaign: _Campaign) -> Iterator[FurtherTrials]:
     """The fewest further trials for every effect that has a size."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.further_trials import further_trials
@@ -114,7 +114,7 @@ def _further(asked: PowerAsked, campaign: _Campaign) -> Iterator[FurtherTrials]:
             remedy = "write the size to be found, such as leak=0.5" if not size else campaign.power.not_testable[name]
             words = "needs a size" if not size else "cannot be seen with the columns of these trials"
             raise ExperimentError([Problem(message=words, column="--effect", value=text, remedy=remedy)])
-        value = _value_of(text, campaign.power[name])
+        value = _size_of(text, campaign.power[name])
         with waiting(f"looking for trials that show {name}"):
             yield further_trials(campaign.design, campaign.power[name], value, asked.reach, campaign.limits)
 
@@ -138,7 +138,7 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
     ]
 
 
-def _refuse(name: str, power: Power) -> None:
+def _refuse_effect(name: str, power: Power) -> None:
     """Say that no such effect was asked about."""
     import difflib
 
@@ -151,7 +151,7 @@ def _refuse(name: str, power: Power) -> None:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class _MeasuredTrials:
     """Trials that were measured; `names` are the effects of the model, `added` those that a diagnosis put into it."""
 
     pairs: Sequence[tuple[Trial, Track]]
@@ -162,24 +162,24 @@ class _Measured:
     limits: Limits = field(default_factory=Limits)
 
 
-def _campaign(asked: PowerAsked) -> _Campaign:
+def _campaign(asked: PowerRequest) -> _Campaign:
     """Of trials that were measured, where there are any; else of the sheet."""
     from vinetrack.experiment.planned import planned_sheet
 
-    measured = _measured(asked)
+    measured = _measured_trials(asked)
     if measured is not None:
-        return _fitted(asked, measured)
-    return _planned(asked, planned_sheet(asked.target, every_row=True))
+        return _measured_campaign(asked, measured)
+    return _planned_campaign(asked, planned_sheet(asked.target, every_row=True))
 
 
-def _measured(asked: PowerAsked) -> _Measured | None:
+def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
     """The trials of a results folder or of an experiment with tracks; None of a sheet that nobody has filmed."""
     from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
 
     if (asked.target / PROVENANCE).exists():
-        return _measured_results(asked)
+        return _trials_of_results(asked)
     if not asked.target.is_dir():
         return None
     try:
@@ -191,38 +191,38 @@ def _measured(asked: PowerAsked) -> _Measured | None:
     settings = read.settings
     user_effects = dict(own_effects([read.folder / path for path in settings.effects]))
     pairs, _ = pairs_of(read)
-    return _Measured(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
+    return _MeasuredTrials(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
 
 
-def _given(asked: PowerAsked, given: Fit | Pairs) -> _Campaign:
+def _campaign_in_memory(asked: PowerRequest, given: Fit | Pairs) -> _Campaign:
     """Of trials in memory: as they were fitted, or fitted with the base model."""
     from vinetrack.inference.fit_result import Fit
 
     if isinstance(given, Fit):
         return _Campaign(fit_power(given), design_of_fit(given))
-    return _fitted(asked, _Measured(list(given), BASE_EFFECTS))
+    return _measured_campaign(asked, _MeasuredTrials(list(given), BASE_EFFECTS))
 
 
-def _measured_results(asked: PowerAsked) -> _Measured:
+def _trials_of_results(asked: PowerRequest) -> _MeasuredTrials:
     from vinetrack.diagnosis.result import ADEQUATE
     from vinetrack.effects import own_effects
-    from vinetrack.pipeline.model_stage import measured
-    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.pipeline.model_stage import measured_trials
+    from vinetrack.pipeline.source_experiment import read_source_experiment
     from vinetrack.results.folder_layout import Results
     from vinetrack.results.stored_diagnosis import read_diagnosis
 
     results = Results(asked.target)
-    experiment = experiment_behind(asked.target, asked.experiment)
+    experiment = read_source_experiment(asked.target, asked.experiment)
     settings = experiment.settings
     diagnosis = read_diagnosis(results)
     named = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
     added = tuple(name for name in named if name not in settings.model)
     user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
-    pairs = measured(experiment, results)[0]
-    return _Measured(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
+    pairs = measured_trials(experiment, results)[0]
+    return _MeasuredTrials(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
 
 
-def _fitted(asked: PowerAsked, measured: _Measured) -> _Campaign:
+def _measured_campaign(asked: PowerRequest, measured: _MeasuredTrials) -> _Campaign:
     """Trials that were measured: noise and scatter from the fit, but for what is stated."""
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for
     from vinetrack.dynamics.model import make_model
@@ -244,7 +244,7 @@ def _fitted(asked: PowerAsked, measured: _Measured) -> _Campaign:
     return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
 
 
-def _stated_noise(asked: PowerAsked, noise_m: float, correlation: float) -> tuple[float, float] | None:
+def _stated_noise(asked: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
     if math.isnan(asked.noise_mm) and math.isnan(asked.noise_correlation):
         return None
     return (
@@ -253,7 +253,7 @@ def _stated_noise(asked: PowerAsked, noise_m: float, correlation: float) -> tupl
     )
 
 
-def _stated_spreads(asked: PowerAsked, otherwise: tuple[float, float]) -> tuple[float, float] | None:
+def _stated_spreads(asked: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
     if math.isnan(asked.spread_P) and math.isnan(asked.spread_B):
         return None
     return (
@@ -272,7 +272,7 @@ def _input_rows(
     ]
 
 
-def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
+def _planned_campaign(asked: PowerRequest, planned: PlannedTrials) -> _Campaign:
     """Trials that nobody has filmed: B, n and the yield pressure stated, printed or from scaling laws."""
     from vinetrack.effects import own_effects
     from vinetrack.inference.parameters import DAMPING, EXPONENT
@@ -287,12 +287,14 @@ def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
             by_vine[trial.vine] = predictive_inputs(trial, stated)
     vine_inputs = list(by_vine.values())
     first = vine_inputs[0]
-    noise = _stated_noise(asked, GUESSED_NOISE_MM / 1e3, 0.0)
-    noise_m, correlation = noise or (GUESSED_NOISE_MM / 1e3, 0.0)
+    noise = _stated_noise(asked, DEFAULT_NOISE_MM / 1e3, 0.0)
+    noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
     spreads = _stated_spreads(asked, first.spreads)
     trials = tuple(_with_yield(trial, by_vine[trial.vine].trial) for trial in planned.trials)
     filmed_fps = [asked.capture_fps if math.isfinite(asked.capture_fps) else trial.capture_fps for trial in trials]
-    cameras = tuple(FilmingPlan(fps if math.isfinite(fps) else GUESSED_FPS, noise_m, correlation) for fps in filmed_fps)
+    cameras = tuple(
+        FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
+    )
     origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
     inputs = [
         *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
@@ -315,7 +317,7 @@ def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
     return _Campaign(design_power(design, inputs), design, settings.limits)
 
 
-def _fps_origin(asked: PowerAsked, trials: Sequence[Trial]) -> str:
+def _fps_origin(asked: PowerRequest, trials: Sequence[Trial]) -> str:
     if math.isfinite(asked.capture_fps):
         return "stated"
     return "sheet" if all(math.isfinite(trial.capture_fps) for trial in trials) else "guess"
@@ -331,7 +333,7 @@ def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
     return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=usual_Pa)
 
 
-def _sizes_of(asked: PowerAsked, campaign: _Campaign) -> list[tuple[str, float, float]]:
+def _simulated_sizes(asked: PowerRequest, campaign: _Campaign) -> list[tuple[str, float, float]]:
     """Effect, value in SI and promised rate of every kind of campaign that is simulated, the one with nothing first."""
     power = campaign.power
     wanted = [("", math.nan, power.false_alarm_rate)]
@@ -340,12 +342,12 @@ def _sizes_of(asked: PowerAsked, campaign: _Campaign) -> list[tuple[str, float, 
         if name in power.not_testable:
             continue
         entry = power[name]
-        sizes = [_value_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
+        sizes = [_size_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
         wanted += [(name, value, entry.probability_at(value)) for value in sizes if math.isfinite(value)]
     return wanted
 
 
-def _value_of(text: str, entry: EffectPower) -> float:
+def _size_of(text: str, entry: EffectPower) -> float:
     """The size in `name=size`, SI."""
     from vinetrack.core.units import display_unit
 
@@ -358,19 +360,19 @@ def _value_of(text: str, entry: EffectPower) -> float:
         raise ExperimentError([problem]) from None
 
 
-def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRates]:
+def _simulated_rates(asked: PowerRequest, campaign: _Campaign) -> Iterator[SimulatedRates]:
     """Rates of complete diagnoses; those kept by an earlier run are not made again."""
-    wanted = _sizes_of(asked, campaign)
+    wanted = _simulated_sizes(asked, campaign)
     how = Simulation(asked.simulate, asked.first_seed, asked.jobs, asked.answers or _answers_file(asked.target))
     design = replace(
         campaign.design, other_values={entry.effect: entry.other_values for entry in campaign.power.effects}
     )
-    answers = simulated(design, [(effect, value) for effect, value, _ in wanted], how)
+    answers = simulate_answers(design, [(effect, value) for effect, value, _ in wanted], how)
     for effect, value, promised in wanted:
-        yield rates_of([answers[effect, key_of(value), seed] for seed in how.seeds], promised)
+        yield rates_of([answers[effect, size_key(value), seed] for seed in how.seeds], promised)
 
 
-def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration:
+def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
     """The tests of the first model of measured trials, held against null campaigns of their design."""
     from vinetrack.diagnosis.candidates import testable
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
@@ -383,7 +385,7 @@ def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration
         questioned = candidates_of(given.model, None, given.model.user_effects)
         fitted = with_host(given, host_for(given.model, questioned))
     else:
-        measured = _measured(asked) if given is None else _Measured(list(given), BASE_EFFECTS)
+        measured = _measured_trials(asked) if given is None else _MeasuredTrials(list(given), BASE_EFFECTS)
         if measured is None:
             problem = Problem(
                 message="needs measured trials", column="--calibrate", value=str(asked.target),
@@ -399,7 +401,7 @@ def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration
     path = asked.answers or _answers_file(asked.target)
     path = path.with_name(f"{path.stem}_calibration.csv")
     how = Simulation(asked.calibrate, asked.first_seed, asked.jobs, path)
-    return calibrated(observed, simulated_chances(design_of_fit(fitted, candidates), how), fitted.model.names)
+    return calibrated(observed, simulate_null_tests(design_of_fit(fitted, candidates), how), fitted.model.names)
 
 
 def _answers_file(target: Path) -> Path:

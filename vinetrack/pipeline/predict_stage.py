@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import number
 from vinetrack.core.tables import STANDARD_OUTPUT, write_csv, write_json
 from vinetrack.pipeline.prediction_inputs import (
-    Asked,
-    Ground,
-    as_option,
+    PredictionBasis,
+    PredictionRequest,
     check_figure,
+    describe_trial,
+    display_unit_name,
+    display_value,
     input_rows,
     inputs_of,
-    read_ground,
-    shown,
-    trial_words,
-    unit_of,
+    name_missing_option,
+    read_basis,
     warnings_of,
     write_figure,
 )
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from vinetrack.planning.design_checks import Neglected
     from vinetrack.planning.prediction import Quantity, VinePrediction
 
-LEAST_N = 0.01
+SMALL_FORCE_N = 0.01
 """Largest force below which forces are shown in mN, N. Chosen: three digits then need no leading zeros."""
 
-WORTH_SHOWING = 0.005
+SMALLEST_LISTED_CHANGE = 0.005
 """Relative change of the final speed below which an effect that is left out is not listed. Chosen: half a per cent is a
 tenth of what a good measurement of speed resolves. At half the list grows by effects without weight, at twice some of
 one per cent are missing."""
@@ -50,7 +50,7 @@ class ConditionPrediction:
 
 
 def predict_conditions(
-    asked: Asked,
+    asked: PredictionRequest,
     *,
     samples: int,
     seed: int,
@@ -79,14 +79,14 @@ def predict_conditions(
     Raises
     ------
     ExperimentError, ResultsError, EffectError
-        If something asked for will not do; see `read_ground`.
+        If something asked for will not do; see `read_basis`.
     """
     import pandas as pd
 
     check_figure(figure)
-    ground = read_ground(asked)
+    ground = read_basis(asked)
     entries = _predict_all(ground, samples, seed, at_fraction)
-    lines = [*_one(entries[0])] if len(entries) == 1 else [*_several(entries)]
+    lines = [*_condition_lines(entries[0])] if len(entries) == 1 else [*_table_lines(entries)]
     lines += [f"! {words}" for words in warnings_of(ground)]
     if figure is not None:
         from vinetrack.figures.prediction_figures import draw_predictions
@@ -97,12 +97,12 @@ def predict_conditions(
         write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
         lines.append(f"Curves: {csv}")
     if json is not None:
-        write_json(json, [_entry(entry) for entry in entries])
+        write_json(json, [_json_entry(entry) for entry in entries])
         lines.append(f"Everything: {json}")
     return [] if json == STANDARD_OUTPUT else lines
 
 
-def _predict_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
+def _predict_all(ground: PredictionBasis, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
     """Predict every condition.
 
     Raises
@@ -124,17 +124,17 @@ def _predict_all(ground: Ground, samples: int, seed: int, at_fraction: float) ->
     except SimulationError as error:
         raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except EffectError as error:
-        raise as_option(error) from None
+        raise name_missing_option(error) from None
     return entries
 
 
-def _one(entry: ConditionPrediction) -> Iterator[str]:
+def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
     """Everything about one condition."""
     from vinetrack.core.terminal import table
 
     prediction = entry.prediction
     inputs = prediction.inputs
-    yield f"{trial_words(inputs.trial)}; {' + '.join(inputs.model.names)}"
+    yield f"{describe_trial(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
     yield from table(input_rows(inputs.bands()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
@@ -154,16 +154,16 @@ def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
     if unit == "Pa":
         texts, unit = [number(value / 1e6) for value in values], "MPa"
-    elif unit == "N" and max(abs(value) for value in values) < LEAST_N:
+    elif unit == "N" and max(abs(value) for value in values) < SMALL_FORCE_N:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
-        texts, unit = [shown(value, unit) for value in values], unit_of(unit)
+        texts, unit = [display_value(value, unit) for value in values], display_unit_name(unit)
     no_band = quantity.low == quantity.high or math.isnan(quantity.median)
     return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
 def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
-    return name, f"{shown(low, 'm/s')} to {shown(high, 'm/s')} m/s", words
+    return name, f"{display_value(low, 'm/s')} to {display_value(high, 'm/s')} m/s", words
 
 
 def _left_out(entry: ConditionPrediction) -> Iterator[str]:
@@ -172,20 +172,20 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
 
     rows = [
         (
-            effect_left_out.effect,
-            effect_left_out.size,
-            f"{shown(effect_left_out.without_m_s, 'm/s')} → {shown(effect_left_out.final_m_s, 'm/s')} m/s",
-            f"{effect_left_out.change:+.1%}",
+            omitted.effect,
+            omitted.size,
+            f"{display_value(omitted.without_m_s, 'm/s')} → {display_value(omitted.final_m_s, 'm/s')} m/s",
+            f"{omitted.change:+.1%}",
         )
-        for effect_left_out in entry.neglected
-        if abs(effect_left_out.change) >= WORTH_SHOWING
+        for omitted in entry.neglected
+        if abs(omitted.change) >= SMALLEST_LISTED_CHANGE
     ]
     if rows:
         yield ""
         yield from table(rows, ("left out of the model", "if it were", "the final speed went", ""))
 
 
-def _several(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
+def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     """A row a condition."""
     from vinetrack.core.terminal import table
     from vinetrack.planning.prediction import TIME
@@ -220,7 +220,7 @@ def _picture(prediction: VinePrediction) -> PredictionPicture:
     from vinetrack.figures.prediction_figures import PredictionPicture
 
     return PredictionPicture(
-        title=trial_words(prediction.inputs.trial),
+        title=describe_trial(prediction.inputs.trial),
         curve=prediction.curve,
         final_name=prediction.final.name,
         shares=[(share.name, share.low, share.high) for share in prediction.shares],
@@ -228,7 +228,7 @@ def _picture(prediction: VinePrediction) -> PredictionPicture:
     )
 
 
-def _entry(entry: ConditionPrediction) -> dict[str, Any]:
+def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
     """One condition as JSON holds it, SI."""
     prediction = entry.prediction
     return {

@@ -33,7 +33,7 @@ NEVER = "never"
 
 
 @dataclass(frozen=True)
-class Asked:
+class PredictionRequest:
     """What stands on the command line. `cells` are texts by column of the sheet, those that were given.
 
     `B_error` and `spreads` are relative. NaN and None where nothing is said. `anyway` allows a fit whose model was
@@ -54,7 +54,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Ground:
+class PredictionBasis:
     """What predictive inputs are made from: planned trials, stated values, and a fit where there is one."""
 
     planned: PlannedTrials
@@ -62,7 +62,7 @@ class Ground:
     fit: FitNumbers | None
 
 
-def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
+def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
     """Read the sheet or the options, the fit, and the effects that are asked for.
 
     Parameters
@@ -73,7 +73,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
 
     Returns
     -------
-    Ground
+    PredictionBasis
 
     Raises
     ------
@@ -84,7 +84,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
     EffectError
         If an effect is unknown or has no such size.
     """
-    from vinetrack.experiment.planned import NEEDED
+    from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
     from vinetrack.experiment.settings import ExperimentSettings
     from vinetrack.planning.input_sources import StatedValues
     from vinetrack.planning.predictive_inputs import read_sizes
@@ -93,12 +93,16 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         planned = planned_sheet(asked.sheet)
         _refuse_beside_sheet(asked)
     else:
-        planned = planned_trial(asked.cells, ExperimentSettings(), NEEDED if needed is None else needed)
+        planned = planned_trial(
+            asked.cells, ExperimentSettings(), REQUIRED_FOR_PREDICTION if needed is None else needed
+        )
     if asked.tail_slack is not None:
         planned = replace(
             planned, trials=tuple(replace(trial, tail_slack=asked.tail_slack) for trial in planned.trials)
         )
-    fit, user_effects = (None, _own(planned)) if asked.results is None else _read_fit(asked.results, asked.anyway)
+    fit, user_effects = (
+        (None, _effects_of_sheet(planned)) if asked.results is None else _read_fit(asked.results, asked.anyway)
+    )
     sizes = [read_sizes(text, user_effects) for text in asked.effects]
     stated = StatedValues(
         B=asked.B,
@@ -111,10 +115,10 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         user_effects=user_effects,
         spreads=asked.spreads,
     )
-    return Ground(planned, stated, fit)
+    return PredictionBasis(planned, stated, fit)
 
 
-def _refuse_beside_sheet(asked: Asked) -> None:
+def _refuse_beside_sheet(asked: PredictionRequest) -> None:
     problems = [
         Problem(message="stands beside a sheet", column=option(name), value=text, remedy="write it in the sheet")
         for name, text in asked.cells.items()
@@ -123,14 +127,14 @@ def _refuse_beside_sheet(asked: Asked) -> None:
         raise ExperimentError(problems)
 
 
-def _own(planned: PlannedTrials) -> Mapping[str, Effect]:
+def _effects_of_sheet(planned: PlannedTrials) -> Mapping[str, Effect]:
     """The user's own effects of the sheet's experiment."""
     from vinetrack.pipeline.effects_stage import effects_of
 
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def fit_heading(asked: Asked) -> list[str]:
+def fit_heading(asked: PredictionRequest) -> list[str]:
     """What must stand above everything predicted from a fit: the verdict on its model.
 
     Parameters
@@ -176,12 +180,12 @@ def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Eff
     return fit, user_effects
 
 
-def inputs_of(ground: Ground) -> list[PredictiveInputs]:
+def inputs_of(ground: PredictionBasis) -> list[PredictiveInputs]:
     """Predictive inputs of every trial.
 
     Parameters
     ----------
-    ground : from `read_ground`.
+    ground : from `read_basis`.
 
     Returns
     -------
@@ -202,7 +206,7 @@ def inputs_of(ground: Ground) -> list[PredictiveInputs]:
         raise ResultsError(str(error)) from None
 
 
-def as_option(error: Exception) -> Exception:
+def name_missing_option(error: Exception) -> Exception:
     """What an effect needs, said of the option or the column that is missing; any other error as it is.
 
     Parameters
@@ -222,12 +226,12 @@ def as_option(error: Exception) -> Exception:
     )
 
 
-def warnings_of(ground: Ground) -> list[str]:
+def warnings_of(ground: PredictionBasis) -> list[str]:
     """What is legal in the sheet or the options, but hardly meant.
 
     Parameters
     ----------
-    ground : from `read_ground`.
+    ground : from `read_basis`.
 
     Returns
     -------
@@ -236,8 +240,8 @@ def warnings_of(ground: Ground) -> list[str]:
     return [str(problem) for problem in ground.planned.problems]
 
 
-def litres(volume_m3: float) -> str:
-    """A volume as people say it: litres, or millilitres where they are few.
+def format_volume(volume_m3: float) -> str:
+    """A volume in litres, or in millilitres below 0.1 L.
 
     Parameters
     ----------
@@ -250,13 +254,13 @@ def litres(volume_m3: float) -> str:
 
     Examples
     --------
-    >>> litres(3.7e-3), litres(3.534e-6)
+    >>> format_volume(3.7e-3), format_volume(3.534e-6)
     ('3.7 L', '3.53 mL')
     """
     return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
 
 
-def trial_words(trial: Trial) -> str:
+def describe_trial(trial: Trial) -> str:
     """A trial as a person would write it.
 
     Parameters
@@ -270,7 +274,7 @@ def trial_words(trial: Trial) -> str:
     Examples
     --------
     >>> from vinetrack.core.records import Trial
-    >>> trial_words(Trial(name="a", diameter_m=0.025, thickness_m=1e-4, length_m=0.4, pressure_Pa=62e3))
+    >>> describe_trial(Trial(name="a", diameter_m=0.025, thickness_m=1e-4, length_m=0.4, pressure_Pa=62e3))
     '25 mm × 100 µm × 400 mm at 62 kPa, no payload, growing straight down'
     """
     size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
@@ -278,12 +282,12 @@ def trial_words(trial: Trial) -> str:
     degrees = math.degrees(trial.growth_angle_rad)
     named = {0: "straight down", 90: "horizontally", 180: "straight up"}
     way = named.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
-    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {litres(trial.chamber_m3)}"
+    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {format_volume(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
     return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {way}{rig}"
 
 
-def shown(value: float, unit: str, digits: int = 3) -> str:
+def display_value(value: float, unit: str, digits: int = 3) -> str:
     """An SI value in the unit people use, to so many digits; a time that never comes is `never`.
 
     Parameters
@@ -304,7 +308,7 @@ def shown(value: float, unit: str, digits: int = 3) -> str:
     return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
 
 
-def unit_of(unit: str) -> str:
+def display_unit_name(unit: str) -> str:
     """The unit that `shown` uses.
 
     Parameters
@@ -336,8 +340,10 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
         if entry.origin == "constant":
             continue
         exact = entry.low == entry.high
-        spread = "–" if exact else f"{shown(entry.low, entry.unit)} to {shown(entry.high, entry.unit)}"
-        rows.append((entry.symbol, shown(entry.median, entry.unit), spread, unit_of(entry.unit), entry.origin))
+        spread = "–" if exact else f"{display_value(entry.low, entry.unit)} to {display_value(entry.high, entry.unit)}"
+        rows.append(
+            (entry.symbol, display_value(entry.median, entry.unit), spread, display_unit_name(entry.unit), entry.origin)
+        )
     return rows
 
 

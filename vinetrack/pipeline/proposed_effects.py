@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vinetrack.experiment.folder import Experiment
-from vinetrack.pipeline.model_stage import measured
+from vinetrack.pipeline.model_stage import measured_trials
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
@@ -62,7 +62,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
         )
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
-    pairs, _ = measured(experiment, results)
+    pairs, _ = measured_trials(experiment, results)
     proposal = propose(model, pairs, report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal.sentences()]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.files import is_full
+from vinetrack.core.files import is_disk_full
 from vinetrack.core.numbers import number
 from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row, write_empty
@@ -49,10 +49,10 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
     if fault:
         log.error("trial %s:\n%s", name, fault)
     log.info("%s: %s", name, reason or "analysed")
-    return f"{name}: failed: {reason}" if reason else f"{name}: {_understood(results, trial)}."
+    return f"{name}: failed: {reason}" if reason else f"{name}: {_outcome(results, trial)}."
 
 
-def _understood(results: Results, trial: Trial) -> str:
+def _outcome(results: Results, trial: Trial) -> str:
     """How many frames of a trial show where the edge was, and its sizes beside those of the sheet, in words."""
     track = read_result(results.track(trial.name))
     row = read_json(results.analysed(trial.name))["row"]
@@ -75,7 +75,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     measurement = None
     try:
         measurement = measure_recording(trial, experiment.settings, experiment.folder)
-        differing = _differences(trial, measurement)
+        differing = _contradictions(trial, measurement)
         track = measurement.tracking.track
         track = replace(track, notes=(*track.notes, *(problem.reason for problem in differing)))
         if trial.pressure_trace is not None:
@@ -90,7 +90,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             scale_rel_sigma=measurement.scale_rel_sigma,
             tube_width_mm=1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
         )
-        view = _view(measurement, getattr(experiment.settings.calibration, "image", None))
+        view = _calibration_and_axis(measurement, getattr(experiment.settings.calibration, "image", None))
         contradictions = [{"column": problem.column, "reason": problem.reason} for problem in differing]
         path = results.analysed(trial.name)
         write_json(path, read_json(path) | view | {"contradictions": contradictions})
@@ -98,15 +98,15 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
     except Exception as error:
-        if is_full(error):
+        if is_disk_full(error):
             raise  # a fault of the disk is none of this trial
         reason, fault = INTERNAL_FAULT, traceback.format_exc()
         write_empty(results, trial.name, failed_row(trial, reason))
-    _draw(trial, results, measurement, reason, settings)
+    _draw_strip_figure(trial, results, measurement, reason, settings)
     return reason, fault
 
 
-def _differences(trial: Trial, measurement: Measurement) -> list[Problem]:
+def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
     """Every size and exposure in the picture that differs from the sheet.
 
     Raises
@@ -125,7 +125,7 @@ def _differences(trial: Trial, measurement: Measurement) -> list[Problem]:
     return problems
 
 
-def _view(measurement: Measurement, image: str | None) -> dict[str, Any]:
+def _calibration_and_axis(measurement: Measurement, image: str | None) -> dict[str, Any]:
     """What the scale of a recording rests on, and the axis its `edge_px` counts along."""
     from vinetrack.video.curved_axis import axis_entry
 
@@ -147,7 +147,9 @@ def _view(measurement: Measurement, image: str | None) -> dict[str, Any]:
     return {"calibration": entry, "axis": line}
 
 
-def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
+def _draw_strip_figure(
+    trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings
+) -> None:
     from vinetrack.figures.strip_figure import draw_strip
     from vinetrack.figures.style import blank, render
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
-from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
+from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosis_section, read_diagnosis_tables
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.results.folder_layout import Results, read_json, read_result
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from vinetrack.report.model_section import ModelResult
     from vinetrack.report.trials_section import TrackedRecording
 
-_WHOLLY = "It shows the initial model, which the diagnosis refutes."
-_PARTLY = "The dashed model is the initial one, which the diagnosis refutes."
+_SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
+_DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
 OF_INITIAL_MODEL = {
-    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _WHOLLY),
-    **dict.fromkeys(("model_comparison", "before_after"), _PARTLY),
+    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _SHOWS_REFUTED),
+    **dict.fromkeys(("model_comparison", "before_after"), _DASHED_REFUTED),
 }
 """What the caption of a figure adds where the model in it is refuted."""
 
-MOST_CURVE_ROWS = 6000
+MAX_CURVE_ROWS = 6000
 """Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
 
 
@@ -95,7 +95,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     trials = read_result(results.trials)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
-    diagnosed = read_diagnosed(results, describe_conditions(trials, experiment.trials))
+    diagnosed = read_diagnosis_tables(results, describe_conditions(trials, experiment.trials))
     own_data = {name: _as_csv(table) for name, table in figure_tables(diagnosed).items()}
     own_data["model_comparison"] = _as_csv(_curves(results))
     return ReportContent(
@@ -111,7 +111,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, diagnosed, trials),
         model=_model_result(results),
-        diagnosis=read_diagnosis(results, experiment),
+        diagnosis=read_diagnosis_section(results, experiment),
         sections=[_paper_section(results)] if experiment.settings.published else [],
         notes=experiment.blank_notes,
     )
@@ -178,7 +178,7 @@ def _curves(results: Results) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame()
     whole = pd.concat(parts, ignore_index=True)
-    return whole.iloc[:: -(-len(whole) // MOST_CURVE_ROWS)]
+    return whole.iloc[:: -(-len(whole) // MAX_CURVE_ROWS)]
 
 
 def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> Clip | None:

@@ -12,7 +12,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 
 PACKAGE = Path(__file__).parents[1]
 
-CLAIM = "experiment.json"
+CLAIM_FILE = "experiment.json"
 """File of a results folder that names its experiment from the beginning of a run; `provenance.json` comes last."""
 
 
@@ -55,7 +55,7 @@ def _shown(path: Path) -> str:
     return os.path.relpath(path)
 
 
-def find_nature(folder: Path, base: Path) -> Path | None:
+def find_ground_truth(folder: Path, base: Path) -> Path | None:
     """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
 
     The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
@@ -89,7 +89,7 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
     ExperimentError
         If what is there was made from another experiment that still exists, naming both.
     """
-    for name in ("provenance.json", CLAIM):
+    for name in ("provenance.json", CLAIM_FILE):
         try:
             made_from = Path(str(json.loads((results / name).read_text(encoding="utf-8"))["experiment"]))
         except (OSError, ValueError, KeyError, TypeError):
@@ -110,7 +110,7 @@ def claim_results(results: Path, experiment: Path) -> None:
     """
     from vinetrack.core.tables import write_json
 
-    write_json(results / CLAIM, {"experiment": experiment.absolute().as_posix()})
+    write_json(results / CLAIM_FILE, {"experiment": experiment.absolute().as_posix()})
 
 
 def path_problems(*folders: Path) -> list[Problem]:
@@ -130,11 +130,11 @@ def path_problems(*folders: Path) -> list[Problem]:
             remedy="rename the folder, or run the stages one by one with vinetrack",
         )
         for folder in folders
-        if is_pattern(folder)
+        if has_wildcard(folder)
     ]  # fmt: skip
 
 
-def is_pattern(path: Path) -> bool:
+def has_wildcard(path: Path) -> bool:
     """Whether Snakemake would take part of a path for a wildcard or a variable; it has no way to write such marks.
 
     Parameters
@@ -143,6 +143,6 @@ def is_pattern(path: Path) -> bool:
 
     Returns
     -------
-    is_pattern : bool
+    bool
     """
     return re.search(r"[{}]|<\w+>", str(path)) is not None

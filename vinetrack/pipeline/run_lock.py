@@ -20,21 +20,21 @@ from pathlib import Path
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_text
 
-SAME_START_S = 1.0
+START_TOLERANCE_S = 1.0
 """Difference of two readings of one process's start. Derived: systems count it in hundredths of a second; a number that
 is given anew belongs to a process that began later by the time all others take, minutes at the least."""
-FRESH_S = 60.0
+MIN_UNFINISHED_AGE_S = 60.0
 """Age below which an unfinished file in the experiment may be somebody's save. Chosen: a save takes milliseconds; at
 half or twice nothing changes but on network drives."""
-ENTRY = ".run.json"
+OWNER_FILE = ".run.json"
 """File of a results folder that names the process that writes it."""
 
-TAKEN_AWAY = "The lock of a run that was broken off"
-OPEN_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
+LOCK_REMOVED = "The lock of a run that was broken off"
+UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
 """Names under which files are written before they take their own."""
 
 
-LOOKING = re.compile(
+NON_EXECUTING_OPTIONS = re.compile(
     r"-[a-zA-Z]*[nlhDS][a-zA-Z]*|--(dry-?run|unlock|lint|report|summary|detailed-summary|dag|rulegraph|filegraph|d3dag|list.*|help|"
     r"version|archive|print-compilation|cleanup-.*|delete-.*|containerize)(=.*)?"
 )
@@ -60,10 +60,10 @@ class RunOwner:
         if not self.is_here:
             return True
         started_s = _process_start_s(self.pid)
-        return started_s is not None and abs(started_s - self.started_s) < SAME_START_S
+        return started_s is not None and abs(started_s - self.started_s) < START_TOLERANCE_S
 
 
-def only_looks(options: Iterable[str]) -> bool:
+def executes_nothing(options: Iterable[str]) -> bool:
     """Whether Snakemake runs nothing with these options: it draws, lists, unlocks or says what it would do.
 
     Parameters
@@ -74,7 +74,7 @@ def only_looks(options: Iterable[str]) -> bool:
     -------
     True where nothing is run.
     """
-    return any(LOOKING.fullmatch(option) for option in options)
+    return any(NON_EXECUTING_OPTIONS.fullmatch(option) for option in options)
 
 
 def refuse_running(results: Path) -> None:
@@ -89,7 +89,7 @@ def refuse_running(results: Path) -> None:
     ExperimentError
         Naming the process.
     """
-    owner = _owner(results / ENTRY)
+    owner = _read_owner(results / OWNER_FILE)
     if owner is not None and owner.pid != os.getpid() and owner.is_alive:
         raise ExperimentError([_refusal(owner, results)])
 
@@ -113,15 +113,15 @@ def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str
         If another run that is still alive writes these results, naming its process.
     """
     refuse_running(results)
-    entry = (results / ENTRY).absolute()  # Snakemake may end in another folder
-    owner = _owner(entry)
+    entry = (results / OWNER_FILE).absolute()  # Snakemake may end in another folder
+    owner = _read_owner(entry)
     if owner is not None and owner.pid != os.getpid() and _remove_locks(working, results):
-        say(f"{TAKEN_AWAY} (process {owner.pid}) is taken away; what it finished is kept.")
+        say(f"{LOCK_REMOVED} (process {owner.pid}) is taken away; what it finished is kept.")
     started_s = _process_start_s(os.getpid()) or time.time()
     write_text(entry, json.dumps(asdict(RunOwner(os.getpid(), started_s, socket.gethostname()))))
-    atexit.register(_leave, entry, os.getpid())
+    atexit.register(_remove_owner_file, entry, os.getpid())
     clear_unfinished(results.rglob("*"))
-    clear_unfinished(experiment.glob("*"), older_than_s=FRESH_S)
+    clear_unfinished(experiment.glob("*"), older_than_s=MIN_UNFINISHED_AGE_S)
 
 
 def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
@@ -132,13 +132,13 @@ def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
     paths : where to look; only names that unfinished files have are touched.
     older_than_s : age at least, s.
     """
-    for path in [path for path in paths if OPEN_FILES.fullmatch(path.name)]:
+    for path in [path for path in paths if UNFINISHED_FILES.fullmatch(path.name)]:
         with contextlib.suppress(OSError):
             if path.is_file() and time.time() - path.stat().st_mtime >= older_than_s:
                 path.unlink()
 
 
-def _leave(entry: Path, pid: int) -> None:
+def _remove_owner_file(entry: Path, pid: int) -> None:
     """Remove the entry of this process; a copy of it that was forked leaves it alone."""
     if os.getpid() == pid:
         with contextlib.suppress(OSError):
@@ -150,12 +150,12 @@ def _refusal(owner: RunOwner, results: Path) -> Problem:
     remedy = "wait until it ends, or end it"
     if not owner.is_here:
         message += f" of the computer {owner.host}"
-        remedy = f"wait until it ends; if it no longer runs, remove {results / ENTRY}"
+        remedy = f"wait until it ends; if it no longer runs, remove {results / OWNER_FILE}"
     since = time.strftime("%H:%M on %d %B", time.localtime(owner.started_s))
     return Problem(message=f"{message}, since {since}", file=str(results), remedy=remedy)
 
 
-def _owner(entry: Path) -> RunOwner | None:
+def _read_owner(entry: Path) -> RunOwner | None:
     """Who has entered last and not left; an entry that cannot be read says nothing."""
     try:
         return RunOwner(**json.loads(entry.read_text(encoding="utf-8")))

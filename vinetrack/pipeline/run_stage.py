@@ -16,8 +16,14 @@ from typing import TextIO
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import Progress, progress
-from vinetrack.pipeline.run_folders import PACKAGE, claim_results, find_experiment, find_nature, refuse_shared_results
-from vinetrack.pipeline.run_lock import TAKEN_AWAY, refuse_running
+from vinetrack.pipeline.run_folders import (
+    PACKAGE,
+    claim_results,
+    find_experiment,
+    find_ground_truth,
+    refuse_shared_results,
+)
+from vinetrack.pipeline.run_lock import LOCK_REMOVED, refuse_running
 from vinetrack.pipeline.workflow import SNAKEFILE
 
 Say = Callable[[str], None]
@@ -26,17 +32,17 @@ _FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+?)(?:_(\d+))?\)")
 _STEPS = re.compile(r"^(\d+) of (\d+) steps")
 _FAILED = re.compile(r"^Error in rule (\w+)")
 _STAGE_LOG = re.compile(r"^\s+log: (\S.*\.log)")
-_NOISE = re.compile(
+_SNAKEMAKE_LINES = re.compile(
     r"^(\[|\s|$|Finished jobid|\d+ of \d+ steps|Select jobs|Execute \d|Using |Config file|Assuming|Building|Provided|"
     r"Rules claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting|"
     r"Removing output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
 )
 """Lines of Snakemake about itself; format of version 9. What stages print is what is left."""
 
-LAST_WORDS = 12
+MAX_EXPLANATION_LINES = 12
 """Chosen: lines of stages that are kept to explain a failure; a stage that stops says why in one to three."""
 
-STAGE_WORDS = {
+STAGE_DONE_TEXT = {
     "laboratory": "recordings of the virtual laboratory made",
     "recording": "recordings tracked",
     "tracks": "tracks analysed",
@@ -88,7 +94,7 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
     return RunPaths(experiment, results)
 
 
-def check_first(experiment: Path, say: Say) -> None:
+def check_before_run(experiment: Path, say: Say) -> None:
     """Say what is wrong with an experiment before its run.
 
     Parameters
@@ -105,7 +111,7 @@ def check_first(experiment: Path, say: Say) -> None:
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.pipeline.check_stage import check_folder
 
-    if find_nature(experiment, PACKAGE.parent):
+    if find_ground_truth(experiment, PACKAGE.parent):
         return  # The virtual laboratory makes the recordings of the demonstration in the run itself.
     checked = check_folder(experiment)
     errors = [problem for problem in checked.problems if problem.severity == "error"]
@@ -151,12 +157,12 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace"
         ) as process:
             assert process.stdout is not None
-            failed, words = _follow(_kept(process.stdout, kept), say)
+            failed, words = _follow(_copied_to(process.stdout, kept), say)
         if process.returncode:
-            raise RunError(_why(failed, words, log))
+            raise RunError(_failure_text(failed, words, log))
 
 
-def _kept(lines: Iterable[str], file: TextIO) -> Iterator[str]:
+def _copied_to(lines: Iterable[str], file: TextIO) -> Iterator[str]:
     """The lines without their ends, each written to the file before it is handed on."""
     for line in lines:
         file.write(line)
@@ -166,7 +172,7 @@ def _kept(lines: Iterable[str], file: TextIO) -> Iterator[str]:
 def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
     """Show how a run gets on; the stages that failed with their logs, and the last lines that stages printed."""
     failed: dict[str, str] = {}
-    words: deque[str] = deque(maxlen=LAST_WORDS)
+    words: deque[str] = deque(maxlen=MAX_EXPLANATION_LINES)
     done: Counter[str] = Counter()
     shown, rule, part = sys.stderr.isatty(), "", None
     bar: Progress[int] | None = None
@@ -174,9 +180,9 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
         if match := _FINISHED.match(line):
             rule, part = match[1], match[2]
             done[rule] += 1
-        elif (match := _STEPS.match(line)) and rule in STAGE_WORDS:
+        elif (match := _STEPS.match(line)) and rule in STAGE_DONE_TEXT:
             steps, total = int(match[1]), int(match[2])
-            text = STAGE_WORDS[rule]
+            text = STAGE_DONE_TEXT[rule]
             if part:
                 text += f", part {part}"
             elif done[rule] > 1:
@@ -192,16 +198,16 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
             failed.setdefault(rule, "")
         elif failed and (match := _STAGE_LOG.match(line)):
             failed[rule] = failed[rule] or match[1].split(" (check log")[0]
-        elif line.startswith(TAKEN_AWAY):
+        elif line.startswith(LOCK_REMOVED):
             say(line)
-        elif not _NOISE.match(line):
+        elif not _SNAKEMAKE_LINES.match(line):
             words.append(line)
     if bar is not None:
         bar.__exit__(None, None, None)
     return failed, list(words)
 
 
-def _why(failed: dict[str, str], words: list[str], log: Path) -> str:
+def _failure_text(failed: dict[str, str], words: list[str], log: Path) -> str:
     """Which stage stopped a run and what it printed."""
     sentences = [line for line in words if line.strip()]
     if not failed:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 LEDGER = "campaign.json"
 """Name of the ledger, beside the sheet. A convention."""
 
-USUAL_RISK = 0.03
+DEFAULT_RISK = 0.03
 """Risk of stopping with a wrong name where none is stated. Chosen: three campaigns in a hundred; at half or twice a
 campaign takes about a tenth more or fewer trials, for the risk enters by its logarithm."""
 
@@ -62,47 +62,47 @@ def look_at_folder(target: Path, risk: float | None = None, experiment: Path | N
     ExperimentError, ResultsError, FitError
         If there is nothing to look at, or another risk was stated before.
     """
-    diagnosis, pairs, folder = _diagnosed(target, experiment)
+    diagnosis, pairs, folder = _diagnose_target(target, experiment)
     before = read_ledger(folder / LEDGER)
     if before is not None and risk is not None and risk != before.risk:
         remedy = f"leave it at {before.risk:g}, or begin another campaign without {folder / LEDGER}"
         problem = Problem(message="was stated otherwise before", column="--risk", value=f"{risk:g}", remedy=remedy)
         raise ExperimentError([problem])
-    ledger = before or Ledger(USUAL_RISK if risk is None else risk)
-    mark, look = _mark(pairs), look_at(diagnosis, len(pairs), ledger.risk)
+    ledger = before or Ledger(DEFAULT_RISK if risk is None else risk)
+    mark, look = _data_fingerprint(pairs), look_at(diagnosis, len(pairs), ledger.risk)
     looks, marks = ledger.looks, ledger.marks
     if marks and marks[-1] == mark:
         looks, marks = looks[:-1], marks[:-1]
-    ledger = replace(ledger, looks=(*looks, look), marks=(*marks, mark), next_text=_next(diagnosis, look))
+    ledger = replace(ledger, looks=(*looks, look), marks=(*marks, mark), next_text=_next_step(diagnosis, look))
     write_json(folder / LEDGER, ledger.to_json())
     return ledger
 
 
-def _diagnosed(target: Path, experiment: Path | None) -> tuple[Diagnosis, Sequence[tuple[Trial, Track]], Path]:
+def _diagnose_target(target: Path, experiment: Path | None) -> tuple[Diagnosis, Sequence[tuple[Trial, Track]], Path]:
     """Diagnosis, trials with their tracks, and the folder of the sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
-    from vinetrack.pipeline.model_stage import measured
+    from vinetrack.pipeline.model_stage import measured_trials
     from vinetrack.pipeline.run_folders import find_experiment
-    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.pipeline.source_experiment import read_source_experiment
     from vinetrack.results.folder_layout import Results, ResultsError
     from vinetrack.results.stored_diagnosis import read_diagnosis
 
     if (target / PROVENANCE).exists():
-        read = experiment_behind(target, experiment)
+        read = read_source_experiment(target, experiment)
         results = Results(target)
         stored = read_diagnosis(results)
         if stored is None:
             raise ResultsError(f"{target} has no diagnosis yet: run `vinetrack run {read.folder}` first")
-        return stored, measured(read, results)[0], read.folder
+        return stored, measured_trials(read, results)[0], read.folder
     read = read_experiment(find_experiment(target))
     if all(trial.track is None for trial in read.trials):
         raise ResultsError(f"{target} holds recordings: run `vinetrack run {target}`, then give its results folder")
     return diagnose(read, ladder=False), pairs_of(read)[0], read.folder
 
 
-def _mark(pairs: Sequence[tuple[Trial, Track]]) -> str:
+def _data_fingerprint(pairs: Sequence[tuple[Trial, Track]]) -> str:
     """A short text that changes with the trials and their positions."""
     code = hashlib.sha256()
     for trial, track in pairs:
@@ -111,7 +111,7 @@ def _mark(pairs: Sequence[tuple[Trial, Track]]) -> str:
     return code.hexdigest()[:12]
 
 
-def _next(diagnosis: Diagnosis, look: CampaignLook) -> str:
+def _next_step(diagnosis: Diagnosis, look: CampaignLook) -> str:
     """What to do next, in a sentence or two."""
     if look.decision == STOP:
         return "Stop: film no more for this question."

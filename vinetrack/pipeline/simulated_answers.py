@@ -15,11 +15,11 @@ from pathlib import Path
 from vinetrack.diagnosis.campaign_power import CampaignDesign
 from vinetrack.diagnosis.null_calibration import TESTS, TestChances, null_chances
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, simulated_answer
-from vinetrack.pipeline.pool import as_they_come
+from vinetrack.pipeline.pool import map_unordered
 
 Task = tuple[CampaignDesign, str, float, int]
-COLUMNS_KEPT = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
-CHANCES_KEPT = ("design", "seed", *TESTS, "failed")
+ANSWER_COLUMNS = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
+P_VALUE_COLUMNS = ("design", "seed", *TESTS, "failed")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Simulation:
         return range(self.first_seed, self.first_seed + self.campaigns)
 
 
-def simulated(
+def simulate_answers(
     design: CampaignDesign, wanted: Sequence[tuple[str, float]], how: Simulation
 ) -> dict[tuple[str, str, int], SimulatedAnswer]:
     """Diagnose simulated campaigns from beginning to end.
@@ -52,30 +52,30 @@ def simulated(
     Returns
     -------
     dict
-        Answers by effect, value as `key_of` writes it, and seed.
+        Answers by effect, value as `size_key` writes it, and seed.
     """
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
-    kept = {(a.effect, key_of(a.value), a.seed): a for a in kept_answers(how.path, mark)}
+    kept = {(a.effect, size_key(a.value), a.seed): a for a in stored_answers(how.path, mark)}
     tasks: list[Task] = [
         (design, effect, value, seed)
         for seed in how.seeds
         for effect, value in wanted
-        if (effect, key_of(value), seed) not in kept
+        if (effect, size_key(value), seed) not in kept
     ]
     total = len(wanted) * how.campaigns
     bar: Progress[None]
     with progress(total, "simulating", unit="campaign") as bar:
         bar.advance(total - len(tasks))
-        for answer in as_they_come(_answer, tasks, how.jobs):
-            _keep(how.path, COLUMNS_KEPT, _row(mark, answer))
-            kept[answer.effect, key_of(answer.value), answer.seed] = answer
+        for answer in map_unordered(_diagnose_task, tasks, how.jobs):
+            _append_row(how.path, ANSWER_COLUMNS, _row(mark, answer))
+            kept[answer.effect, size_key(answer.value), answer.seed] = answer
             bar.advance()
     return kept
 
 
-def simulated_chances(design: CampaignDesign, how: Simulation) -> list[TestChances]:
+def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[TestChances]:
     """Ask every test of simulated campaigns in which nothing is missing.
 
     Parameters
@@ -91,20 +91,20 @@ def simulated_chances(design: CampaignDesign, how: Simulation) -> list[TestChanc
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
-    kept = {chances.seed: chances for chances in _kept_chances(how.path, mark)}
+    kept = {chances.seed: chances for chances in _stored_p_values(how.path, mark)}
     tasks = [(design, seed) for seed in how.seeds if seed not in kept]
     bar: Progress[None]
     with progress(how.campaigns, "calibrating", unit="campaign") as bar:
         bar.advance(how.campaigns - len(tasks))
-        for chances in as_they_come(_chances, tasks, how.jobs):
+        for chances in map_unordered(_test_task, tasks, how.jobs):
             values = [f"{chances.chances[name]:.6g}" if chances.chances else "" for name in TESTS]
-            _keep(how.path, CHANCES_KEPT, [mark, chances.seed, *values, chances.failed])
+            _append_row(how.path, P_VALUE_COLUMNS, [mark, chances.seed, *values, chances.failed])
             kept[chances.seed] = chances
             bar.advance()
     return [kept[seed] for seed in how.seeds]
 
 
-def key_of(value: float) -> str:
+def size_key(value: float) -> str:
     """Return a size as it is written in the file of answers.
 
     Parameters
@@ -118,11 +118,11 @@ def key_of(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.9g}"
 
 
-def _answer(task: Task) -> SimulatedAnswer:
+def _diagnose_task(task: Task) -> SimulatedAnswer:
     return simulated_answer(*task)
 
 
-def _chances(task: tuple[CampaignDesign, int]) -> TestChances:
+def _test_task(task: tuple[CampaignDesign, int]) -> TestChances:
     return null_chances(*task)
 
 
@@ -148,7 +148,7 @@ def fingerprint(design: CampaignDesign) -> str:
     return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
 
 
-def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
+def stored_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
     """Answers that an earlier run has kept about this design; those about others are passed over.
 
     Parameters
@@ -171,19 +171,19 @@ def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
             seconds=float(row["seconds"] or "nan"),
             failed=row["failed"],
         )
-        for row in _kept_rows(path, mark)
+        for row in _stored_rows(path, mark)
     ]
 
 
-def _kept_chances(path: Path, mark: str) -> list[TestChances]:
+def _stored_p_values(path: Path, mark: str) -> list[TestChances]:
     """Chances that an earlier run has kept about this design."""
     return [
         TestChances(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
-        for row in _kept_rows(path, mark)
+        for row in _stored_rows(path, mark)
     ]
 
 
-def _kept_rows(path: Path, mark: str) -> list[dict[str, str]]:
+def _stored_rows(path: Path, mark: str) -> list[dict[str, str]]:
     """Whole rows of a file that are about this design; none where there is no file."""
     if not path.is_file():
         return []
@@ -194,12 +194,12 @@ def _kept_rows(path: Path, mark: str) -> list[dict[str, str]]:
 def _row(mark: str, answer: SimulatedAnswer) -> list[object]:
     seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
     return [
-        mark, answer.effect, key_of(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
+        mark, answer.effect, size_key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
         "|".join(answer.effects), seconds, answer.failed,
     ]  # fmt: skip
 
 
-def _keep(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
+def _append_row(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
     """Append one answer; the header stands in a new file."""
     new = not path.is_file()
     with path.open("a", newline="", encoding="utf-8") as stream:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
 
 
-def experiment_behind(folder: Path, experiment: Path | None = None) -> Experiment:
+def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
     """The experiment that a results folder was made from, by its `provenance.json`.
 
     Parameters

@@ -77,8 +77,8 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
     try:
         recording = inspect_recording(_recording_path(path))
         rate = _capture_fps(recording, options)
-        understood = _understood(recording, rate)
-        for line in _understood_lines(understood):
+        understood = _recording_facts(recording, rate)
+        for line in _recording_lines(understood):
             say(line)
         trial = Trial(
             name=path.stem,
@@ -101,8 +101,8 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
         raise UserError(str(error)) from None
     table = _table(measurement, options.scaled)
     written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled, rate)
-    seen = _seen(measurement, table, options, rate)
-    for line in _seen_lines(seen):
+    seen = _tracking_facts(measurement, table, options, rate)
+    for line in _tracking_lines(seen):
         say(line)
     say("Written: " + ", ".join(map(str, written.values())))
     return understood | seen | {"written": written}
@@ -171,7 +171,7 @@ def _capture_fps(recording: Recording, options: TrackOptions) -> float:
     return true_fps
 
 
-def _understood(recording: Recording, rate: float) -> dict[str, Any]:
+def _recording_facts(recording: Recording, rate: float) -> dict[str, Any]:
     n_frames = recording.declared_frames
     return {
         "recording": recording.path,
@@ -187,7 +187,7 @@ def _understood(recording: Recording, rate: float) -> dict[str, Any]:
     }
 
 
-def _understood_lines(understood: dict[str, Any]) -> list[str]:
+def _recording_lines(understood: dict[str, Any]) -> list[str]:
     n_frames, plays = understood["declared_frames"], understood["playback_fps"]
     picture = f"{understood['width_px']} × {understood['height_px']} px, {understood['bit_depth']} bit"
     count = "an unknown number of frames" if n_frames is None else f"{n_frames} frames"
@@ -233,7 +233,7 @@ def _write(
     from vinetrack.figures.overlay import TRACKED, ClipView, Edge
     from vinetrack.figures.strip_figure import draw_strip
     from vinetrack.figures.style import render
-    from vinetrack.pipeline.overlays_stage import REST_FRAMES, draw_over, frames_to_show, pace
+    from vinetrack.pipeline.overlays_stage import MARGIN_FRAMES, draw_over, frames_to_show, playback_rate
     from vinetrack.video.write import write_clip
 
     if folder.exists() and not folder.is_dir():
@@ -245,7 +245,7 @@ def _write(
     m_per_px = measurement.m_per_px if scaled else math.nan
     write_bytes(written["strip"], render(draw_strip(name, tracking, m_per_px), ("png",))["png"])
     shown = frames_to_show(table)
-    play_fps, stride = pace(len(shown), settings.seconds)
+    play_fps, stride = playback_rate(len(shown), settings.seconds)
     size = recording.width, recording.height
     tube_px = tracking.tube_width_px if math.isfinite(tracking.tube_width_px) else tracking.axis.width_px
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(size)
@@ -253,12 +253,14 @@ def _write(
     view = ClipView(name, tracking.axis, tube_px, size, 1e3 * m_per_px, slowed, settings.width_px)
     edges = [Edge("tracked edge", TRACKED, tracking.track.edge_px + tracking.shake_px)]
     time_s = tracking.track.time_s
-    time_ms = 1e3 * (time_s - time_s[min(shown.start + REST_FRAMES, len(time_s) - 1)])
+    time_ms = 1e3 * (time_s - time_s[min(shown.start + MARGIN_FRAMES, len(time_s) - 1)])
     write_clip(written["clip"], draw_over(recording, view, edges, time_ms, shown, stride), play_fps)
     return written
 
 
-def _seen(measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float) -> dict[str, Any]:
+def _tracking_facts(
+    measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float
+) -> dict[str, Any]:
     from vinetrack.video.curved_axis import axis_entry
 
     tracking = measurement.tracking
@@ -290,7 +292,7 @@ def _seen(measurement: Measurement, table: pd.DataFrame, options: TrackOptions, 
     }
 
 
-def _seen_lines(seen: dict[str, Any]) -> list[str]:
+def _tracking_lines(seen: dict[str, Any]) -> list[str]:
     ends = (*seen["axis"]["from_px"], *seen["axis"]["to_px"])
     axis = "Axis ({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)
     axis += ", a curve" if "via_px" in seen["axis"] else ""

@@ -174,7 +174,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
-    analysed |= _taken_for_the_tube(experiment, analysed)
+    analysed |= _askew_as_failed(experiment, analysed)
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
@@ -191,7 +191,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     return table
 
 
-def _taken_for_the_tube(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Trials whose axis was found askew to that of most others that grow as they do, as ones that failed."""
     from vinetrack.video.axis_agreement import askew_trials, slope_deg
 

@@ -20,8 +20,8 @@ from vinetrack.figures.registry import PAPER_FIGURES
 from vinetrack.pipeline.run_folders import (
     PACKAGE,
     find_experiment,
-    find_nature,
-    is_pattern,
+    find_ground_truth,
+    has_wildcard,
     path_problems,
     refuse_shared_results,
 )
@@ -46,7 +46,7 @@ SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
 """The rules, in the package: `vinetrack run` runs them from anywhere, the Snakefile of a checkout includes them."""
 
-TRIALS_A_JOB = 100
+TRIALS_PER_JOB = 100
 """Chosen: trials that come as tracks, and trials whose figures are drawn, in one job of the workflow.
 
 With every file that a job writes Snakemake notes all files that the job reads, 50 µs each: 1,000 trials in one job took
@@ -130,7 +130,7 @@ class WorkflowPlan:
         dict of str to list of str
             Names of the trials by the name of the job: the stage's own where one job does for all.
         """
-        shares = [list(trials[first : first + TRIALS_A_JOB]) for first in range(0, len(trials), TRIALS_A_JOB)]
+        shares = [list(trials[first : first + TRIALS_PER_JOB]) for first in range(0, len(trials), TRIALS_PER_JOB)]
         return {stage if len(shares) == 1 else f"{stage}_{number}": share for number, share in enumerate(shares, 1)}
 
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
@@ -247,9 +247,9 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
     folder = Path(settings.experiment)
-    if not folder.exists() and find_nature(base / folder, base):
+    if not folder.exists() and find_ground_truth(base / folder, base):
         folder = base / folder
-    nature = find_nature(folder, base)
+    nature = find_ground_truth(folder, base)
     is_virtual = nature is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
@@ -264,7 +264,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
-    watched = {path: None for path in inputs if not is_pattern(path)}
+    watched = {path: None for path in inputs if not has_wildcard(path)}
     filmed = {
         trial.name: tuple(
             path.as_posix()
@@ -297,11 +297,11 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
 def _fingerprint(inputs: Iterable[Path]) -> str:
     """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
-    stats = [(path.name, path.stat()) for path in inputs if is_pattern(path) and path.exists()]
+    stats = [(path.name, path.stat()) for path in inputs if has_wildcard(path) and path.exists()]
     return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
 
 
-def plan_or_stop(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
+def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
 
     For the Snakefile: an exception there would be printed with Snakemake's own stack.
@@ -325,8 +325,8 @@ def plan_or_stop(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         raise SystemExit(1) from None
 
 
-def begin_or_stop(plan: WorkflowPlan) -> None:
-    """`begin_run`, but a refusal is printed and the process ends with status 1; for the Snakefile, as `plan_or_stop`.
+def begin_run_or_exit(plan: WorkflowPlan) -> None:
+    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`.
 
     Where Snakemake only shows what it would do nothing is begun; it does not tell a Snakefile, its command line does.
 
@@ -334,9 +334,9 @@ def begin_or_stop(plan: WorkflowPlan) -> None:
     ----------
     plan : of this run.
     """
-    from vinetrack.pipeline.run_lock import begin_run, only_looks
+    from vinetrack.pipeline.run_lock import begin_run, executes_nothing
 
-    if only_looks(sys.argv[1:]):
+    if executes_nothing(sys.argv[1:]):
         return
     try:
         begin_run(plan.results, plan.experiment, Path.cwd(), lambda line: print(line, flush=True))
@@ -345,7 +345,7 @@ def begin_or_stop(plan: WorkflowPlan) -> None:
         raise SystemExit(1) from None
 
 
-def say_where_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
+def print_report_path_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
     """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
 
     Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
@@ -358,10 +358,10 @@ def say_where_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
         Say nothing.
     """
     if not quiet:
-        atexit.register(_say_where, plan)
+        atexit.register(_print_report_path, plan)
 
 
-def _say_where(plan: WorkflowPlan) -> None:
+def _print_report_path(plan: WorkflowPlan) -> None:
     path = plan.results / "report.html"
     if not path.exists():
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from vinetrack.results.folder_layout import Results, read_json, read_result
-from vinetrack.results.stored_fit import broken_file
+from vinetrack.results.stored_fit import unreadable_file_error
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.result import Diagnosis
@@ -37,4 +37,4 @@ def read_diagnosis(results: Results) -> Diagnosis | None:
     try:
         return Diagnosis.from_json(content, ladder if ladder is not None and len(ladder) else None)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise broken_file(results.diagnosis, error) from None
+        raise unreadable_file_error(results.diagnosis, error) from None

@@ -39,10 +39,10 @@ def read_fit(results: Results) -> FitSummary:
     try:
         return FitSummary.from_json(content)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise broken_file(results.fit, error) from None
+        raise unreadable_file_error(results.fit, error) from None
 
 
-def broken_file(path: Path, error: Exception) -> ResultsError:
+def unreadable_file_error(path: Path, error: Exception) -> ResultsError:
     """Return what is said of a file of the results that does not hold what it should.
 
     Parameters

@@ -13,14 +13,14 @@ from pathlib import Path
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Correction
 from vinetrack.core.tables import write_text
-from vinetrack.experiment.corrections import CORRECTIONS, corrections_text, read_corrections
+from vinetrack.experiment.corrections import CORRECTIONS_FILE, corrections_text, read_corrections
 from vinetrack.experiment.folder import SETTINGS
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.setup_page.clip_names import list_recordings
 from vinetrack.setup_page.settings_draft import read_settings_text, shared_values
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
 
-FILES = (SHEET, SETTINGS, CORRECTIONS)
+FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)
 """All that is ever written."""
 
 
@@ -115,8 +115,8 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
         write_text(folder / SETTINGS, draft.settings)
         written.append(SETTINGS)
     if corrections_text(read_corrections(folder)[0]) != corrections_text(draft.corrections):
-        write_text(folder / CORRECTIONS, corrections_text(draft.corrections))
-        written.append(CORRECTIONS)
+        write_text(folder / CORRECTIONS_FILE, corrections_text(draft.corrections))
+        written.append(CORRECTIONS_FILE)
     return written
 
 
@@ -162,5 +162,5 @@ def drafted(folder: Path, draft: Draft) -> Iterator[Path]:
         write_text(copy / SHEET, draft.sheet.text())
         write_text(copy / SETTINGS, draft.settings)
         if draft.corrections:
-            write_text(copy / CORRECTIONS, corrections_text(draft.corrections))
+            write_text(copy / CORRECTIONS_FILE, corrections_text(draft.corrections))
         yield copy

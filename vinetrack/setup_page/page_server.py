@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from vinetrack.core.local_page import LOOPBACK, THREAD_PREFIX, ended_by_signals, on_a_free_port, own_hosts, secret_path
+from vinetrack.core.local_page import (
+    LOOPBACK,
+    THREAD_PREFIX,
+    allowed_hosts,
+    secret_path,
+    serve_on_free_port,
+    stop_on_signals,
+)
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.experiment.corrections import corrections_text
 from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
@@ -120,7 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_for_us(self) -> bool:
         """Whether the request names this server and its secret: a name elsewhere that leads here is refused."""
-        hosts = own_hosts(self.server.server_port)
+        hosts = allowed_hosts(self.server.server_port)
         origin = self.headers.get("Origin")
         ours = self.headers.get("Host") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts})
         if ours and self.path.startswith(f"{self.server.secret}/"):
@@ -200,7 +207,7 @@ def start_server(folder: Path, port: int | None = None) -> SetupServer:
     PageError
         If the port is taken.
     """
-    return on_a_free_port(lambda number: SetupServer(folder, number), port)
+    return serve_on_free_port(lambda number: SetupServer(folder, number), port)
 
 
 def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
@@ -228,7 +235,7 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     if browser:
         threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
     # From the thread that serves, a shutdown would wait for itself.
-    with ended_by_signals(lambda: threading.Thread(target=server.shutdown, daemon=True).start()):
+    with stop_on_signals(lambda: threading.Thread(target=server.shutdown, daemon=True).start()):
         server.serve_forever(poll_interval=0.2)
     server.server_close()
     say("Set-up ended.")

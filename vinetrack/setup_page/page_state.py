@@ -14,13 +14,21 @@ from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.core.yaml_edit import with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment
 from vinetrack.experiment.schema import COLUMNS, SHARED
-from vinetrack.experiment.sheet import NEEDED
+from vinetrack.experiment.sheet import REQUIRED_COLUMNS
 from vinetrack.setup_page.clip_names import list_pictures, list_recordings, list_tables, units_of
 from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, same_cells
 from vinetrack.setup_page.settings_draft import shared_values, with_shared
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
 
-OFFERED = ("capture_fps", *NEEDED, "payload_g", "growth_angle_deg", "chamber_l", "exposure_us", "pressure_trace")
+OFFERED = (
+    "capture_fps",
+    *REQUIRED_COLUMNS,
+    "payload_g",
+    "growth_angle_deg",
+    "chamber_l",
+    "exposure_us",
+    "pressure_trace",
+)
 """Columns that the page shows from the start, whether or not the sheet has them."""
 
 

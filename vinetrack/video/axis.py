@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.experiment.cells import LEAST_AXIS_PX
+from vinetrack.experiment.cells import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
 from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
@@ -49,9 +49,9 @@ class Axis:
     width_px: float = float("nan")
 
     def __post_init__(self) -> None:
-        if self.length_px < LEAST_AXIS_PX:
+        if self.length_px < SHORTEST_AXIS_PX:
             raise RecordingError(
-                f"the growth axis is shorter than {LEAST_AXIS_PX} pixels; move from_px and to_px apart"
+                f"the growth axis is shorter than {SHORTEST_AXIS_PX} pixels; move from_px and to_px apart"
             )
 
     @property

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.experiment.cells import LEAST_APART_PX
+from vinetrack.experiment.cells import SMALLEST_POINT_SPACING_PX
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError
 
@@ -43,9 +43,10 @@ class CurvedAxis(Axis):
 
     def __post_init__(self) -> None:
         points = np.array(self.through_px)
-        if np.min(np.hypot(*np.diff(points, axis=0).T)) < LEAST_APART_PX:
+        if np.min(np.hypot(*np.diff(points, axis=0).T)) < SMALLEST_POINT_SPACING_PX:
             raise RecordingError(
-                f"two neighbouring points of the growth axis are less than {LEAST_APART_PX} pixels apart; leave out one"
+                f"two neighbouring points of the growth axis are less than {SMALLEST_POINT_SPACING_PX} pixels apart; "
+                "leave out one"
             )
         super().__post_init__()
 

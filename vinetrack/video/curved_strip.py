@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.experiment.cells import LEAST_APART_PX
+from vinetrack.experiment.cells import SMALLEST_POINT_SPACING_PX
 from vinetrack.video.axis import Axis, FrontShare, front_share
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
@@ -241,7 +241,10 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
     away = _averaged(sides.places_px, sides.middles_px, knots)
     through = axis.points(knots, away)
-    kept = [0, *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > LEAST_APART_PX)]
+    kept = [
+        0,
+        *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > SMALLEST_POINT_SPACING_PX),
+    ]
     try:
         curve = axis_through(through[kept], 2 * sides.half_px)
     except RecordingError:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.files import NO_FILE, is_pipe_or_device
+from vinetrack.core.files import NOT_A_FILE, is_pipe_or_device
 from vinetrack.video.camera_headers import side_file_of
 from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
 from vinetrack.video.raw_frames import levelled, unpacked
@@ -132,7 +132,7 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     if not images:
         raise RecordingError(f"{folder.name}: the folder holds no images; expected PNG, JPEG, TIFF or DNG frames")
     if waits := next(filter(is_pipe_or_device, images), None):
-        raise RecordingError(f"{folder.name}: {waits.name} cannot be read: {NO_FILE}")
+        raise RecordingError(f"{folder.name}: {waits.name} cannot be read: {NOT_A_FILE}")
     groups: dict[tuple[str, str], list[tuple[int, Path]]] = {}
     for file in images:
         match = re.fullmatch(r"(.*?)(\d+)\D*", file.stem)
