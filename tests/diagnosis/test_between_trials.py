@@ -169,7 +169,7 @@ def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after
 def test_the_order_of_the_rows_is_taken_and_said_where_the_sheet_has_none(worn: Pairs) -> None:
     result = diagnosed([(replace(trial, order=np.nan), track) for trial, track in worn], PHYSICS)
     assert "order_drift" in result.answer_set
-    assert "The order of the rows was taken" in result.explanation
+    assert "The trials were assumed to be in the order of the rows" in result.explanation
 
 
 def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials: list[Trial]) -> None:
@@ -183,9 +183,9 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
     assert not any(difference.stated for difference in apart)
     result = diagnosed(unstated, ("air_drag",))
     assert result.verdict == ADEQUATE
-    assert "But trials seem to differ" in result.explanation
+    assert "However, the trials seem to differ" in result.explanation
     assert "B rises by" in result.explanation
-    assert "The order of the rows was taken for that of the trials" in result.explanation
+    assert "The trials were assumed to be in the order of the rows" in result.explanation
 
 
 def test_wear_in_random_order_is_no_effect(trials: list[Trial]) -> None:

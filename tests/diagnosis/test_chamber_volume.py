@@ -23,4 +23,4 @@ def test_a_chamber_that_was_misread_is_a_depletion_and_its_volume_is_told(tmp_pa
     (gamma,) = [number for number in said.parameters if number.key == "reservoir_depletion.gamma"]
     assert gamma.value < 1.0 if row == "chamber_larger" else gamma.value > 1.4
     assert f"the chamber is {words}" in said.explanation
-    assert ("count the hoses" in said.explanation) == (row == "chamber_larger")
+    assert ("count the hoses too" in said.explanation) == (row == "chamber_larger")

@@ -45,7 +45,7 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     assert "filmed at a frame rate that is off by half of its ε" in said.explanation
     (n,) = [number for number in named.along if number.key == "eversion_damping.n"]
     assert abs(n.value - truths["eversion_damping.n"]) < 2 * n.sigma
-    assert f"Fitted along with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation
+    assert f"Fitted together with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation
     for k, number in enumerate(named.numbers):
         assert abs(number.value - truths[f"film_mass.eps.{k}"]) < 3 * number.sigma < 0.03
 

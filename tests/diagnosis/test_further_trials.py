@@ -91,7 +91,7 @@ def test_what_no_trial_within_the_limits_shows_is_said(design: CampaignDesign, p
     never = further_trials(design, power["air_drag"], 0.05, 0.9, Limits(**tight.model_dump()))
     assert not never.is_reached
     assert never.endless < 0.9
-    assert any(line.startswith("No number of trials within `limits` gets there") for line in further_lines(never))
+    assert any(line.startswith("No number of trials within `limits` suffices") for line in further_lines(never))
 
 
 def test_rows_of_the_sheet_are_read_back_as_the_same_trials(power: Power, plan: FurtherTrials) -> None:
@@ -105,5 +105,5 @@ def test_rows_of_the_sheet_are_read_back_as_the_same_trials(power: Power, plan: 
 
 def test_the_table_of_a_plan_ends_with_its_probability(plan: FurtherTrials) -> None:
     lines = further_lines(plan)
-    assert lines[0].startswith("To find leak at ")
+    assert lines[0].startswith("To detect leak at ")
     assert f"{100 * plan.after:.2g} %" in "\n".join(lines)

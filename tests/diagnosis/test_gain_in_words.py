@@ -1,4 +1,4 @@
-"""What `vinetrack add` says of an effect that helps, one that does not, and one whose fit has not settled."""
+"""What `vinetrack add` says of an effect that helps, one that does not, and one whose fit did not converge."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def fit(log_likelihood: float, converged: bool = True) -> Any:
     ("after", "words"),
     [
         (fit(110.0), "Δχ² = 20.0"),
-        (fit(101.0), "it does not help (Δχ² = 2.0; a gain begins at 9)"),
-        (fit(47.0), "the fit has not settled, so whether it helps is not known"),
-        (fit(110.0, converged=False), "Δχ² = 20.0; the fit has not settled"),
+        (fit(101.0), "no significant improvement (Δχ² = 2.0; 9 are needed)"),
+        (fit(47.0), "the fit did not converge, so whether it helps is unknown"),
+        (fit(110.0, converged=False), "Δχ² = 20.0; the fit did not converge"),
     ],
 )
 def test_a_gain_is_said_as_what_it_is(after: Any, words: str) -> None:
@@ -40,7 +40,7 @@ def test_a_size_at_its_bound_is_said_to_be_there() -> None:
 
 
 def test_a_negative_size_of_what_cannot_be_negative_is_said_to_be_one() -> None:
-    assert size(number(-2e-3, 1e-4, lower=0.0)).endswith("(negative, which it cannot be)")
+    assert size(number(-2e-3, 1e-4, lower=0.0)).endswith("(negative, which is impossible)")
 
 
 def test_a_bound_that_an_interval_ends_at_is_named() -> None:
@@ -52,4 +52,4 @@ def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
     from vinetrack.diagnosis.result import Candidate
 
     row = Candidate("tail_stretch", "physical", "refitted", 1.0, NONE_SEEN - 0.1, (number(1.0, 0.6),))
-    assert sizes(row).endswith(": none seen")
+    assert sizes(row).endswith(": not significant")

@@ -90,16 +90,16 @@ def test_a_diagnosis_without_a_cause_names_the_row_and_says_what_the_others_say(
     result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
     assert result.verdict == "unexplained"
     assert re.match(
-        r"t2 does not go with the other 11 trials: it moves as with 2[01][.\d]* kPa, and 12 kPa is stated\. Look at",
+        r"t2 is inconsistent with the other 11 trials: it moves as at 2[01][.\d]* kPa, but 12 kPa is stated\. Check",
         result.explanation,
     )
     assert "Without t2 the verdict is `adequate`" in result.explanation
     printed = str(result)
-    assert printed.startswith("unexplained: t2 does not go with the others, which are explained")
+    assert printed.startswith("unexplained: t2 is inconsistent with the others, which the model explains")
     assert printed.rstrip().endswith("leave it out with `use: no`, and run again.")
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
-    assert sentence(result) == "t2 does not go with the others, which are explained."
-    assert meaning(result).startswith("What the sheet says of a trial and how it moved contradict each other.")
+    assert sentence(result) == "t2 is inconsistent with the others, which the model explains."
+    assert meaning(result).startswith("The row of a trial in the sheet contradicts its motion.")
 
 
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
@@ -109,7 +109,7 @@ def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
     outcome = with_odd_trials(result, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
     assert outcome.verdict == "adequate"
     assert outcome.notes[-1].startswith(
-        "t2 and t5 do not go with the other 10 trials: t2 moves as with 21 kPa, and 12 kPa is stated. Look at their"
+        "t2 and t5 are inconsistent with the other 10 trials: t2 moves as at 21 kPa, but 12 kPa is stated. Check their"
     )
 
 
@@ -125,7 +125,7 @@ def test_where_nothing_explains_all_trials_what_the_others_say_is_said(campaign,
     assert asked == [["t2"]]
     assert outcome.verdict == "unexplained"
     if said == "adequate":
-        assert outcome.explanation.startswith("t2 does not go with")
+        assert outcome.explanation.startswith("t2 is inconsistent with")
         assert f"Without t2 the verdict is `adequate`: {result.explanation} With t2: Something is left." in (
             outcome.explanation
         )
@@ -152,7 +152,7 @@ def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they
             ("tail_friction",),
             ("tail_friction",),
         )
-        assert outcome.notes[-1].startswith("t2 does not go with the other 11 trials")
+        assert outcome.notes[-1].startswith("t2 is inconsistent with the other 11 trials")
         return
     assert (outcome.verdict, outcome.answer_set, outcome.effects) == ("unexplained", (), ())
     assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
@@ -168,7 +168,7 @@ def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaig
         raise FitError("there is nothing to fit")
 
     outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
-    assert outcome.notes[-1].startswith("t2 does not go with the other 11 trials")
+    assert outcome.notes[-1].startswith("t2 is inconsistent with the other 11 trials")
     assert outcome.explanation == unexplained.explanation
 
 

@@ -30,7 +30,7 @@ from vinetrack.diagnosis.score_test import informations_at, scores_of
 from vinetrack.diagnosis.shape_products import fit_columns
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
 from vinetrack.inference import sensitivity
-from vinetrack.narrative.power_text import effect_sentence, frequency
+from vinetrack.narrative.power_text import effect_sentence
 from vinetrack.narrative.verdict_summary import facts
 from vinetrack.planning.campaign_information import FilmingPlan
 
@@ -272,14 +272,14 @@ def test_a_verdict_never_stands_alone(power: Power) -> None:
     diagnosis = Diagnosis((step,), (), "Nothing is missing.", power=power)
     beside = "(false alarms in at most 0.42 % of such campaigns; "
     assert str(diagnosis).startswith(f"adequate: no missing effect can be detected {beside}")
-    assert "Could not have been seen: air drag" in str(diagnosis)
+    assert "Not detectable: air drag" in str(diagnosis)
     said = {fact.question: fact for fact in facts(diagnosis, None)}
     assert said["False alarms"].answer == "at most 0.42 %"
-    assert said["Could have been seen"].answer.endswith("of 8 effects")
-    assert said["Could have been seen"].note.startswith("nine times in ten at their largest plausible size; not even")
-    assert "air drag" in said["Could have been seen"].note
+    assert said["Detectable effects"].answer.endswith("of 8 effects")
+    assert said["Detectable effects"].note.startswith("with 90 % power at their largest plausible size; not even")
+    assert "air drag" in said["Detectable effects"].note
     wary = replace(diagnosis, power=replace(power, wary="the model is far off"))
-    assert [fact.note for fact in facts(wary, None) if fact.question == "Could have been seen"] == [
+    assert [fact.note for fact in facts(wary, None) if fact.question == "Detectable effects"] == [
         "the model is far off"
     ]
     again = Diagnosis.from_json(json.loads(json.dumps(diagnosis.to_json())))
@@ -305,21 +305,16 @@ def test_a_size_that_no_trial_shows_is_infinite() -> None:
 
 def test_the_sentence_of_an_effect() -> None:
     assert effect_sentence(entry(), 24) == (
-        "These 24 trials show C_D of air drag beyond 1.1 nine times in ten; short of 0.87 hardly ever; "
-        "it would be called inlet loss one time in four."
+        "These 24 trials detect air drag with at least 90 % power above C_D = 1.1, and with less than 10 % below 0.87; "
+        "it would be mistaken for inlet loss in 26 % of campaigns."
     )
 
 
 def test_the_sentence_of_an_effect_that_is_too_weak() -> None:
     text = effect_sentence(entry(largest=0.5), 24)
-    assert text == "These 24 trials hardly ever show C_D of air drag, even at its largest plausible size, 0.50."
-
-
-@pytest.mark.parametrize(
-    ("probability", "words"), [(0.93, "nine times in ten"), (0.5, "every other time"), (0.26, "one time in four")]
-)
-def test_probabilities_in_words(probability: float, words: str) -> None:
-    assert frequency(probability) == words
+    assert text == (
+        "These 24 trials detect air drag with less than 10 % power even at its largest plausible size, C_D = 0.50."
+    )
 
 
 def test_the_exact_interval_of_a_rate() -> None:

@@ -56,7 +56,7 @@ def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> No
     content = json.loads(file.read_text())
     (leak,) = content["effects"]
     assert 0 < leak["size_50"] < leak["size_90"]
-    assert "nine times in ten" in result.output
+    assert "90 % power" in result.output
     assert figure.stat().st_size > 10_000
 
 

@@ -58,7 +58,7 @@ def shown(content: dict, **changes: object) -> str:
 SENTENCES = {
     "missing": "Missing from the model: reservoir depletion.",
     "ambiguous": "Missing from the model: air drag or inlet loss. These trials cannot tell which.",
-    "artefact": "A fault of the measurement, not of the physics: length scale.",
+    "artefact": "A fault of the measurement, not missing physics: length scale.",
     "adequate": "No missing effect can be detected.",
     "unexplained": "The model fails, and no effect of the catalogue explains it.",
 }
@@ -106,7 +106,7 @@ def test_the_size_on_the_first_screen_has_the_interval_with_others_left_open() -
     ]  # fmt: skip
     found = {fact.question: fact for fact in facts(content, None)}
     assert found["Size of reservoir depletion"].note == (
-        "95 %: 1.162 to 1.178; with end stop and leak left open: 1.020 to 1.190"
+        "95 %: 1.162 to 1.178; allowing for end stop and leak: 1.020 to 1.190"
     )
 
 
@@ -167,7 +167,7 @@ def test_the_most_suspicious_is_so_by_its_score_not_by_what_a_wrong_sign_would_g
     right = candidate("air_drag", 2.0, status="screened", sigma=1.4)
     content["rounds"][0]["ranking"] = [wrong, right]
     fact = facts(content, None)[0]
-    assert (fact.answer, fact.note) == ("1.4 σ", "the best of 2 candidates: air drag")
+    assert (fact.answer, fact.note) == ("1.4 σ", "largest of 2 candidates: air drag")
 
 
 def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() -> None:
@@ -352,8 +352,8 @@ def test_the_page_says_what_the_trials_could_have_seen() -> None:
     html = page(diagnosis=DiagnosisResult(told))
     part = html.partition('<h2 id="power">')[2].partition("<h2")[0]
     assert "raise a false alarm in at most 0.30 % of campaigns" in part
-    assert "Found nine times in ten: air drag from C_D = 1.0." in part
-    assert "Could not have been seen: leak and static yield." in part
+    assert "Detectable with 90 % power: air drag from C_D = 1.0." in part
+    assert "Not detectable: leak and static yield." in part
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", part)]
     assert [row[0] for row in rows if row] == ["air drag", "leak"]
     assert rows[1][3:] == ["1.0", "3.0", "100 %", "inlet loss 26 %"]

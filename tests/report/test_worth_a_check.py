@@ -14,17 +14,17 @@ from vinetrack.narrative.verdict_text import explain
 def round_of(effect: str, kind: str, sigma: float) -> SimpleNamespace:
     """A round that finds nothing, in which one candidate comes nearest."""
     effects = [SimpleNamespace(name=effect, kind=kind), SimpleNamespace(name="leak", kind="physical")]
-    questions = SimpleNamespace(
+    tests = SimpleNamespace(
         fit=SimpleNamespace(model=SimpleNamespace(names=("gravity",)), trials=[None] * 6),
         effects=effects,
-        possible=np.array([sigma, 0.5]),
-        answers=SimpleNamespace(effects=(effect, "leak"), silent=()),
-        family=SimpleNamespace(of=lambda _name: 4.5),
+        one_sided_z=np.array([sigma, 0.5]),
+        sensitivities=SimpleNamespace(effects=(effect, "leak"), silent=()),
+        family=SimpleNamespace(threshold=lambda _name: 4.5),
         level=1e-4,
-        largest=lambda _effect: ({}, True),
+        upper_limits=lambda _effect: ({}, True),
         best_z=lambda _name: (0.0, 0),
     )
-    return SimpleNamespace(questions=questions, verdict=ADEQUATE, note="", unstated=())
+    return SimpleNamespace(tests=tests, verdict=ADEQUATE, note="", unstated_differences=())
 
 
 @pytest.mark.parametrize(
@@ -34,5 +34,5 @@ def round_of(effect: str, kind: str, sigma: float) -> SimpleNamespace:
 )  # fmt: skip
 def test_only_a_likely_slip_is_named(effect: str, kind: str, sigma: float, worth: bool) -> None:
     words = explain(round_of(effect, kind, sigma))  # type: ignore[arg-type]
-    assert f"{effect}, has {sigma:.1f} σ" in words
+    assert f"{effect}, reaches {sigma:.1f} σ" in words
     assert (f"soon checked: see `vinetrack effects {effect}`" in words) is worth

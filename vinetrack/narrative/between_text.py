@@ -1,4 +1,4 @@
-"""Differences between trials in words: which trials differ by what, and how to find out."""
+"""Differences between trials in words: which trials differ, by how much, and how to confirm it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
 
 REMEDIES = {
-    N_BY_VINE: "Give every vine its own n (`shared={'n': 'vine'}`) before asking for effects",
-    ORDER_DRIFT: "Repeat six trials in random order, and number all in the column `order`; read the gauge at each",
-    SPECIMEN: "Film every specimen at several pressures, and name it in the column `specimen`",
-    DAY: "Repeat some conditions on another day, and zero the gauge and set the regulator anew before each",
+    N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
+    ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge at "
+    "each",
+    SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
+    DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
 }
+"""What to do about each difference between trials."""
 
 
 def trials_differ(names: Sequence[str]) -> bool:
@@ -38,7 +40,7 @@ def trials_differ(names: Sequence[str]) -> bool:
 
 
 def difference_headline(names: Sequence[str]) -> str:
-    """What an answer set of differences between trials says.
+    """The differences between trials of an answer set, each in a clause.
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ def difference_headline(names: Sequence[str]) -> str:
 
 
 def difference_in_words(result: LikelihoodRatio) -> str:
-    """The size of one difference between trials: `order_drift: ln B changes by 0.021 ± 0.001 a trial`.
+    """The size of one difference between trials: `pressure rises by 0.42 ± 0.03 % with each trial`.
 
     Parameters
     ----------
@@ -73,7 +75,7 @@ def difference_in_words(result: LikelihoodRatio) -> str:
             way = "higher" if slope.value > 0 else "lower"
             return f"pressure is {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % {slope.vine}"
         way = "rises" if slope.value > 0 else "falls"
-        what, each = ("B", "every trial of a tube") if slope.key.endswith(".B") else ("pressure", "every trial")
+        what, each = ("B", "each trial of a tube") if slope.key.endswith(".B") else ("pressure", "each trial")
         return f"{what} {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
     parts = []
     in_B = [number for number in result.numbers if number.key.endswith(".B")]
@@ -83,23 +85,23 @@ def difference_in_words(result: LikelihoodRatio) -> str:
     if in_P:
         parts.append(f"in pressure (zero of the gauge, or P_y) by {_range(in_P, 1e-3, 'kPa')}")
     if gains := [number for number in result.numbers if number.key.endswith(".gain")]:
-        parts.append(f"in pressure (how a regulator was set) by {_range(gains, 100, '%')}")
+        parts.append(f"in pressure (setting of a regulator) by {_range(gains, 100, '%')}")
     return f"{name}s differ {' and '.join(parts)}"
 
 
-def remedies_in_words(kept: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
-    """What to do about the differences of an answer set; blank where there are none.
+def remedies_in_words(answers: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
+    """What to do about the differences between trials in an answer set; blank where there are none.
 
     Parameters
     ----------
-    kept : results of the answer set.
+    answers : results of the answer set.
     trials : all trials of the experiment.
 
     Returns
     -------
     str
     """
-    names = [result.names[-1] for result in kept if result.effects[-1].kind == BETWEEN_TRIALS]
+    names = [result.names[-1] for result in answers if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
     text = "".join(f" {REMEDIES[name]}." for name in names)
@@ -107,7 +109,7 @@ def remedies_in_words(kept: Sequence[LikelihoodRatio], trials: Sequence[Trial]) 
         return text
     _, stated = trial_order(trials)
     if not stated:
-        text = f" The order of the rows was taken for that of the trials.{text}"
+        text = f" The trials were assumed to be in the order of the rows.{text}"
     correlation = order_pressure_correlation(trials)
     if math.isfinite(correlation) and abs(correlation) >= CONFOUNDING_CORRELATION:
         text = f" Trials were made in the order of pressure (rank correlation {correlation:.2f}).{text}"
@@ -120,7 +122,7 @@ def _value(value: float, sigma: float) -> str:
 
 
 def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
-    """One coefficient with its error, several as a range."""
+    """One coefficient with its standard error; several as a range."""
     if len(numbers) == 1:
         return f"{_value(factor * numbers[0].value, factor * numbers[0].sigma)} {unit} ({numbers[0].vine})"
     values = [factor * number.value for number in numbers]

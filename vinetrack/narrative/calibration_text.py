@@ -1,4 +1,4 @@
-"""What the thresholds of a verdict are worth for one design, in a table and in sentences."""
+"""Thresholds of a verdict calibrated for one design by simulated null campaigns: a table and sentences."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 
 def calibration_lines(calibration: NullCalibration) -> list[str]:
-    """Return what the thresholds of a verdict are worth for this very design, a row a test, and what that changes.
+    """Return nominal and Monte-Carlo p-values of each test for this design, and whether the calls change.
 
     Parameters
     ----------
-    calibration : of the tests of a first model.
+    calibration : null distributions of the tests of an initial model.
 
     Returns
     -------
@@ -34,34 +34,35 @@ def calibration_lines(calibration: NullCalibration) -> list[str]:
         rows.append(
             (
                 test.name, _chance(test.level), _chance(test.observed), f"{test.exceeding.count} of {count}",
-                _chance(test.monte_carlo), f"{_chance(low)} to {_chance(high)}", tail, _said(test),
+                _chance(test.monte_carlo), f"{_chance(low)} to {_chance(high)}", tail, _is_called(test),
             )
         )  # fmt: skip
-    head = ("test", "level", "p", "as extreme", "Monte-Carlo p", "95 %", "by the tail", "called")
+    head = ("test", "level", "p", "as extreme", "Monte-Carlo p", "95 %", "fitted tail", "called")
     low, high = calibration.alarms.interval
     lines = [
-        f"{count} campaigns of this design, {' + '.join(calibration.model)} their truth, fitted and tested alike:",
+        f"{count} campaigns of this design, simulated with {' + '.join(calibration.model)}, fitted and tested alike:",
         *(f"  {line}" for line in table(rows, head, align="<>>>>>><")),
-        f"At the levels as they stand, {calibration.alarms.count} of them raise an alarm ({percent(low)} to "
-        f"{percent(high)} with 95 % confidence).",
+        f"At the nominal levels, {calibration.alarms.count} of them raise a false alarm (95 % interval {percent(low)} "
+        "to "
+        f"{percent(high)}).",
     ]
-    short = [test for test in calibration.tests if not test.resolves and math.isnan(test.by_tail[0])]
+    unresolved = [test for test in calibration.tests if not test.resolves and math.isnan(test.by_tail[0])]
     lines.append(_verdict_of(calibration))
-    if short:
-        needed = math.ceil(1 / min(test.level for test in short)) - 1
-        names = listed([test.name for test in short])
+    if unresolved:
+        needed = math.ceil(1 / min(test.level for test in unresolved)) - 1
+        names = listed([test.name for test in unresolved])
         lines.append(f"Too few campaigns to resolve the level of {names}: that takes {needed}.")
     if calibration.failed:
-        lines.append(f"{calibration.failed} campaigns could not be fitted and do not count.")
+        lines.append(f"{calibration.failed} campaigns could not be fitted and are not counted.")
     return lines
 
 
 def _verdict_of(calibration: NullCalibration) -> str:
-    """What changes with respect to the nominal levels."""
+    """Whether calibration changes what the nominal levels call missing."""
     now = calibration.still_called
     if calibration.was_called:
         if now is None:
-            return "Something was called missing or at fault; these campaigns are too few to confirm or to withdraw it."
+            return "Something was called missing or at fault; these campaigns are too few to confirm or to revoke it."
         if now:
             return "Something was called missing or at fault; by the null distribution of this design it still is."
         return (
@@ -72,14 +73,14 @@ def _verdict_of(calibration: NullCalibration) -> str:
     return "Nothing was called missing, and by the null distribution of this design nothing would be."
 
 
-def _said(test: CalibratedTest) -> str:
-    """Whether a test was called at its level, and whether it would be by the null distribution."""
+def _is_called(test: CalibratedTest) -> str:
+    """Whether a test is significant at its nominal level, and whether it is by the null distribution."""
     words = {True: "yes", False: "no", None: "not known"}
     return f"{words[test.is_called]}, calibrated {words[test.still_called]}"
 
 
 def _chance(chance: float) -> str:
-    """A probability in per cent, two digits; far ones as a power of ten."""
+    """A probability in per cent, two digits; small ones as a power of ten."""
     if math.isnan(chance):
         return "–"
     return percent(chance) if chance >= 1e-5 or chance == 0 else f"{chance:.0e}"

@@ -1,4 +1,4 @@
-"""A planned campaign as text: its conditions, the standard errors expected of it, and those of simulated campaigns."""
+"""A designed campaign as text: its conditions, its expected standard errors, and those of simulated campaigns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from vinetrack.planning.simulated_campaigns import SimulatedCampaigns
 
 _SHOWN_OTHERS = 4
-"""Chosen: other campaigns that also meet the limits; with more, the table fills the screen."""
+"""Other campaigns shown that also meet the limits. Chosen: with more, the table fills the screen."""
 
 
 def campaign_lines(
@@ -28,12 +28,12 @@ def campaign_lines(
 
     Parameters
     ----------
-    planned : the best campaign, the others, and the nearest where none will do.
+    planned : the best campaign, the others, and the nearest where none meets the limits.
     inputs : predictive inputs of each vine.
-    n_error : standard error of n that is wanted.
-    B_error : relative standard error of B that is wanted.
-    most_trials : trials that a campaign may have.
-    camera : the plan of filming, for frame rate and noise.
+    camera : how trials are filmed: frame rate and noise.
+    n_error : largest standard error of n that is allowed.
+    B_error : largest relative standard error of B that is allowed.
+    most_trials : largest number of trials of a campaign.
 
     Yields
     ------
@@ -42,8 +42,8 @@ def campaign_lines(
     spread_P, spread_B = inputs[0].spreads
     yield (
         f"standard errors wanted: n {n_error:g}, B {100 * B_error:g} %; filmed at {camera.capture_fps:g} "
-        f"frames a second, noise {1e3 * camera.noise_m:g} mm; from trial to trial P {100 * spread_P:.2g} %, B "
-        f"{100 * spread_B:.2g} %"
+        f"frames per second, noise {1e3 * camera.noise_m:g} mm; between-trial standard deviations: P "
+        f"{100 * spread_P:.2g} %, B {100 * spread_B:.2g} %"
     )
     yield f"assumed: {'; '.join(dict.fromkeys(_assumed(vine) for vine in inputs))}"
     yield ""
@@ -54,7 +54,7 @@ def campaign_lines(
     yield ""
     yield from _compared(planned, inputs, camera)
     if planned.candidates.rejected:
-        yield f"conditions passed over as too slow or too quick to be filmed: {planned.candidates.rejected}"
+        yield f"conditions left out because they are too slow or too fast to film: {planned.candidates.rejected}"
 
 
 def _assumed(inputs: PredictiveInputs) -> str:
@@ -62,14 +62,14 @@ def _assumed(inputs: PredictiveInputs) -> str:
 
     values = inputs.medians
     trial = inputs.trial
-    sigma = trial.yield_pressure_sigma_Pa
-    known = sigma if sigma > 0 else MEASURED_YIELD_SIGMA_PA
-    yields = f"P_y {trial.yield_pressure_Pa / 1e3:.3g} kPa, measured to {known / 1e3:.2g}"
-    return f"{trial.vine} B {values['eversion_damping.B']:.3g}, n {values['eversion_damping.n']:.3g}, {yields}"
+    stated_Pa = trial.yield_pressure_sigma_Pa
+    yield_sigma_Pa = stated_Pa if stated_Pa > 0 else MEASURED_YIELD_SIGMA_PA
+    P_y = f"P_y {trial.yield_pressure_Pa / 1e3:.3g} ± {yield_sigma_Pa / 1e3:.2g} kPa"
+    return f"{trial.vine} B {values['eversion_damping.B']:.3g}, n {values['eversion_damping.n']:.3g}, {P_y}"
 
 
 def _conditions(planned: Planned, best: Plan) -> Iterator[str]:
-    """The campaign, a row a vine and payload."""
+    """The campaign, a row for each vine and payload."""
     from vinetrack.core.terminal import table
 
     shown = planned.candidates
@@ -87,7 +87,7 @@ def _conditions(planned: Planned, best: Plan) -> Iterator[str]:
 
 
 def _compared(planned: Planned, inputs: Sequence[PredictiveInputs], camera: FilmingPlan) -> Iterator[str]:
-    """The campaign beside others that meet the limits and the cheapest; the error of n from steady speeds alone."""
+    """The campaign, others that meet the limits, and the cheapest, each with its expected standard errors."""
     from vinetrack.core.terminal import table
     from vinetrack.planning.campaign_information import reaches_steady, steady_error
 
@@ -95,13 +95,14 @@ def _compared(planned: Planned, inputs: Sequence[PredictiveInputs], camera: Film
     steady = reaches_steady(shown.model, shown.trials, camera.longest_s)
 
     def row(name: str, plan: Plan) -> tuple[str, ...]:
-        alone = steady_error(shown.model, shown.trials, plan.counts, inputs[0].spreads, steady)
-        errors = f"{plan.n_error:.4f}", f"{100 * plan.B_error:.2f}", "–" if math.isinf(alone) else f"{alone:.4f}"
+        by_speeds = steady_error(shown.model, shown.trials, plan.counts, inputs[0].spreads, steady)
+        n_by_speeds = "–" if math.isinf(by_speeds) else f"{by_speeds:.4f}"
+        errors = f"{plan.n_error:.4f}", f"{100 * plan.B_error:.2f}", n_by_speeds
         loads = " and ".join(f"{1e3 * load:g} g" for load in plan.payloads_kg)
         shape = (
             f"{plan.pressures} pressures × {plan.replicates}, {loads}"
             if plan.pressures
-            else "at most informative places"
+            else "at the most informative conditions"
         )
         return name, str(plan.n_trials), shape, *errors
 
@@ -112,26 +113,30 @@ def _compared(planned: Planned, inputs: Sequence[PredictiveInputs], camera: Film
         rows.append(row("cheapest", planned.cheapest))
     head = ("", "trials", "", "error of n", "worst B", "n, steady speeds")
     yield from table(rows, head, ("", "", "", "", "%", "alone"), align="<><>>>")
-    yield "errors: of a fit to whole trajectories with the true model; the cheapest cannot reveal a wrong one"
+    yield "errors: of a fit to whole trajectories with the true model; the cheapest design cannot reveal a wrong model"
 
 
 def _out_of_reach(planned: Planned, most_trials: int) -> Iterator[str]:
-    near, end = planned.nearest, planned.endless
-    yield f"! no campaign of {most_trials} trials or fewer with the allowed pressures and replicates reaches this"
+    nearest, limit = planned.nearest, planned.endless
+    yield f"! no campaign of {most_trials} trials or fewer with the allowed pressures and replicates reaches that"
     yield (
-        f"the nearest, {near.n_trials} trials at {near.pressures} pressures, has n {near.n_error:.4f} and B "
-        f"{100 * near.B_error:.2f} %; infinitely many would have n {end.n_error:.4f} and B {100 * end.B_error:.2f} %"
+        f"the nearest, {nearest.n_trials} trials at {nearest.pressures} pressures, has n {nearest.n_error:.4f} and B "
+        f"{100 * nearest.B_error:.2f} %; unlimited replicates would have n {limit.n_error:.4f} and B "
+        f"{100 * limit.B_error:.2f} %"
     )
-    yield "widen the pressures, allow more (--most-trials, --replicates, --pressures), add vines, accept larger errors"
+    yield (
+        "widen the pressures, allow more trials (--most-trials, --replicates, --pressures), add vines, or accept "
+        "larger errors"
+    )
 
 
 def simulation_lines(planned: Planned, simulated: SimulatedCampaigns) -> list[str]:
-    """Return the errors of simulated campaigns beside the expected ones, as lines of text.
+    """Return the standard errors of simulated campaigns beside the expected ones, as lines of text.
 
     Parameters
     ----------
-    planned : the campaign, with its expected errors.
-    simulated : simulated campaigns, fitted.
+    planned : the campaign, with its expected standard errors.
+    simulated : errors of fits to simulated campaigns.
 
     Returns
     -------
@@ -142,23 +147,31 @@ def simulation_lines(planned: Planned, simulated: SimulatedCampaigns) -> list[st
     assert planned.best is not None
     if simulated.campaigns == 0:
         return ["", "! none of the simulated campaigns could be fitted"]
-    room = simulated.uncertainty
+    relative_sigma = simulated.uncertainty
     rows = [
-        ("n", f"{planned.best.n_error:.4f}", f"{simulated.n_stated:.4f}", _rms_with_error(simulated.n_rms, room, 4), "")
+        (
+            "n",
+            f"{planned.best.n_error:.4f}",
+            f"{simulated.n_stated:.4f}",
+            _rms_with_error(simulated.n_rms, relative_sigma, 4),
+            "",
+        )
     ]
     for vine, expected in planned.best.B_errors.items():
         stated, rms = (100 * errors.get(vine, math.nan) for errors in (simulated.B_stated, simulated.B_rms))
-        rows.append((f"B ({vine})", f"{100 * expected:.2f}", f"{stated:.2f}", _rms_with_error(rms, room, 2), "%"))
+        rows.append(
+            (f"B ({vine})", f"{100 * expected:.2f}", f"{stated:.2f}", _rms_with_error(rms, relative_sigma, 2), "%")
+        )
     lines = [
         "",
-        f"simulated {simulated.campaigns} times: with scatter and noise, fitted, compared with the true values",
+        f"{simulated.campaigns} campaigns simulated with scatter and noise, fitted, and compared with the true values:",
     ]
     lines += table(rows, ("error of", "expected", "stated by fits", "simulated", "unit"), align="<>>><")
     lines.append(f"95 % intervals contained the true value in {simulated.covered:.0%} of cases")
     if simulated.failed:
-        lines.append(f"! {simulated.failed} of the campaigns could not be fitted")
+        lines.append(f"! {simulated.failed} simulated campaigns could not be fitted")
     return lines
 
 
-def _rms_with_error(rms: float, room: float, digits: int) -> str:
-    return f"{rms:.{digits}f} ± {rms * room:.{digits}f}"
+def _rms_with_error(rms: float, relative_sigma: float, digits: int) -> str:
+    return f"{rms:.{digits}f} ± {rms * relative_sigma:.{digits}f}"

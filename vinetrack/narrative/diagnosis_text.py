@@ -1,4 +1,4 @@
-"""What `vinetrack diagnose` and `vinetrack add` print: a whole diagnosis, and what an added effect brought."""
+"""Output of `vinetrack diagnose` and `vinetrack add`: a whole diagnosis, and the improvement by an added effect."""
 
 from __future__ import annotations
 
@@ -33,24 +33,26 @@ _HEADLINES = {
     ADEQUATE: "no missing effect can be detected",
     MISSING: "one effect is missing",
     AMBIGUOUS: "one of several effects is missing, and these data cannot tell which",
-    ARTEFACT: "a fault of the measurement, not of the physics",
+    ARTEFACT: "a fault of the measurement, not missing physics",
     UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
 }
 GO_ON = (
-    "To go on: look at the pictures of the missing force in the report; `vinetrack propose` on the results folder seeks"
-    " a law for it, and writes what mends the model as an effect file of your own."
+    "Next: look at the figures of the missing force in the report, and run `vinetrack propose` on the results folder. "
+    "It looks for a law that describes the missing force and writes the law as an effect file of your own."
 )
-"""What a user does next where nothing known explains the misfit."""
+"""What a user does next where no effect of the catalogue explains the misfit."""
 
 CLEAR_GAIN = 9.0
-"""Δχ² from which an effect helps. Derived: that of the answer set, 3 standard errors for one number."""
+"""Δχ² above which an added effect is said to help. Derived: 3 standard errors of one parameter, as for the answer
+set."""
 
 _SHOWN_CANDIDATES = 8
-"""Of a round on the terminal; chosen: two rounds fit a screen of 24 lines, and `diagnosis.json` has all."""
+"""Candidates of a round that the terminal shows. Chosen: two rounds fit a screen of 24 lines; `diagnosis.json` has
+all."""
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return what the terminal prints: verdict, rounds with their candidates, ladder, next experiment.
+    """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment.
 
     Parameters
     ----------
@@ -75,13 +77,13 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if diagnosis.next_experiment:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
-    if onward := to_go_on(diagnosis):
-        lines += ["", onward]
+    if next_step := to_go_on(diagnosis):
+        lines += ["", next_step]
     return "\n".join(lines)
 
 
 def to_go_on(diagnosis: Diagnosis) -> str:
-    """Return what to do next where nothing known explains the trials; blank elsewhere.
+    """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere.
 
     Parameters
     ----------
@@ -97,7 +99,7 @@ def to_go_on(diagnosis: Diagnosis) -> str:
 
 
 def verdict_line(diagnosis: Diagnosis) -> str:
-    """Return the verdict in a line.
+    """Return the verdict in one line.
 
     Parameters
     ----------
@@ -123,10 +125,10 @@ def _headline(diagnosis: Diagnosis) -> str:
         if diagnosis.answer_set == (DROPPED_FRAMES,):
             return "frames are missing from the recordings"
         if trials_differ(diagnosis.answer_set):
-            return f"trials differ, the physics holds: {difference_headline(diagnosis.answer_set)}"
+            return f"the trials differ, and no physics is missing: {difference_headline(diagnosis.answer_set)}"
         return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
-    beside = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
-    return _HEADLINES[diagnosis.verdict] + beside
+    power = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
+    return _HEADLINES[diagnosis.verdict] + power
 
 
 def _ranking(step: Round) -> list[str]:
@@ -145,12 +147,12 @@ def _ranking(step: Round) -> list[str]:
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
-    blind = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
-    return lines + ([f"not testable here: {', '.join(blind)}"] if blind else [])
+    untestable = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
+    return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
 
 
 def _status(candidate: Candidate) -> str:
-    """How much is known of a candidate, with its posterior weight where it shares the answer set."""
+    """How a candidate was tested, with its posterior weight where it shares the answer set."""
     shared = candidate.in_answer_set and candidate.posterior_weight < 0.995
     return f"{candidate.status}, weight {100 * candidate.posterior_weight:.0f} %" if shared else candidate.status
 
@@ -172,12 +174,14 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
 
 def _partial_mark(row: Any) -> str:
-    """What stands behind a step of the ladder that mends a part of what nothing mends in full."""
+    """Mark of a step of the ladder that reduces an unexplained misfit without removing it."""
     return ", partial" if getattr(row, "partial", False) in (True, "True") else ""
 
 
 def gain_in_words(before: Fit, after: Fit) -> str:
-    """Return what an added effect brought; the larger model holds the smaller: a loss means a fit that has not ended.
+    """Return the improvement by an added effect.
+
+    The model with the effect contains the one without it, so a loss shows that the optimiser has not converged.
 
     Parameters
     ----------
@@ -189,20 +193,20 @@ def gain_in_words(before: Fit, after: Fit) -> str:
     """
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     if gain < 0:
-        return "the fit has not settled, so whether it helps is not known"
+        return "the fit did not converge, so whether it helps is unknown"
     helps = f"Δχ² = {gain:.1f}"
     if gain <= CLEAR_GAIN:
-        helps = f"it does not help ({helps}; a gain begins at {CLEAR_GAIN:g})"
-    return helps if after.converged else f"{helps}; the fit has not settled"
+        helps = f"no significant improvement ({helps}; {CLEAR_GAIN:g} are needed)"
+    return helps if after.converged else f"{helps}; the fit did not converge"
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
-    """Return how an effect added by hand changed errors and numbers, as lines of aligned tables.
+    """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables.
 
     Parameters
     ----------
     table : the ladder of errors, `before` and `after`.
-    numbers : one row a number and model: `symbol, vine, unit, added, value, sigma` (SI).
+    numbers : one row for each parameter and model: `symbol, vine, unit, added, value, sigma` (SI).
     before, after : fits without and with the effect.
 
     Returns
@@ -217,7 +221,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         "position error",
         *_ladder_table(table),
         "",
-        "numbers",
+        "parameters",
     ]
     changed: dict[tuple[str, str], dict[str, str]] = {}
     for row in _rows(numbers):

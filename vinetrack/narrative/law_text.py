@@ -1,4 +1,4 @@
-"""The damping law of an experiment in sentences and tables, for terminal and page, and how it was determined."""
+"""The damping law of an experiment in sentences and tables, for terminal and report, and how it was determined."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "l
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
 """The two fits of the damping law, by their keys in `damping.json`."""
 
-_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, to the letter"}
-"""Rows of the tables of n and B; the last has set pressure, no weight, and the windows of the 3 % rule."""
+_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}
+"""Rows of the tables of n and B; the published rule uses the set pressure, no weight, and the windows of the 3 %
+rule."""
 
 PREFERRED = "both_axes"
-"""The fit whose numbers head the report: speed and force both have errors, and ignoring those of speed bends n."""
+"""The fit whose numbers head the report: speed and force both have errors, and ignoring errors of speed biases n."""
 
 REFERENCES = (
     "Alvarez et al., High-Velocity, Pressure-Driven Eversion for Rapid Vine Robots, IEEE Robotics and Automation "
@@ -46,11 +47,12 @@ DIAGNOSIS_METHODS = (
         "fitted parameters estimated anew; faults of the measurement are candidates too. The best, and those "
         "correlated with them, are fitted in full. Hypotheses within Δχ² = 9 of the best form the answer set. The "
         "threshold for calling an effect missing accounts for the number of candidates and the correlation between "
-        "them. An effect is added only where it is the only answer; then all candidates are tested again.",
+        "them. An effect is added only if it is the only member of the answer set; all candidates are then tested "
+        "again.",
     ),
     (
         "Ladder",
-        "Errors of position are root mean squares with a release and an origin of each trial's own and nothing else. "
+        "Position errors are root mean squares; only release and origin are estimated for each trial. "
         "Left-out conditions are predicted by the model fitted to all other conditions, the highest pressure of each "
         "vine by the model fitted to all lower ones. The floor is the replicate scatter.",
     ),
@@ -90,7 +92,7 @@ def headline(damping: Mapping[str, Any]) -> str:
 
 
 def tally(trials: pd.DataFrame) -> str:
-    """Return how many trials there are of each status, as a sentence.
+    """Return the number of trials of each status, as a sentence.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ def tally(trials: pd.DataFrame) -> str:
 
 
 def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return size, B, its intervals, R² and N by vine and method of `damping.json` as text, smallest vine first.
+    """Return size, B, its intervals, R² and N of each vine and method of `damping.json` as text, smallest vine first.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
     Returns
     -------
-    list of dict, one a vine and method
+    list of dict, one for each vine and method
     """
     table, sizes = [], []
     for method, method_name in _TABLE_METHODS.items():
@@ -137,7 +139,7 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return n and its intervals by every method of `damping.json` as text, or why a method has none.
+    """Return n and its intervals by each method of `damping.json` as text, or why a method refused.
 
     Parameters
     ----------
@@ -145,7 +147,7 @@ def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
     Returns
     -------
-    list of dict, one a method
+    list of dict, one for each method
     """
     table = []
     for method, method_name in _TABLE_METHODS.items():
@@ -195,31 +197,34 @@ def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "Speed",
             f"Positions are smoothed and differentiated by local polynomials of order {velocity.get('order', 3)} "
-            "(Savitzky–Golay). At each point the window is the widest that the noise does not contradict; noise and "
-            "its correlation are estimated from the positions themselves. Speeds in results are those of the tail, "
-            "which moves twice as fast as the leading edge.",
+            "(Savitzky–Golay). The window at each point is the widest whose fit agrees with narrower ones within the "
+            "noise; noise and its correlation are estimated from the positions. Speeds in results are those of the "
+            "tail, which moves twice as fast as the leading edge.",
         ),
         (
             "Steady stretch",
             "The gated rule takes the longest stretch whose change of speed is shown to be below "
-            f"{_percent(steady.get('drift_limit', 0.03))} (an equivalence test, so noise cannot pass for steadiness). "
+            f"{_percent(steady.get('drift_limit', 0.03))} by an equivalence test, so that noise cannot pass as "
+            "steadiness. "
             f"The paper's rule takes at least {steady.get('paper_points', 3)} consecutive points whose speeds vary by "
             f"less than {_percent(steady.get('paper_cv', 0.03))}. A window chosen by hand is used where the sheet "
             "gives one. All are reported for every trial.",
         ),
         (
             "Force",
-            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ: the pressure in the window where it was measured, else the one that "
-            "the model in use gives there, less the yield pressure; and the mean weight moving there. Only trials "
-            "without payload, of everting bodies, enter the fit.",
+            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ. P is the mean pressure in the window, measured or else computed by the "
+            "model in use; P_y is the yield pressure, and m the mean mass in motion in the window. Only everting "
+            "bodies "
+            "without payload enter the fit.",
         ),
         (
             "Damping law",
             "F = B·x_ssⁿ with one n for all vines and a B for each: by least squares on logarithms, as in the paper, "
             "and with errors on both axes (York), where the scatter between vines is added to the measured errors. "
-            f"Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings of whole trials (seed "
-            f"{damping.get('seed', 0)}), or from Student's t where there are too few trials to resample; the wider "
-            "ones add the stated errors that trials share: of the yield pressure, common to a vine, and of the scale, "
+            f"95 % intervals come from a bootstrap of {damping.get('resamples', 2000)} resamplings of whole trials "
+            f"(seed {damping.get('seed', 0)}), or from Student's t where there are too few trials to resample. The "
+            "total intervals add the stated systematic errors: of the yield pressure, common to a vine, and of the "
+            "scale, "
             "common to all recordings.",
         ),
     ]

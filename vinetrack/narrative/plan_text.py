@@ -1,4 +1,4 @@
-"""The next experiment in sentences: which trials to make, which hypotheses they separate, what to measure instead."""
+"""The next experiment in sentences: trials to make, hypotheses that they separate, and what to measure instead."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vinetrack.narrative.verdict_summary import joined
 from vinetrack.planning.feasible_trials import NEW_VINE, Condition
 
 _MUCH_MORE = 1.5
-"""Chosen: the larger of two significances is stated beside the smaller where it is 1.5 times that."""
+"""Ratio from which the larger of two expected significances is stated beside the smaller. Chosen."""
 
 _WITH_TRACE = (
-    "Record the pressure at the vine during growth and give it with the track: what the chamber does is then measured,"
-    " and only the other can explain the remaining misfit."
+    "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
+    " measured, and only the other hypothesis can explain a remaining misfit."
 )
 
 
@@ -41,7 +41,7 @@ def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]
 
 
 def only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ in effects of the measurement alone.
+    """Return whether the hypotheses differ only in faults of the measurement.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ def only_measurement(tied: Sequence[Fit]) -> bool:
 
 
 def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
-    """Return what to measure so that one of each pair can be ruled out, as the effects' own files state it.
+    """Return what to measure in order to exclude one of each pair of hypotheses, as the files of their effects state.
 
-    Where an effect of the measurement is among them, a calibration decides, and only that is returned.
+    Where a fault of the measurement is among them, a calibration decides, and only the calibration is returned.
 
     Parameters
     ----------
@@ -107,41 +107,42 @@ def outlook(
 
     Parameters
     ----------
-    if_true : by pair (`a | b`) the significance if the one or the other is true; the smaller is stated, the larger
-        only where it is much more.
-    simulated : mean and standard deviation of simulated significances by pair.
+    if_true : for each pair (`a | b`) the expected significance if the one or the other hypothesis is true. The smaller
+        is stated; the larger too where it is much larger.
+    simulated : mean and standard deviation of simulated significances for each pair.
 
     Returns
     -------
     str
     """
     parts = []
-    for pair, ways in if_true.items():
-        least, most = sorted(ways, key=ways.__getitem__)
-        notes = [f"{ways[most]:.2g} σ if {most} is true"] if ways[most] > _MUCH_MORE * max(ways[least], 1.0) else []
+    for pair, by_truth in if_true.items():
+        least, most = sorted(by_truth, key=by_truth.__getitem__)
+        is_much_larger = by_truth[most] > _MUCH_MORE * max(by_truth[least], 1.0)
+        notes = [f"{by_truth[most]:.2g} σ if {most} is true"] if is_much_larger else []
         mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
         if math.isfinite(mean):
             notes.append(f"simulated: {mean:.2g}" + (f" ± {max(sd, 0.1):.1g} σ" if math.isfinite(sd) else " σ"))
-        behind = f" ({'; '.join(notes)})" if notes else ""
-        parts.append(f"{pair.replace(' | ', ' from ')} by {ways[least]:.2g} σ{behind}")
+        remark = f" ({'; '.join(notes)})" if notes else ""
+        parts.append(f"{pair.replace(' | ', ' from ')} by {by_truth[least]:.2g} σ{remark}")
     return ", ".join(parts)
 
 
 def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """Return the trials of a design as entries of `next_experiment`, one a condition.
+    """Return the trials of a design as entries of `next_experiment`, one for each condition.
 
     Parameters
     ----------
     every : all feasible conditions.
-    design : places in `every`, one for each trial.
+    design : index into `every` of each trial.
 
     Returns
     -------
     tuple of dict
     """
     return tuple(
-        _entry(every[place], int(count))
-        for place, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
+        _entry(every[index], int(count))
+        for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
     )
 
 
@@ -166,16 +167,16 @@ def in_words(
     worth_it: bool,
     least: float,
 ) -> str:
-    """Return the advice: the trials, what they separate, and what to measure besides.
+    """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead.
 
     Parameters
     ----------
     trials : entries of `entries`.
-    promise : the text of `outlook`.
+    promise : the text of `outlook`, expected significances.
     left : pairs that the trials do not separate.
     advice : the text of `calibration_for`.
-    worth_it : whether the best design separates a pair by `least`, in standard deviations.
-    least : separation that is worth a trial, standard deviations.
+    worth_it : whether the best design separates a pair by at least `least`.
+    least : smallest separation that is worth a trial, standard deviations.
 
     Returns
     -------
@@ -183,15 +184,15 @@ def in_words(
     """
     if not worth_it:
         return (
-            f"No trials within the limits separate the tied hypotheses by {least:g} σ; the best would separate"
+            f"No trials within `limits` separate the tied hypotheses by {least:g} σ; the best would separate"
             f" {promise}. {advice}".rstrip()
         )
-    text = f"Make {_trials_in_words(trials)}. Together with the trials so far they separate {promise}."
+    text = f"Make {_trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
     if any(trial["new_vine"] for trial in trials):
-        text += " B of the new vine is assumed here from scaling and is fitted; its yield pressure has to be measured."
+        text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
     if left:
         pairs = joined([pair.replace(" | ", " from ") for pair in left])
         text += f" They will not separate {pairs}. {advice}"
     elif advice:
-        text += f" A measurement would do as well: {advice}"
+        text += f" A measurement would decide as well: {advice}"
     return text.rstrip()

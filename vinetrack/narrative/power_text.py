@@ -1,4 +1,4 @@
-"""The power of a campaign in sentences: what it would have shown, what not, and how often it raises a false alarm."""
+"""The power of a campaign in sentences: detectable sizes of effects, undetectable effects, false-alarm rate."""
 
 from __future__ import annotations
 
@@ -13,35 +13,15 @@ from vinetrack.narrative.verdict_summary import joined, listed, plain
 if TYPE_CHECKING:
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
 
-HARDLY_EVER = 0.1
-"""Probability below which an effect is found "hardly ever". Chosen: one campaign in ten; with one in twenty the size
-that is named is smaller by a tenth."""
+LOW_POWER = 0.1
+"""Power below which an effect counts as undetectable. Chosen: one campaign in ten; with one in twenty the size that is
+named is smaller by a tenth."""
 
-MOST_TOLD = 4
-"""Effects that are told of in sentences. Chosen: the table above them has all; twice as many would not be read."""
+MOST_SENTENCES = 4
+"""Effects that get a sentence each, at most. Chosen: the table above has all; twice as many would not be read."""
 
-_IN_WORDS = (
-    (0.95, "nearly always"), (0.85, "nine times in ten"), (0.71, "three times in four"), (0.6, "two times in three"),
-    (0.42, "every other time"), (0.29, "one time in three"), (0.22, "one time in four"), (0.17, "one time in five"),
-    (0.07, "one time in ten"), (0.0, "one time in twenty"),
-)  # fmt: skip
-
-
-def frequency(probability: float) -> str:
-    """Return a probability as people say it.
-
-    Parameters
-    ----------
-    probability : 0 to 1.
-
-    Returns
-    -------
-    str
-
-    >>> frequency(0.27), frequency(0.9)
-    ('one time in four', 'nine times in ten')
-    """
-    return next(words for least, words in _IN_WORDS if probability >= least)
+AT_LARGEST = "with 90 % power at their largest plausible size"
+"""Follows the number of detectable effects (`detectable_count`)."""
 
 
 def percent(rate: float) -> str:
@@ -77,43 +57,50 @@ def size_text(power: EffectPower, value: float) -> str:
 
 
 def effect_sentence(power: EffectPower, n_trials: int) -> str:
-    """Return what the trials show of one effect, in a sentence.
+    """Return the sizes of one effect that the trials detect, in a sentence.
 
     Parameters
     ----------
     power : of the effect.
-    n_trials : how many trials there are.
+    n_trials : number of trials.
 
     Returns
     -------
     str
     """
-    trials = f"these {n_trials} trials" if n_trials != 1 else "this trial"
-    show = "show" if n_trials != 1 else "shows"
-    name = f"{power.symbol} of {plain(power.effect)}"
-    top, seen = size_text(power, power.largest), power.probability_at(power.largest)
-    at_90, at_few = power.size_at(0.9), power.size_at(HARDLY_EVER)
-    beyond = "beyond" if power.largest > power.zero else "below"
-    within = "short of" if power.largest > power.zero else "above"
-    if seen < HARDLY_EVER:
-        text = f"{trials} hardly ever {show} {name}, even at its largest plausible size, {top}"
-    elif seen < 0.9:
-        text = f"{trials} {show} {name} {frequency(seen)} at its largest plausible size, {top}"
-    elif power.least != power.zero and power.probability_at(power.least) >= 0.9:
-        text = f"{trials} {show} {name} at any plausible size ({size_text(power, at_90)} nine times in ten)"
-    else:
+    trials, detect = (f"These {n_trials} trials", "detect") if n_trials != 1 else ("This trial", "detects")
+    name, symbol = plain(power.effect), power.symbol
+    largest, at_largest = size_text(power, power.largest), power.probability_at(power.largest)
+    if at_largest < LOW_POWER:
         text = (
-            f"{trials} {show} {name} {beyond} {size_text(power, at_90)} nine times in ten; "
-            f"{within} {size_text(power, at_few)} hardly ever"
+            f"{trials} {detect} {name} with less than {percent(LOW_POWER)} power even at its largest plausible size, "
+            f"{symbol} = {largest}"
         )
-    if power.taken_for and seen >= HARDLY_EVER:
-        taken = ", ".join(f"{plain(other)} {frequency(rate)}" for other, rate in list(power.taken_for.items())[:2])
-        text += f"; it would be called {taken}"
-    return text[0].upper() + text[1:] + "."
+    elif at_largest < 0.9:
+        text = (
+            f"{trials} {detect} {name} with {percent(at_largest)} power at its largest plausible size, "
+            f"{symbol} = {largest}"
+        )
+    elif power.least != power.zero and power.probability_at(power.least) >= 0.9:
+        text = (
+            f"{trials} {detect} {name} of any plausible size (90 % power at {symbol} = "
+            f"{size_text(power, power.size_at(0.9))})"
+        )
+    else:
+        beyond, within = ("above", "below") if power.largest > power.zero else ("below", "above")
+        text = (
+            f"{trials} {detect} {name} with at least 90 % power {beyond} {symbol} = "
+            f"{size_text(power, power.size_at(0.9))}, and with less than {percent(LOW_POWER)} {within} "
+            f"{size_text(power, power.size_at(LOW_POWER))}"
+        )
+    if power.taken_for and at_largest >= LOW_POWER:
+        names = [f"{plain(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:2]]
+        text += f"; it would be mistaken for {joined(names)} of campaigns"
+    return f"{text}."
 
 
 def false_alarm_sentence(power: Power) -> str:
-    """Return how often such trials say that something is missing where nothing is.
+    """Return the false-alarm rate of such trials: how often something is called missing where nothing is.
 
     Parameters
     ----------
@@ -124,13 +111,13 @@ def false_alarm_sentence(power: Power) -> str:
     str
     """
     return (
-        f"Where nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
-        "campaigns, if noise and scatter are as the fit holds them."
+        f"If nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
+        "campaigns, provided that noise and scatter are as fitted."
     )
 
 
 def power_brief(power: Power) -> str:
-    """Return what must stand beside a verdict, in one clause: false alarms, and how many effects would have been found.
+    """Return the false-alarm rate and the number of detectable effects, which must stand beside a verdict.
 
     Parameters
     ----------
@@ -143,15 +130,27 @@ def power_brief(power: Power) -> str:
     alarms = f"false alarms in at most {percent(power.false_alarm_rate)} of such campaigns"
     if power.wary or not power.effects:
         return alarms
-    seen = sum(entry.probability_at(entry.largest) >= 0.9 for entry in power.effects)
-    total = len(power.effects) + len(power.not_testable)
-    return (
-        f"{alarms}; {seen} of {total} effects would have been found nine times in ten at their largest plausible size"
-    )
+    return f"{alarms}; {detectable_count(power)} would have been detected {AT_LARGEST}"
+
+
+def detectable_count(power: Power) -> str:
+    """Return how many effects the trials detect with 90 % power at their largest plausible size.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    str
+        `17 of 29 effects`
+    """
+    n_detectable = sum(entry.probability_at(entry.largest) >= 0.9 for entry in power.effects)
+    return f"{n_detectable} of {len(power.effects) + len(power.not_testable)} effects"
 
 
 def could_have_seen(power: Power) -> list[str]:
-    """Return what the trials would have shown nine times in ten and what not even at its largest plausible size.
+    """Return the sizes that the trials detect with 90 % power, and the effects that they do not detect.
 
     Parameters
     ----------
@@ -163,30 +162,31 @@ def could_have_seen(power: Power) -> list[str]:
         At most three sentences.
     """
     if power.wary:
-        return [f"What they could have seen is not worked out: {power.wary}."]
+        return [f"Detectable sizes were not computed: {power.wary}."]
     physical = _physical(power)
-    seen = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
-    at_times = [entry for entry in physical if HARDLY_EVER <= entry.probability_at(entry.largest) < 0.9]
+    detectable = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
+    sometimes = [entry for entry in physical if LOW_POWER <= entry.probability_at(entry.largest) < 0.9]
     lines = []
-    if seen:
+    if detectable:
         sizes = "; ".join(
-            f"{plain(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}" for entry in seen
+            f"{plain(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
+            for entry in detectable
         )
-        lines.append(f"Found nine times in ten: {sizes}.")
-    if at_times:
+        lines.append(f"Detectable with 90 % power: {sizes}.")
+    if sometimes:
         parts = [
-            f"{plain(entry.effect)} ({frequency(entry.probability_at(entry.largest))} at "
+            f"{plain(entry.effect)} ({percent(entry.probability_at(entry.largest))} at "
             f"{entry.symbol} = {size_text(entry, entry.largest)})"
-            for entry in at_times
+            for entry in sometimes
         ]
-        lines.append(f"Found at times, at the largest plausible size: {joined(parts)}.")
-    if blind := unseen(power):
-        lines.append(f"Could not have been seen: {listed(blind)}.")
+        lines.append(f"Detectable with less power, even at the largest plausible size: {joined(parts)}.")
+    if undetectable := unseen(power):
+        lines.append(f"Not detectable: {listed(undetectable)}.")
     return lines
 
 
 def unseen(power: Power) -> list[str]:
-    """Return the physical effects that the trials show hardly ever even at their largest plausible size, or not at all.
+    """Return the physical effects that are not testable, or detected with less than 10 % power at any plausible size.
 
     Parameters
     ----------
@@ -197,17 +197,17 @@ def unseen(power: Power) -> list[str]:
     list of str
         Names of effects; of all kinds where none is physical.
     """
-    never = [entry.effect for entry in _physical(power) if entry.probability_at(entry.largest) < HARDLY_EVER]
-    return [*never, *(name for name in power.not_testable if name not in never)]
+    undetectable = [entry.effect for entry in _physical(power) if entry.probability_at(entry.largest) < LOW_POWER]
+    return [*undetectable, *(name for name in power.not_testable if name not in undetectable)]
 
 
 def _physical(power: Power) -> list[EffectPower]:
-    """The physical effects, all effects where there are none."""
+    """The physical effects; all effects where none is physical."""
     return [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
 
 
 def width_text(width: NumberWidth) -> str:
-    """Return the half width of the 95 % interval of a number.
+    """Return the half width of the 95 % interval of a parameter: `n ± 0.0075`.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def width_text(width: NumberWidth) -> str:
 
 
 def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
-    """Return a row an effect: name, symbol, sizes found with 50 and 90 %, largest plausible, found there, taken for.
+    """Return a row for each effect, with the columns of `POWER_COLUMNS`.
 
     Parameters
     ----------
@@ -250,7 +250,9 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
     return rows
 
 
-HEAD = ("effect", "", "found 50 %", "found 90 %", "largest plausible", "found there", "taken for (at 90 %)")
+POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", "power there", "mistaken for (at 90 %)")
+"""Headings of `power_rows`: effect, symbol, sizes detected with 50 and 90 % power, largest plausible size, power at it,
+and the effects that the diagnosis would name instead, at the size of 90 % power."""
 
 
 def power_lines(power: Power) -> list[str]:
@@ -264,13 +266,13 @@ def power_lines(power: Power) -> list[str]:
     -------
     list of str
     """
-    lines = [f"What {power.n_trials} trials can show of effects beside {' + '.join(power.model)}"]
+    lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
     if power.wary:
         lines.append(f"! {power.wary}")
     lines += _size_table(power.effects)
     lines += [f"  not testable: {plain(name)}: {why}" for name, why in power.not_testable.items()]
-    lines += [effect_sentence(entry, power.n_trials) for entry in _told(power)]
+    lines += [effect_sentence(entry, power.n_trials) for entry in _effects_in_sentences(power)]
     lines += [false_alarm_sentence(power)]
     if power.numbers:
         lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
@@ -284,16 +286,16 @@ def power_lines(power: Power) -> list[str]:
 
 
 def _size_table(effects: Sequence[EffectPower]) -> list[str]:
-    """A row an effect, those that can be seen first."""
-    rows = [HEAD, *power_rows(sorted(effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
+    """A row for each effect, detectable ones first."""
+    rows = [POWER_COLUMNS, *power_rows(sorted(effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(POWER_COLUMNS))]
     return [
         ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
     ]
 
 
 def seen_lines(power: Power) -> list[str]:
-    """Return what a campaign designed for n and B could see of other effects.
+    """Return the power of a campaign designed for n and B to detect other effects.
 
     Parameters
     ----------
@@ -304,20 +306,20 @@ def seen_lines(power: Power) -> list[str]:
     list of str
     """
     physical = [entry for entry in power.effects if entry.kind == "physical"]
-    head = f"what these {power.n_trials} trials could see of physics that their model lacks, by linear theory:"
+    head = f"power of these {power.n_trials} trials to detect physics that their model lacks, by linear theory:"
     return [head, *_size_table(physical), false_alarm_sentence(power)]
 
 
-def _told(power: Power) -> list[EffectPower]:
-    """The effects that are told of in a sentence each: few, else those hardest to see among the visible ones."""
-    if len(power.effects) <= MOST_TOLD:
+def _effects_in_sentences(power: Power) -> list[EffectPower]:
+    """All effects if they are few, else the physical ones of the lowest power."""
+    if len(power.effects) <= MOST_SENTENCES:
         return list(power.effects)
     physical = [entry for entry in power.effects if entry.kind == "physical"]
-    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:MOST_TOLD]
+    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:MOST_SENTENCES]
 
 
 def simulated_lines(power: Power) -> list[str]:
-    """Return what complete diagnoses of simulated campaigns said, beside what linear theory promises.
+    """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory.
 
     Parameters
     ----------
@@ -336,22 +338,22 @@ def simulated_lines(power: Power) -> list[str]:
         named = ", ".join(f"{names} {count}" for names, count in rates.named[:4])
         if rates.effect:
             entry = power[rates.effect]
-            what = f"{plain(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: found in {rate}, "
+            what = f"{plain(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: detected in {rate}, "
             what += f"{percent(rates.promised)} by linear theory"
         else:
             what = f"nothing missing: a false alarm in {rate}, at most {percent(rates.promised)} by the tests' levels"
         lines.append(
             what + (f"; named: {named}" if named else "") + (f"; no verdict: {rates.failed}" if rates.failed else "")
         )
-    return ["Simulated campaigns, diagnosed from beginning to end:", *(f"  {line}" for line in lines)] if lines else []
+    return ["Simulated campaigns, each diagnosed in full:", *(f"  {line}" for line in lines)] if lines else []
 
 
 def further_lines(plan: FurtherTrials) -> list[str]:
-    """Return the trials that bring an effect to the wanted probability, a row a condition, or why none do.
+    """Return the further trials with which an effect is detected with the wanted power, a row for each condition.
 
     Parameters
     ----------
-    plan : of further trials.
+    plan : further trials, or why none suffice.
 
     Returns
     -------
@@ -363,11 +365,11 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
     what = f"{plain(plan.effect)} at {plan.symbol} = {size}"
     if plan.before >= plan.reach:
-        return [f"{what} is found in {percent(plan.before)} of campaigns with these trials: none need be added."]
+        return [f"{what} is detected with {percent(plan.before)} power by these trials: none need be added."]
     if not plan.looked_at:
         return [f"{what}: no further trial within `limits` can be made and filmed."]
     count = len(plan.trials)
-    lines = [f"To find {what} in {percent(plan.reach)} of campaigns, {percent(plan.before)} now:"]
+    lines = [f"To detect {what} with {percent(plan.reach)} power ({percent(plan.before)} with the trials so far):"]
     rows, done = [], 0
     while done < count:
         added = plan.trials[done]
@@ -375,7 +377,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         times = next((k for k, other in enumerate(plan.trials[done:]) if other not in same), count - done)
         cells = sheet_cells(added.trial)
         changed = [f"{COLUMN_WORDS.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
-        new = ["a vine to be made"] if added.new_vine else []
+        new = ["a new vine"] if added.new_vine else []
         rows.append(
             (
                 str(times), added.trial.vine, f"{cells.get('pressure_kPa', math.nan):g}",
@@ -385,30 +387,30 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         )  # fmt: skip
         done += times
     if rows and plan.after > plan.before:
-        head = ("trials", "vine", "pressure", "payload", "what is new", "found then")
+        head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
     if not plan.is_reached:
         if plan.endless < plan.reach:
             lines.append(
-                f"No number of trials within `limits` gets there: {plan.looked_at} kinds of trial were looked at, and "
-                f"all of them, made without end, would find it in {percent(plan.endless)}."
+                f"No number of trials within `limits` suffices: with unlimited replicates of all {plan.looked_at} "
+                f"conditions considered, the power would be {percent(plan.endless)}."
             )
         else:
-            lines.append(f"{count} further trials do not get there; more would, up to {percent(plan.endless)}.")
-    asked = {"with a new vine"} if any(added.new_vine for added in plan.trials) else set()
-    asked |= {"with another rig"} if any(added.changed for added in plan.trials) else set()
-    less = [
+            lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.endless)} power.")
+    changes = {"with a new vine"} if any(added.new_vine for added in plan.trials) else set()
+    changes |= {"with another rig"} if any(added.changed for added in plan.trials) else set()
+    alternatives = [
         f"{words} about {needed}"
         for words, needed in plan.needed.items()
-        if asked and words not in asked and needed >= count
+        if changes and words not in changes and needed >= count
     ]
-    if plan.is_reached and less:
-        lines.append(f"Without what is new: {', '.join(less)} trials.")
+    if plan.is_reached and alternatives:
+        lines.append(f"Without these changes: {', '.join(alternatives)} trials.")
     if plan.power is not None and plan.power.taken_for:
-        taken = ", ".join(f"{plain(other)} {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3])
-        lines.append(f"With them it would be taken for: {taken} (at the size found nine times in ten).")
+        names = [f"{plain(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
+        lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")
     return lines
 
 
 COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
-"""What of a rig may change from trial to trial, as it is printed."""
+"""Columns of the rig that a further trial may change, as printed."""

@@ -1,6 +1,6 @@
-"""A diagnosis in sentences: what is missing, how sure that is, and what adding it changed.
+"""Summary of a diagnosis: what is missing, how significant that is, and how much adding it reduces the error.
 
-The page, the figures, notebooks and the explorer take these sentences; `verdict_text` prints a whole diagnosis.
+Report, figures, notebooks and explorer use these sentences; `diagnosis_text` prints a whole diagnosis.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.confounder import Confounder, left_open
-from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, NOT_TESTABLE, UNEXPLAINED
 from vinetrack.narrative.between_text import difference_headline, trials_differ
 
 if TYPE_CHECKING:
@@ -24,24 +24,25 @@ if TYPE_CHECKING:
 
 MEANINGS = {
     MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
-    AMBIGUOUS: "An effect is missing, and these trials cannot tell which of a few it is: nothing was added. "
-    "The next trial, which would tell them apart, is below.",
-    ARTEFACT: "The misfit is explained by a fault of the measurement, not by physics: nothing was added. "
+    AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
+    "The next experiment below would separate them.",
+    ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit: nothing was added. "
     "Correct the measurement first.",
     ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
     "Upper limits on the size of each are listed below.",
     UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
-    "The missing force is drawn below; vinetrack propose seeks a law for it.",
+    "The missing force is drawn below; `vinetrack propose` looks for a law that describes it.",
 }
 """What each verdict means."""
 
 TRIALS_DIFFER = (
-    "What the model misses is a difference between trials, not physics: nothing was added. What to do is said below."
+    "A difference between trials, not missing physics, explains the misfit: nothing was added. The explanation below "
+    "says what to do."
 )
 
 ODD_MEANING = (
-    "What the sheet says of a trial and how it moved contradict each other. What the others say is in the "
-    "verdict in full. Correct its row, or leave it out with `use: no`, and run again."
+    "The row of a trial in the sheet contradicts its motion. The verdict in full covers the other trials. Correct its "
+    "row, or leave it out with `use: no`, and run again."
 )
 
 THEREAFTER = {
@@ -53,17 +54,17 @@ THEREAFTER = {
 }
 """The verdict on the model with all added effects."""
 
-MOST_UNSEEN_LISTED = 6
-"""Effects that are listed on the first screen as not visible. Chosen: two lines; all are in the table of the page."""
+MOST_UNDETECTABLE_LISTED = 6
+"""Undetectable effects listed on the first screen, at most. Chosen: two lines; the table of the page has all."""
 
 NONE_SEEN = 2.0
-"""Standard errors below which a size is said to be none. Chosen: the usual 95 %; at half sizes of pure noise would be
-quoted as sizes once in three, at twice some that are there would be called none."""
+"""Standard errors below which a size is reported as not significant. Chosen: the usual 95 %. At half of it one size in
+three of pure noise would be reported as significant; at twice, some real sizes would not be."""
 
 
 @dataclass(frozen=True)
 class Fact:
-    """One number of the first screen: the question it answers, the answer, and a line below it."""
+    """One entry of the first screen: the quantity, its value, and a line below it."""
 
     question: str
     answer: str
@@ -71,11 +72,11 @@ class Fact:
 
 
 def plain(effect: str) -> str:
-    """Return the name of an effect with blanks for its underscores.
+    """Return the name of an effect with blanks for underscores.
 
     Parameters
     ----------
-    effect : name with underscores.
+    effect : name in the catalogue.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def listed(names: Sequence[str], last: str = "and") -> str:
 
     Parameters
     ----------
-    names : with underscores.
+    names : in the catalogue.
     last : the conjunction before the last name.
 
     Returns
@@ -135,20 +136,17 @@ def sentence(diagnosis: Diagnosis) -> str:
     if verdict == AMBIGUOUS:
         return f"Missing from the model: {listed(answers, 'or')}. These trials cannot tell which."
     if verdict == ARTEFACT and trials_differ(answers):
-        return f"Trials differ, the physics holds: {difference_headline(answers)}."
+        return f"The trials differ, and no physics is missing: {difference_headline(answers)}."
     if verdict == ARTEFACT:
-        return f"A fault of the measurement, not of the physics: {listed(answers, 'or')}."
+        return f"A fault of the measurement, not missing physics: {listed(answers, 'or')}."
     if verdict == ADEQUATE:
         return "No missing effect can be detected."
     if diagnosis.odd_trials:
-        return f"{joined(diagnosis.odd_trials)} {_do_not_go(diagnosis)} with the others, which are explained."
+        verb = "is" if len(diagnosis.odd_trials) == 1 else "are"
+        return f"{joined(diagnosis.odd_trials)} {verb} inconsistent with the others, which the model explains."
     if verdict == UNEXPLAINED:
         return "The model fails, and no effect of the catalogue explains it."
     return "No diagnosis could be made."
-
-
-def _do_not_go(diagnosis: Diagnosis) -> str:
-    return "does not go" if len(diagnosis.odd_trials) == 1 else "do not go"
 
 
 def meaning(diagnosis: Diagnosis) -> str:
@@ -168,12 +166,12 @@ def meaning(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == ARTEFACT and trials_differ(list(diagnosis.answer_set)):
         text = TRIALS_DIFFER
     added = diagnosis.effects
-    then = THEREAFTER.get(diagnosis.final_verdict, "") if added else ""
-    return f"{text} {then.replace('With it,', 'With them,') if len(added) > 1 else then}".strip()
+    final = THEREAFTER.get(diagnosis.final_verdict, "") if added else ""
+    return f"{text} {final.replace('With it,', 'With them,') if len(added) > 1 else final}".strip()
 
 
 def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
-    """Return significance, size and change of the error: as many numbers as the verdict has.
+    """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them.
 
     Parameters
     ----------
@@ -215,10 +213,10 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     others = [row for row in tested if not row.in_answer_set]
     best = max(tested, key=_gain, default=None)
     if verdict == ADEQUATE:
-        # By the score: a predicted gain may belong to a size of the wrong sign.
+        # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
         scored = [row for row in ranking if known(row.sigma)]
         best = max(scored, key=lambda row: abs(row.sigma), default=None)
-        note = f"the best of {len(scored)} candidates: {plain(best.effect)}" if best else ""
+        note = f"largest of {len(scored)} candidates: {plain(best.effect)}" if best else ""
         return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
     if diagnosis.odd_trials:
         return None
@@ -229,14 +227,14 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     best = max(inside, key=_gain, default=None)
     if best is None:
         return None
-    tried = sum(row.status != "not testable here" for row in ranking)
-    note = f"of {tried} candidates tested" if tried > 1 else "the only candidate"
-    note = f"{len(inside)} of {tried} candidates fit equally well" if len(inside) > 1 else note
-    # One that holds the answer as a limit fits as well by construction, and is no rival.
+    n_tested = sum(row.status != NOT_TESTABLE for row in ranking)
+    note = f"of {n_tested} candidates tested" if n_tested > 1 else "the only candidate"
+    note = f"{len(inside)} of {n_tested} candidates fit equally well" if len(inside) > 1 else note
+    # A candidate that contains the answer as a limiting case fits as well by construction, and is no rival.
     rival = max([row for row in others if not row.plausible or not row.reason], key=_gain, default=None)
     if rival is not None:
         behind = best.delta_chi2 - rival.delta_chi2
-        # An implausible candidate, or one predicted and not fitted, may have the larger Δχ².
+        # An implausible candidate, or one whose Δχ² is only predicted, may have the larger Δχ².
         note = f"next best: {plain(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
         note += "" if rival.plausible else ", not plausible"
     return Fact("Significance", f"{_sigmas(best)} σ", note)
@@ -276,14 +274,14 @@ def size(entry: Number) -> str:
     Returns
     -------
     str
-        With what it means where it sits at a bound, or is negative where its effect cannot be.
+        With a remark where it lies at or outside a bound.
     """
     unit, factor = display_unit(entry.unit)
     if known(entry.bound):
         return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
     text = f"{entry.title} = {value_alone(entry)} {unit}".strip()
     if entry.value < entry.lower or entry.value > entry.upper:
-        text += " (negative, which it cannot be)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
+        text += " (negative, which is impossible)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
     return text
 
 
@@ -297,19 +295,19 @@ def sizes(row: Candidate) -> str:
     Returns
     -------
     str
-        Blank where it has no fitted number; `none seen` follows where the candidate is less than 2 standard errors
-        from no effect at all.
+        Blank where it has no fitted number; `not significant` follows where the candidate is less than 2 standard
+        errors from no effect.
     """
     text = ", ".join(size(entry) for entry in row.numbers if known(entry.value))
-    return f"{text}: none seen" if text and known(row.sigma) and abs(row.sigma) < NONE_SEEN else text
+    return f"{text}: not significant" if text and known(row.sigma) and abs(row.sigma) < NONE_SEEN else text
 
 
 def _sizes(diagnosis: Diagnosis) -> list[Fact]:
-    """The size of every effect that was added, at the end; of those in the answer set where none was."""
+    """The size of each added effect in the final model; without one, the sizes of the members of the answer set."""
     if diagnosis.effects:
         of = {name: [n for n in diagnosis.parameters if n.key.split(".")[0] == name] for name in diagnosis.effects}
         return [
-            Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0]) + _beside_others(diagnosis, n[0].key))
+            Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0]) + _confounded_interval(diagnosis, n[0].key))
             for name, n in of.items()
             if n
         ]
@@ -317,8 +315,8 @@ def _sizes(diagnosis: Diagnosis) -> list[Fact]:
     return [Fact(f"If {plain(row.effect)}", sizes(row)) for row in members[:3]]
 
 
-def _beside_others(diagnosis: Diagnosis, key: str) -> str:
-    """The wider interval of a size where effects that the data do not exclude are left open; blank without any."""
+def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
+    """The wider interval of a size that allows for effects the data do not exclude; blank without any."""
     alike: list[Confounder] = []
     for entry in diagnosis.rounds:
         rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
@@ -328,7 +326,7 @@ def _beside_others(diagnosis: Diagnosis, key: str) -> str:
     factor = display_unit(alike[0].number.unit)[1]
     low, high = left_open(alike)
     names = joined([plain(rival.effect) for rival in alike])
-    return f"; with {names} left open: {number(factor * low, 4)} to {number(factor * high, 4)}"
+    return f"; allowing for {names}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
 def size_interval(entry: Number) -> str:
@@ -359,20 +357,20 @@ def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
 
 
 def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
-    """How often such trials say that something is missing where nothing is, and what they could have shown."""
+    """The false-alarm rate of such trials, and the effects that they could have detected."""
     if diagnosis.power is None:
         return []
-    from vinetrack.narrative.power_text import power_brief, unseen
+    from vinetrack.narrative.power_text import AT_LARGEST, detectable_count, percent, unseen
 
-    alarms, _, shown = power_brief(diagnosis.power).partition("; ")
-    rate = alarms.removeprefix("false alarms in ").partition(" of such")[0]
-    alarm = Fact("False alarms", rate, "of such campaigns, where nothing is missing")
-    seen, _, how = shown.partition(" would have been found ")
-    if not how:
-        return [alarm, Fact("Could have been seen", "not worked out", diagnosis.power.wary)]
-    blind = unseen(diagnosis.power)
-    beyond = f"; not even then: {listed(blind)}" if 0 < len(blind) <= MOST_UNSEEN_LISTED else ""
-    return [alarm, Fact("Could have been seen", seen, f"{how}{beyond}")]
+    power = diagnosis.power
+    alarm = Fact(
+        "False alarms", f"at most {percent(power.false_alarm_rate)}", "of such campaigns if nothing is missing"
+    )
+    if power.wary or not power.effects:
+        return [alarm, Fact("Detectable effects", "not computed", power.wary)]
+    undetectable = unseen(power)
+    listing = f"; not even then: {listed(undetectable)}" if 0 < len(undetectable) <= MOST_UNDETECTABLE_LISTED else ""
+    return [alarm, Fact("Detectable effects", detectable_count(power), f"{AT_LARGEST}{listing}")]
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
@@ -399,7 +397,7 @@ def _exponent(diagnosis: Diagnosis) -> list[Fact]:
 
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out the steps of a ladder that mend only a part of what nothing mends in full.
+    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it.
 
     Parameters
     ----------

@@ -13,8 +13,7 @@ from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.law_text import PREFERRED
-from vinetrack.narrative.power_text import HEAD as POWER_HEAD
-from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_rows
+from vinetrack.narrative.power_text import POWER_COLUMNS, could_have_seen, false_alarm_sentence, power_rows
 from vinetrack.narrative.verdict_summary import facts, known, listed, meaning, plain, sentence, size, sizes
 from vinetrack.report.section import ReportTable
 
@@ -226,7 +225,7 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
     table = None
     if power.effects and not power.wary:
         order = sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
-        head = ("Effect", "number", *POWER_HEAD[2:])
+        head = ("Effect", "number", *POWER_COLUMNS[2:])
         table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), ABOUT_POWER)
     return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
