@@ -63,5 +63,5 @@ def test_a_key_is_added_to_a_file_without_a_last_line_end() -> None:
 
 
 def test_what_cannot_be_set_without_harm_is_refused() -> None:
-    with pytest.raises(ExperimentError, match="without harm"):
+    with pytest.raises(ExperimentError, match="without altering other settings"):
         with_value("a: &x {p: 1}\nb: *x\n", "b", {"p": 2})

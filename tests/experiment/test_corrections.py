@@ -39,9 +39,9 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("a,3,remove,", "is no correction: write move, drop or confirm"),
-        ("a,3.5,drop,", "is no frame"),
-        ("a,-1,drop,", "is no frame"),
+        ("a,3,remove,", "is not an action: write move, drop or confirm"),
+        ("a,3.5,drop,", "is not a frame number"),
+        ("a,-1,drop,", "is not a frame number"),
         ("a,3,move,", "is blank"),
         ("a,three,drop,", "is not a number"),
         ("a,3,drop,\na,3,confirm,", "is corrected twice"),
@@ -57,4 +57,7 @@ def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: s
 def test_corrections_of_a_track_and_of_a_stranger_are_ignored_with_a_warning(tmp_path: Path) -> None:
     experiment = read_experiment(write(tmp_path, "trial,frame,action,edge_px\nb,3,drop,\nzz,3,drop,\n"))
     words = [problem.message for problem in experiment.problems if problem.file == "corrections.csv"]
-    assert words == ["is no recording, and its corrections are ignored", "is not in the sheet"]
+    assert words == [
+        "is not a recording; its corrections are ignored",
+        "is not in the sheet; its corrections are ignored",
+    ]

@@ -127,7 +127,7 @@ def test_a_trial_put_aside_is_listed_and_not_judged(folder: Path) -> None:
         ("diameter_mm", "0.024", "looks like metres: 0.024 metres is 24 mm"),
         ("diameter_mm", "301", "is above 300 mm"),
         ("diameter_mm", "0.49", "is below 0.5 mm"),
-        ("thickness_um", "6001", "is a wall above a quarter of the diameter of 24 mm (allowed: at most 6000 µm)"),
+        ("thickness_um", "6001", "is more than a quarter of the diameter (24 mm) (allowed: at most 6000 µm)"),
         ("thickness_um", "0", "is not above 0"),
         ("length_mm", "280000", "looks like µm: 280000 µm is 280 mm"),
         ("payload_g", "-3", "is below 0 g"),
@@ -141,11 +141,11 @@ def test_a_trial_put_aside_is_listed_and_not_judged(folder: Path) -> None:
         ("bends", "1:2:3;4", "bend '4' that is not three numbers"),
         ("bends", "1:0:3", "not positive"),
         ("use", "perhaps", "neither yes nor no"),
-        ("trial", "v 1", "is no name for a trial"),
+        ("trial", "v 1", "is not a valid trial name"),
         ("trial", "-rf", "begins with a hyphen"),
         ("trial", "--help", "begins with a hyphen"),
         ("trial", "", "is blank"),
-        ("trial", "../x", "is no name for a trial"),
+        ("trial", "../x", "is not a valid trial name"),
         ("trial", "x" * 101, "too long"),
         ("track", "../a.csv", "leads out of the experiment folder"),
         ("track", "/data/a.csv", "absolute path"),
@@ -177,13 +177,13 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(
     ("column", "cell", "words"),
     [
         ("pressure_kPa", "2.5", "psi"),
-        ("yield_pressure_kPa", "0", "says that the vine grows at any pressure"),
+        ("yield_pressure_kPa", "0", "states that the vine grows at any pressure"),
         ("payload_g", "0.0356", "looks like kilograms"),
         ("thickness_um", "0.2", "looks like millimetres"),
         ("length_mm", "0.28", "looks like metres"),
-        ("exposure_us,capture_fps", "1200,1000", "longer than a frame"),
+        ("exposure_us,capture_fps", "1200,1000", "1.2 times the frame interval"),
         ("payload_gg", "3", "did you mean payload_g?"),
-        ("remarks", "nice", "is no column of a trial sheet and is ignored"),
+        ("remarks", "nice", "is not a column of the trial sheet and is ignored"),
     ],
 )
 def test_a_legal_oddity_is_a_warning(folder: Path, column: str, cell: str, words: str) -> None:
@@ -219,7 +219,7 @@ def test_names_that_differ_in_case_alone_are_a_warning(folder: Path) -> None:
     write(folder, GOOD.replace("\nb,", "\nA,"))
     (problem,) = read_experiment(folder).problems
     assert problem.severity == "warning"
-    assert "in case alone" in problem.message
+    assert "in case only" in problem.message
 
 
 def test_a_video_needs_its_rate_of_capture(folder: Path) -> None:
@@ -252,7 +252,7 @@ def test_a_rate_of_playback_is_suspected(folder: Path, shared: bool) -> None:
     assert [trial.capture_fps for trial in experiment.trials] == [30]
     (problem,) = experiment.problems
     assert (problem.severity, problem.file) == ("warning", "experiment.yaml" if shared else "trials.csv")
-    assert "not that of playback" in str(problem)
+    assert "not the playback rate" in str(problem)
 
 
 def test_a_falling_ball_needs_a_diameter_only(folder: Path) -> None:

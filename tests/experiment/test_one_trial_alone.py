@@ -48,13 +48,13 @@ def test_an_axis_may_go_through_more_points() -> None:
 @pytest.mark.parametrize(
     ("column", "text", "said"),
     [
-        ("axis", "161,40", "is no axis"),
+        ("axis", "161,40", "is not an axis"),
         ("axis", "161,40:165,40", "is shorter than 10 pixels"),
         ("axis", "161,40:151,799:0", "has a width that is not positive"),
         ("axis", "161,40:162,41:151,799", "has neighbouring points less than 2 pixels apart"),
-        ("axis", "161,40:162:151,799", "is no axis"),
+        ("axis", "161,40:162:151,799", "is not an axis"),
         ("frames_used", "20:5", "ends before it starts"),
-        ("frames_used", "a:5", "is no range of frames"),
+        ("frames_used", "a:5", "is not a range of frames"),
     ],
 )
 def test_what_cannot_be_read_is_said(column: str, text: str, said: str) -> None:

@@ -53,14 +53,14 @@ def test_a_quantity_in_two_units_keeps_that_of_the_sheet(tmp_path: Path) -> None
     header = REST + "diameter_mm,diameter_in,pressure_kPa,yield_pressure_kPa"
     read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,24,2,28,3"))
     assert read.trials[0].diameter_m == 24 / 1000
-    assert any("diameter_mm stands in the sheet as well" in problem.message for problem in read.problems)
+    assert any("the sheet also has diameter_mm" in problem.message for problem in read.problems)
 
 
 def test_a_unit_of_another_quantity_is_no_column(tmp_path: Path) -> None:
     header = REST + "diameter_mm,pressure_kPa,yield_pressure_kPa,chamber_in"
     read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,24,28,3,4"))
     assert math.isnan(read.trials[0].chamber_m3)
-    assert any(problem.column == "chamber_in" and "no column" in problem.message for problem in read.problems)
+    assert any(problem.column == "chamber_in" and "not a column" in problem.message for problem in read.problems)
 
 
 def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: Path) -> None:
@@ -78,5 +78,5 @@ def test_a_key_in_two_units_is_refused(tmp_path: Path) -> None:
     header = "trial,track,thickness_um,length_mm,diameter_mm,pressure_kPa"
     folder = write(tmp_path / "v", header, "a,a.csv,100,300,24,28")
     (folder / "experiment.yaml").write_text("yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n")
-    with pytest.raises(ExperimentError, match="yield_pressure_psi is no setting"):
+    with pytest.raises(ExperimentError, match="yield_pressure_psi is not a setting"):
         read_experiment(folder)

@@ -180,7 +180,7 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
         ("limits: {pressure_kPa: 7000:9000}", "7000 Pa is 7 kPa"),
         ("limits: {diameter_mm: [0.012]}", "0.012 metres is 12 mm"),
         ("limits: {thickness_um: []}", "name at least one value"),
-        ("limits: {chamber_l: [[1, 2]]}", "numbers alone"),
+        ("limits: {chamber_l: [[1, 2]]}", "numbers only"),
         ("limits: {trials: 0}", "greater than or equal to 1"),
         ("limits: {presure_kPa: 1:2}", "did you mean pressure_kPa?"),
         (

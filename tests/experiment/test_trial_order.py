@@ -64,7 +64,7 @@ def test_check_is_content_with_random_order(tmp_path: Path) -> None:
 def test_check_warns_of_a_specimen_for_each_condition(tmp_path: Path) -> None:
     alone = written(tmp_path / "x", ",specimen", tuple(f",{PRESSURES[i]}" for i in range(10)))
     (warning,) = words(alone, "specimen")
-    assert "another for each condition" in warning
+    assert "differs for every condition" in warning
     mixed = written(tmp_path / "y", ",specimen", tuple(f",{i % 2}" for i in range(10)))
     assert not words(mixed, "specimen")
 

@@ -96,7 +96,7 @@ def test_a_missing_folder_without_a_likeness_names_the_experiments_there_are(tmp
 
 
 def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match=r"dampng is no setting.*damping"):
+    with pytest.raises(ExperimentError, match=r"dampng is not a setting.*damping"):
         make_plan({"experiment": str(experiment(tmp_path / "v")), "dampng": {}}, tmp_path)
 
 

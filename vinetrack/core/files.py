@@ -31,7 +31,10 @@ def missing_file_message(path: Path) -> tuple[str, str]:
     message, remedy
     """
     if path.is_symlink():
-        return "is a link whose end is missing", "connect the disk that it leads to, or copy the file itself there"
+        return (
+            "is a link to something that does not exist",
+            "connect the disk it points to, or copy the file itself there",
+        )
     return "does not exist", "check the path and its upper and lower case"
 
 

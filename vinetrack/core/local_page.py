@@ -72,7 +72,7 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
     for number in tried:
         with contextlib.suppress(OSError):
             return serve(number)
-    raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")
+    raise PageError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
 
 
 @contextlib.contextmanager

@@ -131,11 +131,11 @@ def parse_number(text: str, decimal: str = ".") -> float:
     mark = "," if "," in text else "."
     if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
         joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
-        mended = f"{pointed}0 or {joined}"
-        raise TableError(f"may be thousands or decimals: write {mended}, whichever is meant")
+        corrected = f"{pointed}0 or {joined}"
+        raise TableError(f"may be thousands or decimals: write {corrected}, whichever is meant")
     value = float(text.replace(",", "."))
     if not math.isfinite(value):
-        raise TableError("is too large to be a number here")
+        raise TableError("is too large a number")
     return value
 
 
@@ -327,7 +327,7 @@ def safe_join(folder: Path, relative: str) -> Path:
     text = relative.strip().replace("\\", "/")
     # Control characters, line and paragraph separators; macOS itself puts unusual blanks in the names of recordings.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
-        raise TableError("contains characters that no path should have: type it anew")
+        raise TableError("contains characters that no path should have: type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
         raise TableError("is an absolute path: write it relative to the experiment folder")
     parts: list[str] = []

@@ -137,7 +137,7 @@ def _syntax_problem(error: Exception, file: str) -> Problem:
     """Where and why the text is not YAML, in one sentence."""
     mark = getattr(error, "problem_mark", None)
     reason = getattr(error, "problem", None) or "it cannot be understood"
-    remedy = "use spaces (no tabs) to indent, a blank after each colon, and quotes round text that holds : or #"
+    remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
     line = mark.line + 1 if mark is not None else 0
     return Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)
 
@@ -205,8 +205,10 @@ def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, fi
     except ExperimentError:
         correct = False
     if not correct:
-        remedy = f"set it yourself: {key}: {shown}"
-        raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
+        remedy = f"set it by hand: {key}: {shown}"
+        raise ExperimentError(
+            [Problem(message="cannot be changed without altering other settings", file=file, column=key, remedy=remedy)]
+        )
 
 
 def top_level_value(text: str, key: str) -> Any:

@@ -1,1 +1,1 @@
-"""What a user brings: the trial sheet, the settings, the folder, and where they were read from."""
+"""The user's input: trial sheet, settings, experiment folder, and the provenance record of what was read."""

@@ -1,7 +1,7 @@
-"""Values of the columns of a sheet, read and checked.
+"""Reading and checking of single values of the trial sheet.
 
 A cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay in
-the column's own unit until a trial is made of them.
+the unit of their column until `vinetrack.experiment.sheet.make_trial` converts them to SI.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from vinetrack.experiment.column import Column
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
 SHORTEST_AXIS_PX = 10
-"""Chosen: a shorter axis has no direction to speak of: ends picked by hand, off by half a pixel each, turn this one by
-4 degrees. At half, by 8; at twice, by 2, but growth over 15 px is refused."""
+"""Chosen: the direction of a shorter axis is too uncertain. An error of half a pixel at each end, as of points picked
+by hand, turns an axis of this length by 4 degrees; at half the length by 8, at twice by 2, but growth over 15 px would
+then be refused."""
 SMALLEST_POINT_SPACING_PX = 2
-"""Least distance between neighbouring points of a path that bends. Chosen: a point picked by hand is off by half a
-pixel, so that nearer ones tell no direction. At half, a double click makes a kink; at twice, dense curves of programs
-are refused."""
+"""Smallest distance between neighbouring points of a curved path. Chosen: points picked by hand are off by half a
+pixel, so that closer ones do not define a direction. At half, a double click makes a kink; at twice, densely sampled
+curves from other programs are refused."""
 
 TRUTH_WORDS = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
 
 class CellError(ValueError):
-    """A value that its column does not allow: what is wrong, what is allowed, what to do."""
+    """A value that its column does not allow: what is wrong (`message`), what is allowed, and the remedy."""
 
     def __init__(self, message: str, allowed: str = "", remedy: str = "") -> None:
         super().__init__(message)
@@ -37,17 +38,17 @@ class CellError(ValueError):
 
 
 def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
-    """Value of a cell that is not blank, in the unit of its column.
+    """Return the value of a non-blank cell, in the unit of its column.
 
     Parameters
     ----------
-    column : what the cell is in.
-    text : the cell, without blanks around it.
-    decimal : the decimal mark of the file.
+    column : declaration of the column.
+    text : the cell, stripped.
+    decimal : decimal mark of the file.
 
     Returns
     -------
-    a number, a pair, bends in metres, a truth value or text, by the kind of the column.
+    a number, a pair, bends in metres, a truth value or text, depending on the kind of the column.
 
     Raises
     ------
@@ -83,11 +84,11 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
 
 
 def read_range(column: Column, value: Any) -> tuple[float, float]:
-    """Read lowest and highest from `low:high` or two numbers, judged as cells of the column.
+    """Read the two ends of a range, `low:high` or two numbers, each checked like a cell of the column.
 
     Parameters
     ----------
-    column : whose limit it is.
+    column : declaration of the column that the range limits.
     value : as the settings state it.
 
     Returns
@@ -97,23 +98,23 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     Raises
     ------
     ValueError
-        If it is no range, or the column does not allow it.
+        If it is not a range, or the column does not allow an end of it.
     """
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
         raise ValueError("is not a range: write low:high, such as 7:40")
     low, high = (read_limit(column, part) for part in parts)
     if low > high:
-        raise ValueError("ends below where it begins: write the lower value first")
+        raise ValueError("ends below its start: write the lower value first")
     return low, high
 
 
 def interior_values(low: float, high: float) -> list[float]:
-    """Return three values between two others, in equal ratios where both are positive.
+    """Return three values between two others, in geometric steps where `low` is positive, else in equal steps.
 
     Parameters
     ----------
-    low, high : in one unit.
+    low, high : in the same unit.
 
     Returns
     -------
@@ -124,43 +125,43 @@ def interior_values(low: float, high: float) -> list[float]:
 
 
 def read_limit(column: Column, value: Any) -> float:
-    """Read one value, judged as a cell of the column.
+    """Read one number of `limits`, checked like a cell of the column.
 
     Parameters
     ----------
-    column : whose limit it is.
+    column : declaration of the column that the value limits.
     value : as the settings state it.
 
     Returns
     -------
-    in the unit of the column.
+    the number, in the unit of the column.
 
     Raises
     ------
     ValueError
-        If it is no number, or the column does not allow it.
+        If it is not a number, or the column does not allow it.
     """
     if isinstance(value, bool | list | tuple | dict):
-        raise ValueError("holds something that is not a number: write numbers alone")
+        raise ValueError("holds something that is not a number: write numbers only")
     return float(str(read_value(column, value)))
 
 
 def read_value(column: Column, value: Any) -> Any:
-    """Read a value of the settings as the sheet's cell would be read.
+    """Read a value of the settings like a cell of the sheet's column of the same name.
 
     Parameters
     ----------
-    column : of the same name.
+    column : declaration of the column.
     value : as the settings state it.
 
     Returns
     -------
-    in the unit of the column.
+    the value, in the unit of the column.
 
     Raises
     ------
     ValueError
-        If the column does not allow it, with the remedy behind a colon.
+        If the column does not allow it; the remedy follows a colon.
     """
     try:
         return read_cell(column, str(value).strip())
@@ -170,17 +171,7 @@ def read_value(column: Column, value: Any) -> Any:
 
 
 def _check_number(column: Column, value: float) -> float:
-    """The value itself, if its column allows it; see `read_cell`.
-
-    Parameters
-    ----------
-    column : what the number is in.
-    value : in the unit of the column.
-
-    Returns
-    -------
-    the value, if it is allowed.
-    """
+    """Return the value unchanged if its column allows it; raise a CellError otherwise."""
     if column.kind == "choice":
         if value not in (column.low, column.high):
             raise CellError("is not a travel ratio", "2 for eversion, 1 for a body that moves as a whole")
@@ -193,27 +184,28 @@ def _check_number(column: Column, value: float) -> float:
 
 
 def unusual_value_hint(column: Column, value: float) -> str:
-    """Why a legal value is suspicious, or blank. Zero never is: it is written on purpose.
+    """Return the column's hint if an allowed value lies outside the usual range; zero is deliberate, hence usual.
 
     Parameters
     ----------
-    column : what the number is in.
+    column : declaration of the column.
     value : in the unit of the column.
 
     Returns
     -------
-    the hint of the column, or blank.
+    the hint, or blank.
     """
     return "" if value == 0 or column.usual[0] <= value <= column.usual[1] else column.unusual_hint
 
 
 def _likely_unit(column: Column, value: float) -> str:
-    """The unit that was probably meant, where the value is allowed in it."""
+    """Name the unit in which the value was probably written, if the column would allow it in that unit."""
     unit_of_column = column.unit_key or split_unit(column.name)[1]
     for key in column.slips:
         unit, factor = UNITS[key].text, convert(1.0, key, unit_of_column)
         meant = value * factor
-        # A slip enlarges numbers that are too small and shrinks those that are too large, never the other way round.
+        # The intended unit must bring the value into range: enlarge one that is too small, shrink one that is too
+        # large.
         if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:
             return f"looks like {unit}: {value:g} {unit} is {meant:g} {column.unit}"
     return ""
@@ -228,7 +220,7 @@ def _number(text: str, decimal: str, allowed: str = "") -> float:
 
 
 def _read_window(text: str, decimal: str) -> tuple[float, float]:
-    """`from_s:to_s`, in seconds."""
+    """Read a time window `from_s:to_s`."""
     allowed = "from_s:to_s, such as 0.05:0.20"
     parts = text.split(":")
     if len(parts) != 2:
@@ -240,15 +232,15 @@ def _read_window(text: str, decimal: str) -> tuple[float, float]:
 
 
 def _read_axis(text: str) -> PictureAxis:
-    """`x,y:x,y…[:width_mm]`: points of the picture, two or more, and how wide a strip along them is looked at."""
+    """Read an axis `x,y:x,y…[:width_mm]`: two or more points in the picture, and the width of the strip along them."""
     allowed = (
         "x,y:x,y or x,y:x,y:width_mm, such as 161,40:151,799:20, with more points where the path bends; "
-        "in a sheet with commas between quotes"
+        "in a comma-separated sheet the cell must be in quotes"
     )
     parts, width = text.split(":"), math.nan
     written = parts if "," in parts[-1] else parts[:-1]
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
-        raise CellError("is no axis", allowed)
+        raise CellError("is not an axis", allowed)
     points = [(_number(x, ".", allowed), _number(y, ".", allowed)) for x, y in (point.split(",") for point in written)]
     if sum(math.dist(*pair) for pair in pairwise(points)) < SHORTEST_AXIS_PX:
         raise CellError(f"is shorter than {SHORTEST_AXIS_PX} pixels", allowed, "give two points far apart")
@@ -263,11 +255,11 @@ def _read_axis(text: str) -> PictureAxis:
 
 
 def _read_frames(text: str) -> tuple[int, int]:
-    """`from:to`, whole numbers from 0, both included."""
+    """Read a range of frames `from:to`, counted from 0, both ends included."""
     allowed = "from:to, such as 12:80"
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
-        raise CellError("is no range of frames", allowed)
+        raise CellError("is not a range of frames", allowed)
     first, last = int(parts[0]), int(parts[1])
     if first >= last:
         raise CellError("ends before it starts", allowed)
@@ -275,7 +267,7 @@ def _read_frames(text: str) -> tuple[int, int]:
 
 
 def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
-    """`start_mm:arc_mm:radius_mm;…`, as bends in metres."""
+    """Read bends `start_mm:arc_mm:radius_mm;…`; the result is in metres."""
     allowed = "start_mm:arc_mm:radius_mm, several joined by ;"
     bends = []
     for piece in filter(None, (piece.strip() for piece in text.split(";"))):

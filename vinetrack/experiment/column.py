@@ -1,6 +1,6 @@
-"""A column of the trial sheet: what is declared of it, its unit and bounds, and its numbers in SI.
+"""Declaration of one column of the trial sheet, and conversion of its numbers to and from SI.
 
-Nothing heavy is loaded here: the command line reads it at every start.
+Imports stay light: the command line loads this module at every start.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of the sheet.
+    """A column of the trial sheet.
 
-    `field` is the field of a `Trial` that holds it, in SI where it is a number; `meaning` what it is, `measured` how to
-    come by it, `default` what a blank cell stands for. `low` and `high` bound the value (`low` itself is refused where
-    `above_low`). `slips` are units people write by mistake. A legal value outside `usual` gets a warning. `unit_key` is
-    given where the name does not end in the unit. `shared` columns may stand in `experiment.yaml` for all trials;
-    `limit` says how those that the next experiment may choose stand in its `limits`: as a `range`, or as a `choice`.
+    `field` is the field of `Trial` that holds the value, in SI where it is a number; `meaning` describes it, `measured`
+    says how to measure it, `default` what a blank cell stands for. `low` and `high` bound the value (`above_low`
+    excludes `low` itself). `slips` are units that users write by mistake. An allowed value outside `usual` gets the
+    warning `unusual_hint`. `unit_key` is given where the name does not end in the unit. `shared` columns may be set in
+    `experiment.yaml` for all trials. `limit` is the form in which `limits` of `experiment.yaml` constrains the column
+    in further trials: `range` or `choice`, blank where it cannot.
     """
 
     name: str
@@ -44,24 +45,24 @@ class Column:
 
     @property
     def scale(self) -> Unit | None:
-        """The unit of a number; None for text and for plain numbers."""
+        """The unit; None for text and for numbers without one."""
         return UNITS.get(self.unit_key or split_unit(self.name)[1])
 
     @property
     def unit(self) -> str:
-        """The unit as it is printed; blank where there is none."""
+        """The unit as it is printed; blank if there is none."""
         return self.scale.text if self.scale else ""
 
     @property
     def allowed(self) -> str:
-        """The bounds in words."""
+        """The bounds, in words."""
         unit = f" {self.unit}" if self.unit else ""
         if math.isinf(self.high):
             return ("above " if self.above_low else "at least ") + f"{self.low:g}{unit}"
         return f"{'above ' if self.above_low else ''}{self.low:g} to {self.high:g}{unit}"
 
     def in_words(self, value: float) -> str:
-        """Name a number of this column in a sentence: `a chamber of 3.7 litres`.
+        """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`.
 
         Parameters
         ----------
@@ -76,7 +77,7 @@ class Column:
         return f"{article} {quantity} of {value:.3g} {self.unit}".rstrip()
 
     def to_si(self, value: float) -> float:
-        """Return a number of this column in SI.
+        """Convert a value of this column to SI.
 
         Parameters
         ----------
@@ -89,15 +90,15 @@ class Column:
         return self.scale.to_si(value) if self.scale else value
 
     def of_trial(self, trial: Trial) -> float:
-        """Return the number that a trial has in this column.
+        """Return a trial's value of this column.
 
         Parameters
         ----------
-        trial : of a sheet, in SI.
+        trial : a trial, in SI.
 
         Returns
         -------
-        in the unit of the column; NaN where it has none.
+        the value in the unit of the column; NaN if it has none.
         """
         value = float(getattr(trial, self.field))
         return self.scale.from_si(value) if self.scale else value

@@ -1,7 +1,7 @@
-"""Points of recordings that somebody has looked at: `corrections.csv` beside the sheet.
+"""Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
 
-One line a point: `trial, frame, action, edge_px`. The tracker does what it says and marks the point `corrected`; where
-the tracker itself saw the edge stays in the results.
+One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`; the
+position that it had found itself is kept in the results.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
 
 
 def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
-    """Corrections by trial, and what is wrong with the file.
+    """Read the corrections of an experiment.
 
     Parameters
     ----------
-    folder : of the experiment.
+    folder : experiment folder.
 
     Returns
     -------
-    corrections, problems : both empty where there is no such file.
+    corrections, problems : by name of trial, and what is wrong with the file; both empty if there is no file.
     """
     path = folder / CORRECTIONS_FILE
     if not os.path.lexists(path):
@@ -47,23 +47,23 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     problems: list[Problem] = []
     for i, row in enumerate(table.rows):
         correction = _read_line(table, i, problems)
-        of_trial = by_trial.setdefault(row["trial"], {})
+        by_frame = by_trial.setdefault(row["trial"], {})
         if correction is None:
             continue
-        if correction.frame in of_trial:
+        if correction.frame in by_frame:
             problems.append(_problem(table, i, "frame", "is corrected twice", "keep one of the lines"))
-        of_trial[correction.frame] = correction
+        by_frame[correction.frame] = correction
     return {
-        trial: tuple(of_trial[frame] for frame in sorted(of_trial)) for trial, of_trial in by_trial.items()
+        trial: tuple(by_frame[frame] for frame in sorted(by_frame)) for trial, by_frame in by_trial.items()
     }, problems
 
 
 def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction | None:
-    """One correction; None where the line has a fault, which is noted."""
+    """Read one line; None if it is faulty, in which case the fault is added to `problems`."""
     row = table.rows[index]
     if row["action"] not in CORRECTION_ACTIONS:
         remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
-        problems.append(_problem(table, index, "action", "is no correction", remedy))
+        problems.append(_problem(table, index, "action", "is not an action", remedy))
         return None
     numbers = {}
     for column in ("frame", "edge_px"):
@@ -76,7 +76,7 @@ def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction 
             problems.append(_problem(table, index, column, message, remedy))
             return None
     if numbers["frame"] < 0 or numbers["frame"] != int(numbers["frame"]):
-        problems.append(_problem(table, index, "frame", "is no frame", "frames are counted 0, 1, 2, …"))
+        problems.append(_problem(table, index, "frame", "is not a frame number", "frames are counted 0, 1, 2, …"))
         return None
     return Correction(int(numbers["frame"]), row["action"], numbers.get("edge_px", math.nan))
 
@@ -97,22 +97,24 @@ def _problem(table: Table, index: int, column: str, message: str, remedy: str) -
 def unmatched_corrections(
     corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]
 ) -> list[Problem]:
-    """A warning for every trial that corrections name and that is not in the sheet, or is no recording.
+    """Warn of corrections of a trial that is not in the sheet, or is not a recording.
 
     Parameters
     ----------
-    corrections : by trial.
-    names : of all trials of the sheet.
-    filmed : of those that are recordings.
+    corrections : by name of trial.
+    names : names of all trials of the sheet.
+    filmed : names of the trials that are recordings.
 
     Returns
     -------
     problems : warnings.
     """
-    known, recordings = set(names), set(filmed)
+    in_sheet, recordings = set(names), set(filmed)
     return [
         Problem(
-            message="is no recording, and its corrections are ignored" if trial in known else "is not in the sheet",
+            message="is not a recording; its corrections are ignored"
+            if trial in in_sheet
+            else "is not in the sheet; its corrections are ignored",
             file=CORRECTIONS_FILE,
             column="trial",
             value=trial,
@@ -124,21 +126,21 @@ def unmatched_corrections(
 
 
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
-    """The file that holds these corrections.
+    """Return the content of `corrections.csv` for these corrections.
 
     Parameters
     ----------
-    corrections : by trial.
+    corrections : by name of trial.
 
     Returns
     -------
-    CSV, its header first.
+    CSV text, header first.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CORRECTION_COLUMNS)
     for trial, of_trial in corrections.items():
         for correction in of_trial:
-            place = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
-            writer.writerow([trial, correction.frame, correction.action, place])
+            edge = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
+            writer.writerow([trial, correction.frame, correction.action, edge])
     return out.getvalue()

@@ -1,7 +1,7 @@
-"""An experiment folder read and checked whole: sheet, settings and, on request, every track.
+"""Reading and checking an experiment folder: sheet, settings and, on request, every track.
 
-All problems are collected before anything is raised. A fault of the sheet or the settings stops the experiment; a
-fault confined to one row gives that trial alone `failed`, unless the experiment is `strict`.
+All problems are collected before an error is raised. A fault of the sheet or the settings stops the experiment; a fault
+of a single row makes that trial `failed`, unless the experiment is `strict`.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ __all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "form
 
 SETTINGS = "experiment.yaml"
 EXPECTED_FOLDER = (
-    f"expected a folder with {SHEET} (one row a trial) and, with videos, {SETTINGS}; vinetrack setup FOLDER makes both "
-    "of a folder of recordings"
+    f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
+    "creates both from a folder of recordings"
 )
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What a folder holds.
+    """An experiment: its settings and trials.
 
-    `trials` are those to analyse, in the order of the sheet; `failed` maps the name of every trial with a fault to
-    the reason, `left_out` those that the sheet puts aside (`use: no`) likewise; `names` lists all three in the order
-    of the sheet and `lines` gives their lines in it. `problems` holds everything that was found, warnings too.
-    `angle_blank` names the vines whose direction of growth nobody stated: it counts as straight down. `columns` are
-    those of the sheet: what it lacks stands in the settings.
+    `trials` are the trials to analyse, in the order of the sheet; `failed` maps the name of every faulty trial to the
+    reason, and `left_out` that of every excluded one (`use: no`). `names` lists all three in the order of the sheet,
+    `lines` gives their lines in it. `problems` are all errors and warnings. `angle_blank` names the vines whose growth
+    angle is not stated and is taken as straight down. `columns` are the columns of the sheet; a value of any other
+    column comes from the settings.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Experiment:
 
     @property
     def blank_notes(self) -> list[str]:
-        """What blank cells stand for where that decides physics, in sentences."""
+        """Sentences that state which default blank cells stand for, where it affects the physics."""
         blank = [name for name in self.angle_blank if name not in self.left_out]
         if not blank:
             return []
@@ -84,11 +84,11 @@ class Experiment:
         return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
 
     def trial(self, name: str) -> Trial:
-        """Return the trial of a name.
+        """Return the trial with this name.
 
         Parameters
         ----------
-        name : of a trial among `trials`.
+        name : name of one of `trials`.
 
         Returns
         -------
@@ -97,29 +97,29 @@ class Experiment:
         Raises
         ------
         KeyError
-            If there is none.
+            If there is no such trial.
         """
         return {trial.name: trial for trial in self.trials}[name]
 
 
 def read_experiment(folder: Path | str, strict: bool | None = None) -> Experiment:
-    """Read the sheet and settings of an experiment; see `Experiment`.
+    """Read the sheet and settings of an experiment.
 
-    Tracks are opened only where a pressure must be taken from them, videos never: see `check_experiment`.
+    Tracks are opened only if a pressure must be taken from them, videos never; see `check_experiment`.
 
     Parameters
     ----------
-    folder : the experiment's folder.
-    strict : whether a fault of one row is a fault of the whole; None leaves it to `strict` in the settings.
+    folder : experiment folder.
+    strict : whether a fault of one row stops the experiment; None for `strict` of the settings.
 
     Returns
     -------
-    experiment : trials in SI units, those that failed, and every problem that was found.
+    experiment : trials in SI units, failed trials with reasons, and all problems.
 
     Raises
     ------
     ExperimentError
-        With all problems, if the sheet or the settings cannot be read, or if any row has a fault and it is strict.
+        With all problems, if the sheet or the settings cannot be read, or if `strict` and any row has an error.
 
     Examples
     --------
@@ -137,7 +137,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     for row in rows:
         if row.in_use:
             check_row(row, folder)
-            # Without the shared settings nobody knows what is missing.
+            # A value that the sheet lacks may stand in the settings, so this needs readable settings.
             absent |= find_missing(row, folder, table.columns) if table and settings else set()
     problems += _name_problems(rows)
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
@@ -160,7 +160,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
 
 
 def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Correction, ...]]) -> Experiment:
-    """The experiment with what people have corrected of its recordings."""
+    """Add the manual corrections to the trials that are recordings."""
     trials = tuple(
         replace(trial, corrections=corrections[trial.name]) if trial.video and trial.name in corrections else trial
         for trial in experiment.trials
@@ -171,7 +171,7 @@ def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Co
 def _assemble(
     folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem], columns: Iterable[str]
 ) -> Experiment:
-    """Sort the rows into trials to analyse, failed and left out."""
+    """Sort the rows into trials to analyse, failed trials, and excluded ones."""
     good = [row for row in rows if row.in_use and not row.failed]
     errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
     return Experiment(
@@ -189,7 +189,7 @@ def _assemble(
 
 
 def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings | None:
-    """Settings, or None if they cannot be read; their paths are checked as well."""
+    """Read the settings and check their paths and values; None if they cannot be read."""
     try:
         settings = read_experiment_settings(folder / SETTINGS)
     except ExperimentError as error:
@@ -210,14 +210,14 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
 
 
 def _settings_paths(settings: ExperimentSettings) -> list[tuple[str, str]]:
-    """Every path in the settings, with its key."""
+    """Return the (key, path) pairs of all paths in the settings."""
     image = getattr(settings.calibration, "image", None)
     paths = [("effects", path) for path in settings.effects]
     return [*paths, ("calibration.image", image)] if image is not None else paths
 
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
-    """The sheet as a table, or None; notes columns that are missing or not known."""
+    """Read the sheet as a table and check its columns; None if it cannot be read."""
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED_FOLDER))
@@ -236,7 +236,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
 
 
 def _missing_sheet_remedy(folder: Path) -> str:
-    """What to do where there is no sheet: a name that comes close, or else what was expected."""
+    """Remedy for a missing sheet: rename a file with a similar name, else what a folder should contain."""
     try:
         names = sorted(path.name for path in folder.iterdir())
     except OSError:
@@ -250,17 +250,19 @@ def _missing_sheet_remedy(folder: Path) -> str:
 
 
 def _judge_columns(table: Table) -> list[Problem]:
-    """Problems of the header, and a sheet without rows."""
+    """Return the problems of the header, and report a sheet without rows."""
     problems = unknown_columns(table, SHEET)
     if table.nameless:
-        problems.append(Problem(message="has a column without a name, ignored", file=SHEET, severity="warning"))
+        problems.append(
+            Problem(message="has a column without a name, which is ignored", file=SHEET, severity="warning")
+        )
     if "trial" not in table.columns:
         problems.append(_absent_column("trial"))
     if not {"video", "track"} & set(table.columns):
         message = "has neither a column video nor a column track"
         problems.append(Problem(message=message, file=SHEET, remedy="add the one that applies"))
     if not table.rows:
-        problems.append(Problem(message="has no rows", file=SHEET, remedy="write one row a trial below the header"))
+        problems.append(Problem(message="has no rows", file=SHEET, remedy="write one row per trial below the header"))
     return problems
 
 
@@ -270,7 +272,7 @@ def _absent_column(name: str) -> Problem:
 
 
 def _name_problems(rows: list[Row]) -> list[Problem]:
-    """Names used twice (errors) and names that differ in case alone, which some file systems take for one."""
+    """Report repeated names (errors) and names that differ only in case (warnings)."""
     problems, seen = [], dict[str, Row]()
     for row in rows:
         first = seen.setdefault(row.name.lower(), row)
@@ -279,15 +281,17 @@ def _name_problems(rows: list[Row]) -> list[Problem]:
         place: dict[str, Any] = {"file": SHEET, "trial": row.name, "column": "trial", "value": row.name}
         if first.name == row.name:
             message = f"is also the name of line {first.line}"
-            problems.append(Problem(message=message, line=row.line, remedy="name every trial once", **place))
+            problems.append(
+                Problem(message=message, line=row.line, remedy="give every trial a name of its own", **place)
+            )
         else:
-            message = f"differs from {first.name!r} of line {first.line} in case alone: some computers mix them up"
+            message = f"differs from {first.name!r} on line {first.line} in case only, which some file systems ignore"
             problems.append(Problem(message=message, line=row.line, severity="warning", **place))
     return problems
 
 
 def _take_pressure_from_recording(row: Row, folder: Path) -> None:
-    """Fill a blank pressure with the first value of the trace, to three digits: the nominal pressure of the trial."""
+    """Set a blank pressure to the first value of the measured trace, to three digits, as the nominal pressure."""
     if "pressure_kPa" in row.values or row.travel_ratio == 1:
         return
     column = "pressure_trace" if "pressure_trace" in row.values else "track"
@@ -304,14 +308,14 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
         return
     nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
     if nominal_kPa < 0:
-        remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, which is none"
+        remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, below zero"
         row.add("is blank", "pressure_kPa", value="", remedy=remedy)
         return
     row.values["pressure_kPa"] = nominal_kPa
 
 
 def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
-    """The same warning about the same value in many rows is said once."""
+    """Merge repetitions of a warning about the same value in several rows."""
     merged: dict[object, list[Problem]] = {}
     for problem in problems:
         key = (problem.column, problem.value, problem.message) if problem.severity == "warning" else id(problem)
@@ -328,18 +332,17 @@ OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
 
 def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = None) -> list[Problem]:
-    """Every problem of an experiment that can be found in seconds: sheet, settings, tracks, and that videos exist.
-
-    `open_videos` may look into the recordings that are there, and the calibration; see `vinetrack.video.survey`.
+    """Find all problems of sheet, settings and tracks, and missing videos; this takes seconds.
 
     Parameters
     ----------
-    folder : the experiment's folder.
-    open_videos : looks into the recordings and the calibration; None leaves them closed.
+    folder : experiment folder.
+    open_videos : called with the experiment and its existing recordings, returns the problems of recordings and
+        calibration (see `vinetrack.video.survey`); None leaves recordings unopened.
 
     Returns
     -------
-    problems : of the sheet first, in the order of its rows.
+    problems : those of the sheet first, in the order of its rows.
     """
     try:
         experiment = read_experiment(folder, strict=False)
@@ -351,21 +354,21 @@ def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = No
             message, remedy = missing_file_message(safe_join(experiment.folder, relative))
             problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
     problems += order_problems(experiment.trials, SHEET)
-    of_trials: list[Problem] = []
-    there: list[Trial] = []
-    used = {trial.video for trial in experiment.trials if trial.video}
+    trial_problems: list[Problem] = []
+    readable: list[Trial] = []
+    named_videos = {trial.video for trial in experiment.trials if trial.video}
     for trial in experiment.trials:
-        of_trial = _check_track(trial) if trial.track else _check_video(trial, used)
-        of_trials += [replace(problem, trial=trial.name) for problem in of_trial]
+        of_trial = _check_track(trial) if trial.track else _check_video(trial, named_videos)
+        trial_problems += [replace(problem, trial=trial.name) for problem in of_trial]
         if trial.video and not of_trial:
-            there.append(trial)
-    if there and open_videos is not None:
-        of_trials += open_videos(experiment, there)
-    return problems + [_with_location(problem, experiment) for problem in of_trials]
+            readable.append(trial)
+    if readable and open_videos is not None:
+        trial_problems += open_videos(experiment, readable)
+    return problems + [_with_location(problem, experiment) for problem in trial_problems]
 
 
 def _with_location(problem: Problem, experiment: Experiment) -> Problem:
-    """A problem of a trial with its place: the line of the sheet, or the settings where those alone state the value."""
+    """Add the location to a trial's problem: its line in the sheet, or the settings if only they state the value."""
     if not problem.trial:
         return problem
     if problem.column in SHARED and problem.column not in experiment.columns:
@@ -374,7 +377,7 @@ def _with_location(problem: Problem, experiment: Experiment) -> Problem:
 
 
 def _check_track(trial: Trial) -> list[Problem]:
-    """Read the track and its pressure, and hold both against what the sheet says of the trial."""
+    """Read a track with its pressure, and warn where it contradicts the sheet."""
     place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
     try:
         track = load_track(trial)
@@ -383,24 +386,26 @@ def _check_track(trial: Trial) -> list[Problem]:
     remarks = []
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
     if abs(frames - 1) > 0.02:
-        remarks.append(f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?")
+        remarks.append(f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?")
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
-    # Twice the length leaves room for an axis in the wrong unit of angle or a poor scale, not for mm taken as m.
+    # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
     if travel_m > 2 * trial.length_m:
-        remarks.append(f"travels {travel_m:.4g} m, the vine is {trial.length_m:g} m long: are its positions in metres?")
+        remarks.append(
+            f"travels {travel_m:.4g} m, but the vine is {trial.length_m:g} m long: are its positions in metres?"
+        )
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
         remarks.append("runs backwards: position should grow as the vine does")
     if track.pressure_Pa is not None and trial.pressure_Pa > 0:
         highest_kPa = float(np.max(track.pressure_Pa)) / 1000
         if not 0.5 < highest_kPa / (trial.pressure_Pa / 1000) < 2:
             remarks.append(
-                f"has pressures up to {highest_kPa:.4g} kPa, the sheet says {trial.pressure_Pa / 1000:g} kPa"
+                f"has pressures up to {highest_kPa:.4g} kPa, but the sheet says {trial.pressure_Pa / 1000:g} kPa"
             )
     return [Problem(message=message, severity="warning", **place) for message in remarks]
 
 
-def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
-    """Whether there is something to decode at all; `used` are the files that any trial names."""
+def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
+    """Check that a recording exists and is not empty; `named_videos` are the recordings named by any trial."""
     path = trial.video
     if path is None:
         return []
@@ -408,22 +413,22 @@ def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
     try:
         if path.is_dir():
             empty = not any(path.iterdir())
-            return [Problem(message="is an empty folder", remedy="put frames in it", **place)] if empty else []
+            return [Problem(message="is an empty folder", remedy="put the frames in it", **place)] if empty else []
         if file_size(path) == 0:
-            return [Problem(message="is an empty file", remedy="copy it anew", **place)]
+            return [Problem(message="is an empty file", remedy="copy it again", **place)]
     except (FileNotFoundError, ValueError):
         message, remedy = missing_file_message(path)
-        remedy = remedy if path.is_symlink() else _nearest_file(path, used)
+        remedy = remedy if path.is_symlink() else _missing_video_remedy(path, named_videos)
         return [Problem(message=message, remedy=remedy, **place)]
     except OSError as error:
         return [Problem(message=f"cannot be read: {error.strerror}", **place)]
     return []
 
 
-def _nearest_file(path: Path, used: Set[Path]) -> str:
-    """What to do where a file is not there: an unused name in its folder that comes close, or where to look."""
+def _missing_video_remedy(path: Path, named_videos: Set[Path]) -> str:
+    """Remedy for a missing recording: a similar name in its folder that no other trial uses, if there is one."""
     try:
-        names = sorted(entry.name for entry in path.parent.iterdir() if entry not in used)
+        names = sorted(entry.name for entry in path.parent.iterdir() if entry not in named_videos)
     except (OSError, ValueError):
         names = []
     close = difflib.get_close_matches(path.name.lower(), [name.lower() for name in names], 1, CLOSE_NAME_RATIO)

@@ -1,7 +1,7 @@
-"""Names of vines and conditions: the same for the same nominal settings, different for different ones.
+"""Names of vines and conditions, unique for each set of nominal settings.
 
-A name says what it stands for and is fit to name a file: `24mm-200um-280mm` is a vine, `24mm-200um-280mm_28kPa_35.6g`
-a condition.
+Names list the settings and are valid file names: `24mm-200um-280mm` is a vine, `24mm-200um-280mm_28kPa_35.6g` a
+condition.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from vinetrack.core.records import Trial
 
 
 def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """The same trials with `vine` and `condition` filled in.
+    """Return the trials with `vine` and `condition` filled in.
 
-    Pressure and payload are always part of a condition's name; other physical settings only where they differ within
-    the experiment (the yield pressure, which belongs to a vine, where it differs within one vine). Settings that agree
-    to six digits count as the same.
+    The name of a condition always contains pressure and payload, and other physical settings only if they differ within
+    the experiment (the yield pressure only if it differs within one vine). Settings that agree to six digits count as
+    equal.
 
     Parameters
     ----------
-    trials : all of an experiment.
+    trials : all trials of an experiment.
 
     Returns
     -------
@@ -44,7 +44,7 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _digits(value: float) -> str:
-    """Six digits, without exponent or trailing zeros.
+    """Return a value to six digits, without exponent or trailing zeros.
 
     >>> _digits(28.000000004), _digits(0.5), _digits(100000.0)
     ('28', '0.5', '100000')
@@ -54,7 +54,7 @@ def _digits(value: float) -> str:
 
 
 def _vine(trial: Trial) -> str:
-    """Diameter, thickness and length, those that are known."""
+    """Name of a trial's vine: diameter, thickness and length, unknown ones left out."""
     sizes = ((trial.diameter_m * 1e3, "mm"), (trial.thickness_m * 1e6, "um"), (trial.length_m * 1e3, "mm"))
     return "-".join(f"{_digits(size)}{unit}" for size, unit in sizes if math.isfinite(size))
 
@@ -76,4 +76,4 @@ _OPTIONAL_PARTS: tuple[Callable[[Trial], str], ...] = (
     lambda trial: f"ratio{_digits(trial.travel_ratio)}",
     _bends,
 )
-"""Parts of a condition's name that are shown where they differ within the experiment."""
+"""Parts of a condition's name that appear only if they differ within the experiment."""

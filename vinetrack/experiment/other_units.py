@@ -1,4 +1,4 @@
-"""Columns and keys in other units, such as `pressure_psi` or `diameter_in`: converted, and said so."""
+"""Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from vinetrack.experiment.schema import COLUMNS, column_in_other_unit
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Columns in other units, such as `pressure_psi` or `diameter_in`, as the columns that they stand for.
+    """Convert columns in other units to the columns of the sheet.
 
     Parameters
     ----------
-    table : the sheet as it is written.
+    table : the sheet as written.
     file : its name, for messages.
 
     Returns
     -------
     table, problems
-        The table with those columns renamed and their numbers converted, and a warning for each that says so. Cells
-        that are no numbers stay as they are: they are refused where cells are read. A column whose quantity stands in
-        the sheet in two units is left alone, and so ignored.
+        The table with those columns renamed and their numbers converted, and a warning for each. Cells that are not
+        numbers are left unchanged and refused when cells are read. If the sheet states a quantity in two units, the
+        column in the other unit is left unchanged and thereby ignored.
     """
     problems: list[Problem] = []
     renamed: dict[str, tuple[Column, str]] = {}
@@ -37,7 +37,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
         column, unit = other
         place: dict[str, Any] = {"file": file, "line": 1, "column": name, "severity": "warning"}
         if column.name in table.columns or column.name in [target.name for target, _ in renamed.values()]:
-            problems.append(Problem(message=f"is ignored: {column.name} stands in the sheet as well", **place))
+            problems.append(Problem(message=f"is ignored, because the sheet also has {column.name}", **place))
             continue
         renamed[name] = other
         problems.append(Problem(message=_conversion(column, unit), **place))
@@ -57,7 +57,7 @@ def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
 
 
 def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
-    """A cell in the unit of its column, to 15 digits, as the sheet writes numbers."""
+    """Return a cell converted to the unit of its column, to 15 digits, with the decimal mark of the sheet."""
     try:
         value = convert(parse_number(cell, decimal), unit, split_unit(column.name)[1])
     except TableError:
@@ -66,18 +66,18 @@ def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
 
 
 def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[Problem]]:
-    """Keys in other units, such as `pressure_psi`, as the columns that they stand for.
+    """Convert keys in other units, such as `pressure_psi`, to the keys of the settings.
 
     Parameters
     ----------
-    document : `experiment.yaml` as it is written.
+    document : `experiment.yaml` as written.
     file : its name, for messages.
 
     Returns
     -------
     document, problems
-        With those keys renamed and their numbers converted, and a warning for each that says so. A value that is no
-        number, and a quantity that stands there in two units, stay as they are and are refused where keys are read.
+        The document with those keys renamed and their numbers converted, and a warning for each. A value that is not a
+        number, and a quantity stated in two units, are left unchanged and refused when the settings are validated.
     """
     problems: list[Problem] = []
     if not isinstance(document.content, dict):
@@ -100,15 +100,15 @@ def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[
 
 
 def keys_in_other_units(path: Path) -> list[Problem]:
-    """A warning for every key of `experiment.yaml` that is a column in another unit; see `in_key_units`.
+    """Return the warnings of `in_key_units` for a settings file.
 
     Parameters
     ----------
-    path : of the settings; they can be read.
+    path : `experiment.yaml`, which must be readable.
 
     Returns
     -------
-    warnings; none where there is no such file.
+    warnings; none if there is no such file.
     """
     return in_key_units(read_yaml(path), path.name)[1] if path.exists() else []
 

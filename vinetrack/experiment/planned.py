@@ -1,6 +1,6 @@
-"""Trials that nobody has filmed yet: given one by one, or as the rows of a sheet without recordings.
+"""Planned trials: one given by command-line options, or the rows of a sheet, with or without recordings.
 
-Both are judged cell by cell as a trial sheet is, so that kPa typed as Pa gets the same sentence everywhere.
+Both pass the checks of a trial sheet, so that a wrong unit gets the same message everywhere.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from vinetrack.experiment.sheet import (
 )
 
 REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
-"""What must be known of a vine before anything can be said of it; its yield pressure can be guessed."""
+"""Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior."""
 
 _RECORDING_COLUMNS = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
-"""Columns about recordings, which a trial that is only planned may lack or have."""
+"""Columns about recordings: optional for a planned trial, and ignored."""
 
 Relocate = Callable[[Problem], Problem]
 
 
 @dataclass(frozen=True)
 class PlannedTrials:
-    """Trials that are planned, one a condition, with the settings they share; `problems` are warnings."""
+    """Planned trials, one per condition or one per row, with the settings they share; `problems` are warnings."""
 
     trials: tuple[Trial, ...]
     settings: ExperimentSettings
@@ -52,24 +52,24 @@ def planned_trial(
     settings: ExperimentSettings | None = None,
     needed: Sequence[str] = REQUIRED_FOR_PREDICTION,
 ) -> PlannedTrials:
-    """A trial from texts by name of column, as they come from the command line.
+    """Read a trial from texts by name of column, as given on the command line.
 
-    A yield pressure that is not given is NaN. What is wrong is said of the option.
+    A yield pressure that is not given is NaN. Messages name the command-line option.
 
     Parameters
     ----------
     values : texts by column, in the unit of the column.
-    settings : what the trial shares with others; None for the defaults.
-    needed : columns without which nothing can be predicted.
+    settings : shared settings; None for the defaults.
+    needed : required columns.
 
     Returns
     -------
-    planned : the one trial, and warnings.
+    planned : the trial, and warnings.
 
     Raises
     ------
     ExperimentError
-        With everything that is missing or not allowed.
+        With every value that is missing or not allowed.
 
     Examples
     --------
@@ -88,23 +88,23 @@ def planned_trial(
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
-    """The conditions of an experiment folder, or of a sheet by itself, whether filmed or not.
+    """Read the conditions of an experiment folder or of a single sheet, filmed or not.
 
-    Rows of the same nominal settings are one condition, named after the first; rows with `use: no` are passed over.
+    Rows with the same nominal settings form one condition, represented by the first; rows with `use: no` are skipped.
 
     Parameters
     ----------
-    path : an experiment's folder, or a sheet.
-    every_row : whether replicates are kept, a trial for each row.
+    path : an experiment folder, or a sheet.
+    every_row : keep replicates: one trial per row.
 
     Returns
     -------
-    planned : a trial for each condition, or for each row, and warnings.
+    planned : one trial per condition, or per row, and warnings.
 
     Raises
     ------
     ExperimentError
-        With everything that is wrong.
+        With every problem of the sheet.
     """
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
@@ -127,12 +127,12 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
 
 
 def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
-    """Warnings about columns that no sheet has.
+    """Return warnings about unknown columns.
 
     Raises
     ------
     ExperimentError
-        If what must be known of every vine is nowhere: said once, not of every row.
+        If neither sheet nor settings have a required column: reported once, not for every row.
     """
     unknown = unknown_columns(table, file)
     absent = [
@@ -167,14 +167,18 @@ def _planned_trials(
     *,
     every_row: bool = False,
 ) -> PlannedTrials:
-    """Read, judge and name the rows; refuse them all if one has a fault."""
+    """Read, check and name the rows; raise an ExperimentError if any has an error."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     for row in rows:
         _check_row(row, needed)
     of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDING_COLUMNS)
     problems = [*header, *of_rows]
     if any(problem.severity == "error" for problem in problems) or not rows:
-        nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
+        nothing = (
+            []
+            if rows
+            else [shown(Problem(message="has no trial in use", remedy="remove `use: no` from at least one row"))]
+        )
         raise ExperimentError([*problems, *nothing])
     trials = with_names([_trial(row, settings) for row in rows])
     kept = tuple(trials) if every_row else _one_a_condition(trials)
@@ -189,15 +193,19 @@ def _check_row(row: Row, needed: Sequence[str]) -> None:
                 "is missing" if row.line == 0 else "is blank", name, allowed=COLUMNS[name].allowed, remedy="give it"
             )
     if row.travel_ratio != 2:
-        row.add("is that of a body that moves as a whole", "travel_ratio", remedy="only everting vines are predicted")
+        row.add(
+            "is that of a body that moves as a whole",
+            "travel_ratio",
+            remedy="predictions are for everting vines (travel_ratio 2)",
+        )
     check_wall(row)
     check_pressures(row)
 
 
 def _trial(row: Row, settings: ExperimentSettings) -> Trial:
-    """The trial of a row, without its recording; NaN where the yield pressure is not given."""
-    kept = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
-    trial = make_trial(replace(row, values=kept), Path(), settings)
+    """Return the trial of a row, without its recording; a yield pressure that is not given is NaN."""
+    values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
+    trial = make_trial(replace(row, values=values), Path(), settings)
     fps = row.values.get("capture_fps", math.nan)
     trial = replace(trial, capture_fps=float(fps))
     if "yield_pressure_kPa" not in row.values:
@@ -213,7 +221,7 @@ def _one_a_condition(trials: Iterable[Trial]) -> tuple[Trial, ...]:
 
 
 def _without_repeats(problems: Iterable[Problem]) -> list[Problem]:
-    """The same warning about the same value in many rows is said once."""
+    """Drop repetitions of a warning about the same value in several rows."""
     first: dict[object, Problem] = {}
     for problem in problems:
         first.setdefault((problem.column, problem.value, problem.message), problem)

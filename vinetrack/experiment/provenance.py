@@ -1,4 +1,4 @@
-"""What a result was made with: version, libraries, settings, and the hashes of everything read."""
+"""Provenance of a result: versions of program and libraries, settings, and the hashes of all input files."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def describe_run(
     Parameters
     ----------
     experiment : the experiment's folder.
-    inputs : every file that was read; those in the folder are listed relative to it.
-    settings : those of the run.
+    inputs : every file that was read; files in the folder are listed by their relative path.
+    settings : settings of the run.
     model : names of the effects in use.
 
     Returns
@@ -56,7 +56,7 @@ def describe_run(
 
 
 def _hash_file(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of a folder of frames; "missing" or "unreadable" else."""
+    """SHA-256 of a file, or of the names and contents of a folder of frames; else "missing" or "unreadable"."""
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())
         lines = [f"{file.relative_to(path).as_posix()} {_hash_file(file)}\n" for file in files]

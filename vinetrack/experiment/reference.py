@@ -1,6 +1,6 @@
-"""Every column of `trials.csv` and every key of `experiment.yaml` and `config/config.yaml`, as tables for reading.
+"""Reference of all columns of `trials.csv` and all keys of `experiment.yaml` and `config/config.yaml`.
 
-Made from the declarations that also read them, so that it cannot differ from what is allowed.
+Generated from the declarations that validate them, so that reference and validation agree.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _KIND_ALLOWED = {
     "yes_no": "yes, no",
     "choice": "1, 2",
 }
-"""What a column may hold that is no number within bounds."""
+"""Allowed values of columns that are not bounded numbers, by kind."""
 
 
 _PICTURE_MODELS = (
@@ -48,45 +48,43 @@ _PICTURE_MODELS = (
     ("calibration", "mm_per_px", MmPerPx),
     ("axis", "", AxisSettings),
 )
-"""Groups of keys about the picture: the key of the group, its kind, and what reads it."""
+"""Groups of keys about the picture: key of the group, its kind, and the model that validates it."""
 
 _PICTURE_MEANINGS = {
     "image": ("Picture or clip of the target, in the plane of growth.", "Film it with the settings of the trials."),
     "squares": ("Squares across and down.", "Count them."),
     "square_mm": ("Side of a square.", "Calliper over ten printed squares, divided by ten: printers scale."),
     "marker_mm": ("Side of a marker inside its square.", "Calliper."),
-    "dictionary": ("Markers of the board, as OpenCV names them.", "The program that printed the board says it."),
+    "dictionary": ("Marker dictionary of the board, by its OpenCV name.", "Stated by the program that printed it."),
     "from_px": ("First point, x to the right and y down from the upper left corner.", "Any picture viewer shows it."),
     "to_px": ("Second point.", "Any picture viewer shows it."),
     "via_px": (
-        "Points between, in order, of a path that bends; a smooth curve goes through all.",
-        "As the ends.",
+        "Intermediate points of a curved path, in order; a smooth curve passes through all.",
+        "Like the ends.",
     ),
     "length_mm": ("Distance between the two points.", "Two marks of a ruler in the plane of growth."),
     "mm_per_px": ("Scale of the picture.", "Length of a ruler in the plane of growth over its pixels."),
-    "width_mm": ("How wide a strip along the axis is looked at.", "About the diameter of the vine."),
+    "width_mm": ("Width of the strip along the axis that is tracked.", "About the diameter of the vine."),
 }
-"""Meaning of each of those keys, and how one comes by it."""
+"""Meaning of each of those keys, and how to measure it."""
 
 _PICTURE_DEFAULTS = {"via_px": "none: a straight line"}
-"""Defaults of those that do not come from the motion."""
+"""Defaults of optional keys; the others are found from the motion."""
 
 _PAGE_HEAD = """# Every column and key
 
-Made from the declarations that read them: `vinetrack settings` prints the same, `vinetrack settings --json -` for a
-program, and `vinetrack settings --page docs/settings.md` makes this page. A column may be in another unit by its name
-(`pressure_psi`, `diameter_in`, …), and so may a key of `experiment.yaml`: it is converted, and `check` says so. A
-blank cell stands for the default; a blank `growth_angle_deg` means straight down.
+Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack settings --json -`
+prints it for a program, and `vinetrack settings --page docs/settings.md` writes this page. A column, or a key of
+`experiment.yaml`, may state another unit in its name (`pressure_psi`, `diameter_in`, …): it is converted, and
+`vinetrack check` reports the conversion. A blank cell means the default; a blank `growth_angle_deg` means straight
+down.
 """
-"""Beginning of the page."""
+"""Introduction of the page."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A column or key: its unit, default and what is allowed, blank where there is none, and what it means.
-
-    `measured` is how one comes by it.
-    """
+    """Reference entry of a column or key; fields that do not apply are blank. `measured` says how to measure it."""
 
     name: str
     unit: str
@@ -97,7 +95,7 @@ class Entry:
 
 
 def column_entries() -> list[Entry]:
-    """Every column of a trial sheet, in the order of the documentation."""
+    """Entries of all columns of the trial sheet, in the order of their declaration."""
     return [
         Entry(
             name=column.name,
@@ -112,16 +110,16 @@ def column_entries() -> list[Entry]:
 
 
 def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]:
-    """Every key of a settings model that is no column of the sheet; those of a group as `group.key`.
+    """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`.
 
     Parameters
     ----------
     model : a settings model of `vinetrack.experiment.settings`.
-    prefix : of the keys of a group, such as "limits.".
+    prefix : prefix of the keys of a group, such as "limits.".
 
     Yields
     ------
-    an entry a key.
+    one entry per key.
     """
     columns = SHARED if model is ExperimentSettings else ()
     for name, field in model.model_fields.items():
@@ -147,7 +145,7 @@ def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]
 
 
 def picture_entries() -> list[Entry]:
-    """Keys of `calibration`, by its kind, and of `axis`."""
+    """Entries of the keys of `calibration`, by its kind, and of `axis`."""
     entries = []
     for prefix, kind, model in _PICTURE_MODELS:
         for name, field in model.model_fields.items():
@@ -156,16 +154,16 @@ def picture_entries() -> list[Entry]:
                 ends = {"_per_px": "mm/px", "_mm": "mm", "_px": "px"}
                 unit = next((text for end, text in ends.items() if name.endswith(end)), "")
                 of_kind = f" (kind: {kind})" if kind else ""
-                default = "required" if field.is_required() else _PICTURE_DEFAULTS.get(name, "by the motion")
+                default = "required" if field.is_required() else _PICTURE_DEFAULTS.get(name, "from the motion")
                 entries.append(Entry(f"{prefix}.{name}{of_kind}", unit, default, _allowed(field), *meaning))
     return entries
 
 
 def _groups() -> tuple[tuple[str, list[Entry]], ...]:
     """Title and entries of each part of the reference."""
-    one_each = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
+    not_shared = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
     return (
-        (f"Columns of trials.csv; all but {one_each} may stand in experiment.yaml for all", column_entries()),
+        (f"Columns of trials.csv; all but {not_shared} may be set in experiment.yaml for all trials", column_entries()),
         ("Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
         ("Keys of calibration and axis in experiment.yaml", picture_entries()),
         ("Keys of config/config.yaml, also --config key=value of snakemake", list(setting_entries(RunSettings))),
@@ -173,13 +171,13 @@ def _groups() -> tuple[tuple[str, list[Entry]], ...]:
 
 
 def reference_page() -> str:
-    """The reference as the page `docs/settings.md`."""
+    """Return the reference as the page `docs/settings.md`."""
     parts = [_PAGE_HEAD]
     for title, entries in _groups():
         heading, _, shared = title.partition("; ")
         parts += [f"## {heading}", ""]
         parts += [f"{shared[0].upper()}{shared[1:]}.", ""] if shared else []
-        parts += ["| name | unit | default | allowed | meaning | how one measures it |", "|---|---|---|---|---|---|"]
+        parts += ["| name | unit | default | allowed | meaning | how to measure it |", "|---|---|---|---|---|---|"]
         for e in entries:
             cells = (f"`{e.name}`", e.unit, e.default, e.allowed, e.meaning, e.measured)
             parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
@@ -188,7 +186,7 @@ def reference_page() -> str:
 
 
 def reference_lines() -> list[str]:
-    """Columns and keys, a line each, aligned; for the terminal."""
+    """Return the reference as aligned lines for the terminal, one per column or key."""
     head = ("name", "unit", "default", "allowed", "meaning")
     lines: list[str] = []
     for title, entries in _groups():
@@ -196,7 +194,7 @@ def reference_lines() -> list[str]:
         lines += ["", title, *table(rows, head, indent="  ", align="<<<<<")]
     lines += [
         "",
-        "A column may be in another unit by its name (pressure_psi, pressure_bar, diameter_in, …): it is converted.",
+        "A column may state another unit in its name (pressure_psi, pressure_bar, diameter_in, …): it is converted.",
     ]
     return lines[1:]
 
@@ -211,7 +209,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """Choices or bounds of a key, from its annotation."""
+    """Choices or bounds of a key, read from its annotation."""
     choices = [str(choice) for part in _parts(field.annotation) for choice in _literals(part)]
     if choices:
         return ", ".join(dict.fromkeys(choices))
@@ -220,7 +218,7 @@ def _allowed(field: FieldInfo) -> str:
 
 
 def _rules(field: FieldInfo) -> list[Any]:
-    """Bounds of a key, those of an annotated part of a union too."""
+    """Constraints of a key, including those of annotated parts of a union."""
     rules = list(field.metadata)
     for part in _parts(field.annotation):
         for rule in getattr(part, "__metadata__", ()):
@@ -238,7 +236,7 @@ def _literals(annotation: Any) -> tuple[Any, ...]:
 
 
 def reference_content() -> dict[str, list[dict[str, str]]]:
-    """Columns and keys for a program: `columns`, `experiment` and `run`, each a list of entries."""
+    """Return the reference for a program: lists of entries under `columns`, `experiment`, `picture` and `run`."""
     groups = {
         "columns": column_entries(),
         "experiment": list(setting_entries(ExperimentSettings)),

@@ -1,10 +1,11 @@
-"""Every column of a trial sheet, declared once: its name, unit, bounds, meaning, and what it becomes in a trial.
+"""Declarations of all columns of the trial sheet: name, unit, bounds, meaning, and field of `Trial`.
 
-From these declarations derive the reading of `trials.csv` (`vinetrack.experiment.sheet`), the settings of the same
-name in `experiment.yaml` and its `limits` (`settings`), the options of `vinetrack predict` and `design`
-(`vinetrack.cli.design_options`), what an effect may need (`vinetrack.dynamics.trial_inputs`), and `vinetrack settings`.
+These declarations define the reading of `trials.csv` (`vinetrack.experiment.sheet`), the settings of the same name in
+`experiment.yaml` and its `limits` (`settings`), the options of `vinetrack predict` and `design`
+(`vinetrack.cli.design_options`), the inputs that an effect may require (`vinetrack.dynamics.trial_inputs`), and the
+output of `vinetrack settings`. `vinetrack.experiment.cells` reads values.
 
-Nothing heavy is loaded here: the command line reads it at every start. `vinetrack.experiment.cells` reads values.
+Imports stay light: the command line loads this module at every start.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ COLUMNS: dict[str, Column] = {
             field="track",
             kind="path",
             shared=False,
-            meaning="Positions measured already: a CSV with time_s, position_m, or a file of Physics Tracker.",
+            meaning="Positions measured elsewhere: a CSV with time_s, position_m, or a file of Physics Tracker.",
         ),
         Column(
             name="pressure_trace",
@@ -55,18 +56,18 @@ COLUMNS: dict[str, Column] = {
             above_low=True,
             high=1e7,
             usual=(60, math.inf),
-            unusual_hint="write the rate of capture, not that of playback",
-            meaning="Frames a second at capture; never the rate at which the file plays.",
-            measured="The camera's setting; the file's own rate is that of playback.",
+            unusual_hint="write the capture rate, not the playback rate",
+            meaning="Capture rate, frames per second; never the rate at which the file plays.",
+            measured="The camera's setting; the rate stored in the file is that of playback.",
             default="required with a video that does not state it (DNG, cine, mraw do)",
         ),
         Column(
             name="capture_fps_is_playback",
             field="capture_fps_is_playback",
             kind="yes_no",
-            meaning="yes: the film plays as fast as it was captured, and capture_fps may be its rate of playback.",
+            meaning="yes: the film plays as fast as it was captured, so that capture_fps may equal its playback rate.",
             measured="yes for an ordinary film of a phone, no for a high-speed camera.",
-            default="no: a capture_fps that is the rate of playback is refused",
+            default="no: a capture_fps equal to the playback rate is refused",
         ),
         Column(
             name="exposure_us",
@@ -139,7 +140,7 @@ COLUMNS: dict[str, Column] = {
             high=1000,
             slips=("Pa", "mbar"),
             meaning="Scatter of the gauge pressure from trial to trial.",
-            measured="Standard deviation of the gauge over repeated fillings.",
+            measured="Standard deviation of the gauge reading over repeated fillings.",
             default="1 % of the pressure",
         ),
         Column(
@@ -148,8 +149,8 @@ COLUMNS: dict[str, Column] = {
             low=0,
             high=1000,
             slips=("Pa", "mbar"),
-            meaning="Yield pressure: the least gauge pressure at which the vine grows.",
-            measured="Raise the pressure slowly from zero until the tip starts to move; the mean gauge of five starts.",
+            meaning="Yield pressure: the lowest gauge pressure at which the vine grows.",
+            measured="Raise the pressure slowly from zero until the tip starts to move; mean reading of five starts.",
             default="required",
         ),
         Column(
@@ -159,7 +160,7 @@ COLUMNS: dict[str, Column] = {
             high=1000,
             slips=("Pa", "mbar"),
             meaning="Standard error of the yield pressure.",
-            measured="Standard deviation over those starts, over the root of their number.",
+            measured="Standard deviation over those starts, divided by the square root of their number.",
             default="0.2 kPa",
         ),
         Column(
@@ -242,7 +243,7 @@ COLUMNS: dict[str, Column] = {
             field="compare_sizes",
             kind="yes_no",
             meaning="no: width and growth of the tube in the picture are not compared with diameter_mm and length_mm.",
-            measured="no where only part of the tube's width can be seen.",
+            measured="no if only part of the tube's width is visible.",
             default="yes",
         ),
         Column(
@@ -272,7 +273,7 @@ COLUMNS: dict[str, Column] = {
             name="specimen",
             field="specimen",
             kind="text",
-            meaning="Which tube of that vine it was.",
+            meaning="Which physical tube of that vine was used.",
             measured="Label every tube.",
             default="unknown",
         ),
@@ -280,7 +281,7 @@ COLUMNS: dict[str, Column] = {
             name="day",
             field="day",
             kind="text",
-            meaning="Day or batch in which the trial was made.",
+            meaning="Day or batch in which the trial was run.",
             default="unknown",
         ),
         Column(
@@ -289,8 +290,8 @@ COLUMNS: dict[str, Column] = {
             low=1,
             high=1_000_000,
             shared=False,
-            meaning="Place of the trial among those made: 1, 2, …",
-            measured="Count trials as they are made.",
+            meaning="Position of the trial in the order in which trials were run: 1, 2, …",
+            measured="Count trials as they are run.",
             default="the order of the rows",
         ),
         Column(
@@ -298,7 +299,7 @@ COLUMNS: dict[str, Column] = {
             field="axis",
             kind="axis",
             shared=False,
-            meaning="Growth axis in the picture for this trial alone: x,y:x,y[:width_mm], px; more points for a bend.",
+            meaning="Growth axis in the picture for this trial only: x,y:x,y[:width_mm], px; more points for a bend.",
             default="the axis of all trials, or found from the motion",
         ),
         Column(
@@ -306,7 +307,7 @@ COLUMNS: dict[str, Column] = {
             field="frames_used",
             kind="frames",
             shared=False,
-            meaning="First and last frame used of this trial: from:to, counted from 0 (rows of a table of positions).",
+            meaning="First and last frame of this trial to use: from:to, counted from 0 (rows of a track file).",
             default="all",
         ),
         Column(
@@ -314,7 +315,7 @@ COLUMNS: dict[str, Column] = {
             field="point_mass",
             kind="text",
             shared=False,
-            meaning="Which point mass of a Physics Tracker file this trial is, by its name.",
+            meaning="Name of the point mass in a Physics Tracker file that is this trial.",
             default="the one with the most points",
         ),
     )
@@ -325,15 +326,15 @@ SHARED = tuple(name for name, column in COLUMNS.items() if column.shared)
 """Columns that `experiment.yaml` may set for all trials."""
 
 LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) for kind in ("range", "choice")}
-"""Columns that the next experiment may choose, by how `limits` of `experiment.yaml` states them."""
+"""Columns that `limits` of `experiment.yaml` may constrain for further trials, by the form of the constraint."""
 
 
 def column_in_other_unit(name: str) -> tuple[Column, str] | None:
-    """The column that a name in another unit stands for, and that unit; None where it stands for none.
+    """Return the column of the same quantity as a name in another unit, and that unit; None if there is none.
 
     Parameters
     ----------
-    name : of a column that no sheet has.
+    name : name of an unknown column, such as `pressure_psi`.
 
     Returns
     -------
@@ -352,11 +353,11 @@ def column_in_other_unit(name: str) -> tuple[Column, str] | None:
 
 
 def option(column: str) -> str:
-    """The command line's option for a column of the sheet.
+    """Return the command-line option for a column of the sheet.
 
     Parameters
     ----------
-    column : its name.
+    column : name of the column.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""Settings: what all trials share (`experiment.yaml`) and how the analysis runs (`config/config.yaml`).
+"""Settings shared by all trials (`experiment.yaml`) and settings of the analysis (`config/config.yaml`).
 
-The pydantic models below are the one truth about keys, defaults and what is allowed; a test keeps `config/config.yaml`
-in step. An unknown key, a key written twice and a value that is not allowed are all reported at once.
+The pydantic models below define all keys, defaults and allowed values; a test keeps `config/config.yaml` consistent
+with them. All unknown keys, repeated keys and values that are not allowed are reported together.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 
 
 def _no_yes_or_no(value: Any) -> Any:
-    """Refuse what pydantic would take for 1 and 0."""
+    """Refuse yes and no, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("is yes or no where a number belongs: write the number")
     return value
@@ -48,19 +48,19 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class _Strict(BaseModel):
-    """Unknown keys are refused, instances cannot change, NaN and infinity are no settings."""
+    """Base of all settings: immutable, without unknown keys, NaN or infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
 
 
 def _optional_fields(types: dict[str, Any]) -> Any:
-    """A base class with a field of each name and type, None where it is not given."""
+    """Return a base class with an optional field of each name and type, None by default."""
     fields: dict[str, Any] = {name: (kind | None, None) for name, kind in types.items()}
     return create_model("Columns", __base__=_Strict, **fields)
 
 
 class AxisSettings(_Strict):
-    """The growth axis in the picture, and how wide a strip along it is looked at."""
+    """The growth axis in the picture, and the width of the strip along it that is tracked."""
 
     from_px: Pixel
     to_px: Pixel
@@ -80,7 +80,7 @@ class AxisSettings(_Strict):
 
 
 class MmPerPx(_Strict):
-    """The scale itself."""
+    """The scale, stated directly."""
 
     kind: Literal["mm_per_px"]
     mm_per_px: Positive
@@ -111,7 +111,7 @@ class Checkerboard(_Strict):
 
 
 class Charuco(_Strict):
-    """A ChArUco board: `squares` across and down, and the name of its marker dictionary as OpenCV has it."""
+    """A ChArUco board: `squares` across and down, and the OpenCV name of its marker dictionary."""
 
     kind: Literal["charuco"]
     image: str
@@ -136,21 +136,20 @@ _LimitedColumns: Any = _optional_fields(
 
 
 class Limits(_LimitedColumns):
-    """Which further trials could be made, for the next experiment; None where the trials so far are the guide.
+    """Constraints on further trials, for the design of the next experiment; None: the range of the trials so far.
 
-    Pressure and payload are ranges (`7:40` or two numbers); the others are what there is to choose from: one value, a
-    list, or a range, of which five values are looked at. `trials` is how many can be afforded, `new_vines` whether a
-    vine can be made for them, `hoop_stress_MPa` what the film is trusted to hold.
+    Pressure and payload are ranges (`7:40` or two numbers); the others are sets of values to choose from: one value, a
+    list, or a range, of which five values are considered.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     trials: Annotated[Count, Field(ge=1, le=24)] = 4
-    """How many further trials can be afforded."""
+    """Largest number of further trials."""
     new_vines: bool = True
-    """Whether a vine can be made for them."""
+    """Whether new vines can be made for them."""
     hoop_stress_MPa: Positive = 7.8
-    """Hoop stress that the film is trusted to hold."""
+    """Largest hoop stress allowed in the film."""
 
     @field_validator(*LIMITED["range"], mode="before")
     @classmethod
@@ -180,51 +179,53 @@ _TYPES: dict[str, Any] = {
     "window": tuple[float, float],
     "yes_no": bool,
 }
-"""What a value of each kind of column becomes."""
+"""Type of the value of each kind of column."""
 
 _SharedColumns: Any = _optional_fields({name: _TYPES[COLUMNS[name].kind] for name in SHARED})
 
 
 class ExperimentSettings(_SharedColumns):
-    """What all trials of an experiment share. Values keep the unit in their name; None where not given.
+    """Settings shared by all trials of an experiment, in the unit of their name; None where not given.
 
-    Every column but `trial`, `video` and `track` may stand here; a cell of the sheet overrides it.
+    The columns that are declared `shared` may be set here for all trials; a cell of the sheet overrides them.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
-    """Absolute pressure of the air around: enters the gas of chambers."""
+    """Absolute ambient pressure; used in the gas law of chambers."""
     tail_slack: Literal["taut", "free"] = "taut"
-    """Whether a tail that the model would have to push goes slack (free) or stays taut."""
+    """Whether a tail in which the model predicts compression goes slack (free) or stays taut."""
     tail_store: Literal["body", "reel"] = "body"
     """Where the tail is kept: in the body of the vine, or on a reel."""
     mass_loss: Literal["geometric", "as_printed"] = "geometric"
-    """How the moving mass shrinks: by the geometry of eversion, or as the paper prints it."""
+    """How the moving mass decreases: by the geometry of eversion, or as printed in the paper."""
     position_systematic_mm: Annotated[Number, Field(ge=0, le=100)] | None = None
-    """Standard deviation of smooth errors of position that all trials share, such as a lens makes; by default 0.1 for
-    positions from elsewhere and for calibrations by two points or a scale, 0 for those by a target."""
+    """Standard deviation of smooth position errors shared by all trials, such as lens distortion; by default 0.1 for
+    positions measured elsewhere and for a scale from two points or mm_per_px, 0 for a calibration target."""
     model: tuple[str, ...] = BASE_EFFECTS
     """Effects of the model in use."""
     candidates: tuple[str, ...] | None = None
     """Effects that a diagnosis may propose; blank for the whole catalogue."""
     effects: tuple[str, ...] = ()
-    """Paths of Python files with effects of one's own."""
+    """Paths of Python files with effects of your own."""
     strict: bool = False
-    """Whether a fault of one trial stops all."""
+    """Whether a fault of one trial stops the whole experiment."""
     axis: AxisSettings | None = None
-    """The growth axis in the picture, from_px, to_px, width_mm, and via_px where it bends; found where blank."""
+    """The growth axis in the picture: from_px, to_px, width_mm, and via_px if it bends; found from the motion if
+    blank."""
     calibration: Calibration | None = None
     """kind: charuco, checkerboard, two_points or mm_per_px, with the keys of that kind."""
     limits: Limits = Limits()
-    """What further trials may look like; see below."""
+    """Constraints on further trials; see below."""
     published: Literal["simulated", "measured"] | None = None
-    """Set the paper's numbers beside ours, whose trials were grown from its parameters, or filmed."""
+    """Compare with the numbers of the paper: trials simulated from its parameters, or measured; blank: no
+    comparison."""
 
     @field_validator(*SHARED, mode="before")
     @classmethod
     def _as_in_the_sheet(cls, value: Any, info: Any) -> Any:
-        """Judge a shared value as the sheet's cell would be."""
+        """Check a shared value like a cell of the sheet."""
         column = COLUMNS[info.field_name]
         if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
             return value
@@ -246,15 +247,15 @@ class SteadySettings(_Strict):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     drift_limit: Annotated[Number, Field(gt=0, le=1)] = 0.03
-    """Largest relative drift of speed across a steady window, with its 95 % interval."""
+    """Bound on the relative drift of speed across a steady window; must contain its 95 % interval."""
     start_fraction: Annotated[Number, Field(ge=0, lt=1)] = 0.2
-    """A window may begin once the speed exceeds this fraction of the largest of its trial,"""
+    """A window may begin once the speed exceeds this fraction of the trial's largest speed,"""
     start_sigmas: Annotated[Number, Field(ge=0)] = 5.0
     """and this many standard errors of the speed."""
     paper_cv: Annotated[Number, Field(gt=0, le=1)] = 0.03
     """The paper's rule: largest coefficient of variation of speed,"""
     paper_points: Annotated[Count, Field(ge=3)] = 3
-    """over at least so many consecutive points."""
+    """over at least this many consecutive points."""
 
 
 class VelocitySettings(_Strict):
@@ -263,7 +264,7 @@ class VelocitySettings(_Strict):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     kappa: Positive = 3.0
-    """Smoothing windows must agree within this many standard errors."""
+    """The smoothing window is the widest that agrees with all narrower ones within this many standard errors."""
     order: Annotated[Count, Field(ge=1, le=5)] = 3
     """Degree of the local polynomial."""
 
@@ -276,11 +277,11 @@ class DampingSettings(_Strict):
     resamples: Annotated[Count, Field(ge=100)] = 2000
     """Resamplings of whole trials behind each 95 % interval."""
     seed: Annotated[Count, Field(ge=0)] = 1
-    """Seed of the resampling."""
+    """Seed of the bootstrap."""
 
 
 class FigureSettings(_Strict):
-    """Files that every figure is saved as."""
+    """File formats of the figures."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
@@ -298,14 +299,14 @@ class FigureSettings(_Strict):
 
 
 class OverlaySettings(_Strict):
-    """Clips of the recordings with the tracked edge and the models' edges; see `vinetrack.figures.overlay`."""
+    """Clips of the recordings with tracked and modelled edges; see `vinetrack.figures.overlay`."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
     """Which recordings get a clip."""
     seconds: Positive = 6.0
-    """About how long a clip plays, in seconds."""
+    """Approximate duration of a clip, in seconds."""
     width_px: Annotated[Count, Field(ge=320, le=3840)] = 960
     """Width of the picture, in pixels."""
 
@@ -318,7 +319,7 @@ class RunSettings(_Strict):
     experiment: str = "data/demo"
     """The experiment's folder."""
     results: str | None = None
-    """Where results go; blank for results/<name of the experiment>."""
+    """The results folder; blank for results/<name of the experiment>."""
     steady: SteadySettings = SteadySettings()
     """When a stretch of motion counts as steady; see below."""
     velocity: VelocitySettings = VelocitySettings()
@@ -326,9 +327,9 @@ class RunSettings(_Strict):
     damping: DampingSettings = DampingSettings()
     """The damping law."""
     final_at_fraction: Annotated[Number, Field(gt=0, le=1)] = 0.95
-    """Fraction of the length at which final speeds are taken."""
+    """Fraction of the length at which final speeds are evaluated."""
     efficiency_at_mm: Positive = 150.0
-    """Growth at which the energy efficiency is taken, in mm."""
+    """Growth at which the energy efficiency is evaluated, in mm."""
     figures: FigureSettings = FigureSettings()
     """Files of the figures."""
     overlays: OverlaySettings = OverlaySettings()
@@ -336,11 +337,11 @@ class RunSettings(_Strict):
 
 
 def read_experiment_settings(path: Path) -> ExperimentSettings:
-    """Read `experiment.yaml`; all defaults where there is no such file.
+    """Read `experiment.yaml`; return the defaults if there is no such file.
 
     Parameters
     ----------
-    path : of `experiment.yaml`.
+    path : path of `experiment.yaml`.
 
     Returns
     -------
@@ -351,18 +352,18 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
     ExperimentError
         With every problem of the file.
     """
-    # A link whose end is missing is no file left out: the settings behind it were meant.
+    # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
         return ExperimentSettings()
     return _validate(ExperimentSettings, in_key_units(read_yaml(path), path.name)[0], path.name)
 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
-    """Check settings of a run given as a mapping, such as Snakemake's `config` after `--config`.
+    """Validate settings of a run given as a mapping, such as Snakemake's `config`.
 
     Parameters
     ----------
-    values : as `config/config.yaml` would hold them.
+    values : content of `config/config.yaml`, with any overrides.
 
     Returns
     -------
@@ -380,7 +381,7 @@ def run_settings(values: dict[str, Any]) -> RunSettings:
 
 
 def _validate(model: type[Model], document: YamlDocument, file: str) -> Model:
-    """The document as a settings object, or every problem it has."""
+    """Return the document as a settings object; raise an ExperimentError with all its problems."""
     try:
         return model.model_validate(document.content)
     except ValidationError as error:
@@ -388,8 +389,8 @@ def _validate(model: type[Model], document: YamlDocument, file: str) -> Model:
 
 
 def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detail: Any) -> Problem:
-    """One of pydantic's errors as a problem that names the key, its line and what is allowed."""
-    # Inside a calibration pydantic names the kind between "calibration" and the key; the file does not.
+    """Convert a pydantic error to a problem that names the key, its line and what is allowed."""
+    # pydantic inserts the kind of a calibration between "calibration" and the key; the file does not contain it.
     location = tuple(part for i, part in enumerate(detail["loc"]) if not (i == 1 and detail["loc"][0] == "calibration"))
     key = ".".join(str(part) for part in location)
     line = next(
@@ -398,8 +399,8 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     value = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
     shown = None if value is None else str(value)
     if detail["type"] == "extra_forbidden":
-        remedy = did_you_mean(str(location[-1]), _keys_beside(model, document.content, location)) or "remove it"
-        return Problem(message="is no setting", file=file, line=line, column=key, remedy=remedy)
+        remedy = did_you_mean(str(location[-1]), _valid_keys(model, document.content, location)) or "remove it"
+        return Problem(message="is not a setting", file=file, line=line, column=key, remedy=remedy)
     if detail["type"] == "missing":
         return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")
     message, _, remedy = detail["msg"].removeprefix("Value error, ").partition(": ")
@@ -415,8 +416,8 @@ def _kind(content: Any) -> Any:
     return calibration.get("kind") if isinstance(calibration, dict) else None
 
 
-def _keys_beside(model: type[BaseModel], content: Any, location: tuple[Any, ...]) -> list[str]:
-    """Keys that would have been right where an unknown one stands."""
+def _valid_keys(model: type[BaseModel], content: Any, location: tuple[Any, ...]) -> list[str]:
+    """Return the keys that are valid at the location of an unknown key."""
     if len(location) == 1:
         return list(model.model_fields)
     if location[0] == "calibration":

@@ -1,6 +1,6 @@
-"""One row of the trial sheet: its cells, what they lack, and the trial they make.
+"""One row of the trial sheet: reading its cells, checking them, and making a trial of them.
 
-Nothing here opens a recording; `vinetrack.experiment.folder` joins rows, settings and files.
+This module never opens recordings; `vinetrack.experiment.folder` combines rows, settings and files.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSetti
 
 SHEET = "trials.csv"
 MAX_NAME_LENGTH = 100
-"""Longer trial names leave no room for suffixes within the 255 bytes a file name may have. Chosen: 155 bytes remain
-for suffixes; at twice 55 remain, at half names that people write are refused."""
+"""Longest trial name; files are named after it. Chosen: of the 255 bytes of a file name, 155 remain for prefix and
+suffix; at twice the length 55 remain, at half names that people use are refused."""
 
 REQUIRED_COLUMNS = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
-"""What a trial of an everting vine must have; a body that moves as a whole needs its diameter only."""
+"""Columns that a trial of an everting vine requires; a body that moves as a whole requires the diameter only."""
 
 PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
-"""Errors where the sheet states none, part of the contract: 1 % of the pressure, and 0.2 kPa for the yield pressure.
-Chosen: a usual gauge is of class 1, and a yield pressure is read off a slowly rising one. At half or twice the errors
-of forces near the yield pressure halve or double where the sheet states none."""
+"""Default standard errors: 1 % of the pressure, and 0.2 kPa for the yield pressure. Chosen: a usual gauge is of class
+1, and the yield pressure is read from a slowly rising one. At half or twice, the errors of forces near the yield
+pressure halve or double in experiments that state none."""
 
 SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})
-"""Endings of files that carry the rate of capture."""
+"""Suffixes of files that may carry the capture rate."""
 
-RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
+RATE_REMEDY = "write the capture rate; the rate stored in the file is that of playback"
 
 
 @dataclass
 class Row:
-    """A row while it is being judged: values by column, in the column's unit, blank ones left out."""
+    """A row while it is checked: values by column, in the unit of the column, without blank ones, and problems."""
 
     name: str
     line: int
@@ -49,26 +49,26 @@ class Row:
 
     @property
     def failed(self) -> bool:
-        """Whether any of its problems is an error."""
+        """Whether the row has an error."""
         return any(problem.severity == "error" for problem in self.problems)
 
     @property
     def in_use(self) -> bool:
-        """Whether the person wants this trial analysed."""
+        """Whether the trial is to be analysed; False for `use: no`."""
         return bool(self.values.get("use", True))
 
     @property
     def travel_ratio(self) -> float:
-        """2 unless the row or the settings say otherwise."""
+        """Travel ratio of row or settings; 2 by default."""
         return float(self.values.get("travel_ratio", 2.0))
 
     def add(self, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
-        """Note a problem of this row.
+        """Record a problem of this row.
 
         Parameters
         ----------
         message : what is wrong.
-        column : where, blank for the row as a whole.
+        column : column of the cell; blank for the row as a whole.
         severity : "error" or "warning".
         **details : further fields of `Problem`.
         """
@@ -77,13 +77,13 @@ class Row:
 
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
-    """Read one row of the sheet, shared settings filled in where its cells are blank, and judge every cell.
+    """Read and check the cells of one row; shared settings fill blank cells.
 
     Parameters
     ----------
     table : the sheet, in the units of its columns.
-    index : of the row.
-    settings : what all trials share.
+    index : index of the row.
+    settings : settings shared by all trials.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         if column.kind == "number" and (hint := unusual_value_hint(column, row.values[name])):
             row.add(f"is unusual: {hint}", name, "warning", value=text)
     if table.extra[index]:
-        remedy = "put decimal commas and text with separators in quotes"
+        remedy = "put text that contains separators, and decimal commas, in quotes"
         row.add(f"has more cells than the header ({table.extra[index][0][:40]!r} …)", remedy=remedy)
     if not row.in_use:
         row.problems = [replace(problem, severity="warning") for problem in row.problems]
@@ -114,7 +114,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
 
 
 def unknown_columns(table: Table, file: str) -> list[Problem]:
-    """A warning for every column that no trial sheet has, with the nearest that it may have meant.
+    """Warn of every unknown column, with the most similar known names.
 
     Parameters
     ----------
@@ -123,76 +123,76 @@ def unknown_columns(table: Table, file: str) -> list[Problem]:
 
     Returns
     -------
-    problems : warnings, one a column.
+    problems : warnings, one per column.
     """
     problems = []
     for name in table.columns:
         if name not in COLUMNS:
             remedy = did_you_mean(name, [column for column in COLUMNS if column not in table.columns])
-            message = "is no column of a trial sheet and is ignored"
+            message = "is not a column of the trial sheet and is ignored"
             place: dict[str, Any] = {"file": file, "line": 1, "column": name}
             problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
     return problems
 
 
 def _check_name(row: Row) -> None:
-    """Give a row without a usable name one that can stand in files and messages."""
+    """Report an invalid trial name, and replace it by the number of the line."""
     allowed = "letters, digits, _ and -"
     given = row.name
     if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII) and len(given) <= MAX_NAME_LENGTH:
         return
     row.name = f"line-{row.line}"
-    message = "is blank" if not given else "is too long" if len(given) > MAX_NAME_LENGTH else "is no name for a trial"
+    message = (
+        "is blank" if not given else "is too long" if len(given) > MAX_NAME_LENGTH else "is not a valid trial name"
+    )
     if given.startswith("-"):
-        message = "begins with a hyphen, as options of commands do"
-    remedy = f"at most {MAX_NAME_LENGTH} characters, no blanks or dots; it names files"
+        message = "begins with a hyphen, like a command-line option"
+    remedy = f"at most {MAX_NAME_LENGTH} characters, no spaces or dots: files are named after it"
     row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
 
 
 def check_row(row: Row, folder: Path) -> None:
-    """Judge a row as a whole: paths that lead out, and values that contradict each other.
+    """Check a row as a whole: its paths, and values that contradict each other.
 
     Parameters
     ----------
-    row : its problems are noted in it.
-    folder : of the experiment, which paths must not leave.
+    row : row to check; receives the problems.
+    folder : experiment folder, which paths must not leave.
     """
     _check_paths(row, folder)
     check_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
-    # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist, and a frame and
-    # a half is no rounding.
+    # An exposure cannot exceed the frame interval. 2 % allows for rounding of both numbers; above 1.5 intervals
+    # rounding cannot be the reason.
     if exposure > 1.02e6 / fps:
-        longer = exposure * fps / 1e6
-        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs), a factor {longer:.3g}"
-        severity = "error" if longer > 1.5 else "warning"
-        remedy = "check its unit and capture_fps" if longer > 1.5 else ""
+        intervals = exposure * fps / 1e6
+        message = f"is {intervals:.3g} times the frame interval at {fps:g} frames per second ({1e6 / fps:.4g} µs)"
+        severity = "error" if intervals > 1.5 else "warning"
+        remedy = "check its unit and capture_fps" if intervals > 1.5 else ""
         row.add(message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Note required cells that are blank in a row whose shared settings are filled in.
+    """Report required cells that are blank, and return required columns that neither sheet nor settings have.
 
-    Returns the required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported
-    once. Where the travel ratio is broken, what the row needs is not known.
+    The latter are a fault of the sheet, which the caller reports once.
 
     Parameters
     ----------
-    row : its problems are noted in it.
-    folder : of the experiment.
-    columns : that the sheet has.
+    row : row to check, shared settings filled in; receives the problems.
+    folder : experiment folder.
+    columns : columns of the sheet.
 
     Returns
     -------
-    required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported once. Empty where
-        the travel ratio is broken: what the row needs is then not known.
+    required columns that are absent; empty if the travel ratio, which decides what is required, is itself faulty.
     """
-    broken = {problem.column for problem in row.problems if problem.severity == "error"}
+    faulty = {problem.column for problem in row.problems if problem.severity == "error"}
     absent: set[str] = set()
-    if "travel_ratio" in broken:
+    if "travel_ratio" in faulty:
         return absent
-    needed = [name for name in _required_columns(row, folder) if name not in row.values and name not in broken]
-    for name in needed:
+    missing = [name for name in _required_columns(row, folder) if name not in row.values and name not in faulty]
+    for name in missing:
         if name in columns:
             remedy = RATE_REMEDY if name == "capture_fps" else "fill it in"
             row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
@@ -202,17 +202,17 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
 
 
 def _required_columns(row: Row, folder: Path) -> list[str]:
-    """Columns that a row with this travel ratio and these recordings cannot do without."""
-    needed = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
-    if "pressure_kPa" in needed and ("pressure_trace" in row.values or "track" in row.values):
-        needed.remove("pressure_kPa")
-    if "video" in row.values and "track" not in row.values and not _states_its_rate(folder, row.values["video"]):
-        needed.append("capture_fps")
-    return needed
+    """Columns that a row requires, depending on its travel ratio and on the kind of its recording."""
+    required = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
+    if "pressure_kPa" in required and ("pressure_trace" in row.values or "track" in row.values):
+        required.remove("pressure_kPa")
+    if "video" in row.values and "track" not in row.values and not _may_state_rate(folder, row.values["video"]):
+        required.append("capture_fps")
+    return required
 
 
 def _check_paths(row: Row, folder: Path) -> None:
-    """Exactly one recording, and no path that leaves the folder."""
+    """Check that the row names exactly one recording or track, and that no path leaves the folder."""
     for name in ("video", "track", "pressure_trace"):
         if name in row.values:
             try:
@@ -223,11 +223,13 @@ def _check_paths(row: Row, folder: Path) -> None:
     if "video" in row.values and "track" in row.values:
         row.add("has both a video and a track", "track", value=row.values["track"], remedy="keep one of the two")
     if "video" not in row.values and "track" not in row.values:
-        row.add("has neither a video nor a track", remedy="name the recording under video, or positions under track")
+        row.add(
+            "has neither a video nor a track", remedy="name a recording under video, or a file of positions under track"
+        )
 
 
-def _states_its_rate(folder: Path, video: str) -> bool:
-    """Whether a recording is of a kind that may carry the rate of capture; whether it does shows when it is opened."""
+def _may_state_rate(folder: Path, video: str) -> bool:
+    """Whether a recording is of a kind that can carry its capture rate; whether it does, only opening it shows."""
     try:
         path = safe_join(folder, video)
         files = path.iterdir() if path.is_dir() else [path, path.with_suffix(".cih"), path.with_suffix(".cihx")]
@@ -237,57 +239,57 @@ def _states_its_rate(folder: Path, video: str) -> bool:
 
 
 def check_wall(row: Row) -> None:
-    """Refuse a wall that no tube of this diameter can have.
+    """Report a wall thickness above a quarter of the diameter, which no tube can have.
 
     Parameters
     ----------
-    row : its problems are noted in it.
+    row : row to check; receives the problems.
     """
     diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
     if thickness / 1000 > diameter / 4:
-        message = f"is a wall above a quarter of the diameter of {diameter:g} mm"
-        allowed, remedy = f"at most {250 * diameter:g} µm", "the wall is in µm, the diameter in mm"
+        message = f"is more than a quarter of the diameter ({diameter:g} mm)"
+        allowed, remedy = f"at most {250 * diameter:g} µm", "check the units: thickness in µm, diameter in mm"
         row.add(message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
 
 
 def check_pressures(row: Row) -> None:
-    """Warn of pressures that are legal but hardly meant.
+    """Warn of pressures that are allowed but implausible.
 
     Parameters
     ----------
-    row : its problems are noted in it.
+    row : row to check; receives the problems.
     """
     pressure = row.values.get("pressure_kPa", math.nan)
-    onset = row.values.get("yield_pressure_kPa", math.nan)
-    if row.travel_ratio == 2 and onset >= pressure:
-        message = f"is not below the pressure of {pressure:g} kPa: nothing would move (psi? 1 psi is 6.895 kPa)"
-        row.add(message, "yield_pressure_kPa", "warning", value=f"{onset:g}")
+    yield_pressure = row.values.get("yield_pressure_kPa", math.nan)
+    if row.travel_ratio == 2 and yield_pressure >= pressure:
+        message = f"is not below the pressure of {pressure:g} kPa, so the vine would not grow (psi? 1 psi is 6.895 kPa)"
+        row.add(message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
     if (
         row.travel_ratio == 2
         and pressure > 0
-        and onset == 0
+        and yield_pressure == 0
         and not row.values.get("yield_pressure_sigma_kPa", 0.0) > 0
     ):
-        message = "says that the vine grows at any pressure, which none does, and is believed to 0.2 kPa"
-        remedy = "raise the pressure slowly until the tip moves, or say in yield_pressure_sigma_kPa how little is known"
+        message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
+        remedy = "measure it (raise the pressure until the tip moves), or state its error in yield_pressure_sigma_kPa"
         row.add(message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
     if row.travel_ratio == 1 and pressure > 0:
-        message = "drives a body that moves as a whole (travel_ratio 1): is it a vine?"
+        message = "is above 0 although the body moves as a whole (travel_ratio 1): is it a vine?"
         row.add(message, "pressure_kPa", "warning", value=f"{pressure:g}")
 
 
 def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
-    """The trial of a row that has no errors and a pressure, in SI units, with the defaults of the documentation.
+    """Make the trial of a row without errors, in SI units, with the documented defaults.
 
     Parameters
     ----------
-    row : without errors.
-    folder : of the experiment, for its paths.
-    settings : what all trials share.
+    row : row without errors.
+    folder : experiment folder, to which paths are relative.
+    settings : settings shared by all trials.
 
     Returns
     -------
-    trial : SI units; NaN where the sheet is blank and nothing else is stated.
+    trial : SI units; NaN for a blank cell without default.
     """
     values: dict[str, Any] = dict(row.values)
     pressure_kPa = values.setdefault("pressure_kPa", 0.0)
@@ -307,18 +309,17 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
 
 
 def _in_si(column: Column, value: Any, folder: Path) -> Any:
-    """The value of a cell as a trial holds it: numbers in SI, paths inside the folder."""
+    """Convert the value of a cell for a trial: numbers to SI, paths to paths inside the folder."""
     if column.kind == "path":
         return safe_join(folder, value)
     return column.to_si(float(value)) if column.kind in ("number", "choice") else value
 
 
 def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any]) -> float:
-    """Smooth error of positions, standard deviation, m: as stated, else by what is known of the lens.
+    """Standard deviation of smooth position errors, m: as stated, else by whether lens distortion was corrected.
 
-    A target of many corners shows the distortion of the lens; two points or a scale do not, nor do positions that
-    somebody else measured, or a scale of the trial's own, say whether it was corrected. Of a trial that nobody has
-    filmed yet nothing is known: NaN.
+    A target with many corners reveals the distortion, hence 0. Two points, a scale, a scale of the trial's own and
+    positions measured elsewhere do not show whether it was corrected, hence the default. NaN for a planned trial.
     """
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3

@@ -1,7 +1,7 @@
-"""In which order trials were made, and whether it follows the pressure.
+"""The order in which trials were run, and whether it is confounded with pressure.
 
-What changes from trial to trial, wear of a tube, warming, a gauge whose zero moves, follows the order. Where pressures
-were filmed in rising order it follows the pressure too, and nothing in the data tells it from physics.
+A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure rises
+with the order, the data cannot distinguish such a drift from an effect of pressure.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import Floats, Trial
 
 CONFOUNDING_CORRELATION = 0.7
-"""Rank correlation from which the order counts as following the pressure. Derived: a drift fitted beside an effect of
-pressure has its variance multiplied by 1/(1 − r²), and 1/(1 − 0.7²) = 2: half of the information is gone."""
+"""Rank correlation above which order and pressure count as confounded. Derived: when a drift is fitted together with an
+effect of pressure, its variance is inflated by 1/(1 − r²), and 1/(1 − 0.7²) = 2: half of the information is lost."""
 
 FEWEST_TRIALS = 8
-"""Trials from which the correlation is asked. Derived: in random order |r| of 8 passes 0.7 by chance in 5 %."""
+"""Fewest trials for which the correlation is computed. Derived: for 8 trials in random order, |r| exceeds 0.7 with a
+probability of 5 %."""
 
-REMEDY = "make trials in random order, or repeat six of them in random order, and number them in the column order"
+REMEDY = "run the trials in random order, or repeat six of them in random order, and number them under order"
 
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
-    """Rank of every trial in the order in which they were made, and whether the sheet states it.
+    """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     Returns
     -------
     ranks, stated
-        From 0, shape (n_trials,). Where `order` is blank for any trial, or two share it, the order of rows is taken.
+        Ranks from 0, shape (n_trials,). If `order` is blank for any trial, or not unique, the row order is used.
     """
     order = np.array([trial.order for trial in trials], dtype=float)
     stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
@@ -44,7 +45,7 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
 
 
 def order_pressure_correlation(trials: Sequence[Trial]) -> float:
-    """Spearman's rank correlation of order and set pressure among the trials of a vine, all vines together.
+    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
     Returns
     -------
     float
-        −1 to 1; NaN where there are fewer than `FEWEST_TRIALS` trials or each vine has one pressure.
+        −1 to 1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
     """
     from scipy.stats import rankdata
 
@@ -72,7 +73,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
 
 
 def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
-    """Warnings about what a sheet cannot keep apart: order and pressure, and a specimen or day for each condition.
+    """Warn of confounding: order with pressure, and specimen or day with condition.
 
     Parameters
     ----------
@@ -86,29 +87,25 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
     correlation = order_pressure_correlation(trials)
     _, stated = trial_order(trials)
     if abs(correlation) >= CONFOUNDING_CORRELATION and stated:
-        message = f"follows the pressure (rank correlation {correlation:.2f}): any drift looks like physics"
+        message = (
+            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
+        )
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     elif abs(correlation) >= CONFOUNDING_CORRELATION:
         message = (
-            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if they were made "
-            "in this order, any drift looks like physics"
+            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials were "
+            "run in this order, a drift would look like a physical effect"
         )
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     for column in ("specimen", "day"):
         if _confounded_with_condition(trials, column):
-            message = f"is another for each condition: what differs between {column}s looks like physics"
+            message = f"differs for every condition: a difference between {column}s would look like a physical effect"
             remedy = f"spread every condition over two {column}s"
             yield Problem(message=message, file=file, column=column, severity="warning", remedy=remedy)
 
 
 def _confounded_with_condition(trials: Sequence[Trial], column: str) -> bool:
-    """Whether no condition has two of the column's values, though conditions of one vine have different ones.
-
-    Parameters
-    ----------
-    trials : trials with their conditions named.
-    column : `specimen` or `day`.
-    """
+    """Whether every condition has a single value of `specimen` or `day`, while values differ within a vine."""
     values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
     if not values or any(not value for _, _, value in values):
         return False

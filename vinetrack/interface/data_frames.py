@@ -15,6 +15,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.core.tables import Table
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.other_units import in_sheet_units
+from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.experiment.sheet import check_pressures, check_wall, make_trial, read_row
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 POSITION_COLUMNS = ("lead_position_m", "position_m")
 ERROR_COLUMNS = ("lead_position_sigma_m", "lead_position_systematic_m")
-NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
-"""Columns of the sheet that a vine in a frame of tracks needs; a body (`travel_ratio` 1) needs the diameter alone."""
 
 
 def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
@@ -97,8 +96,8 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
     trials = []
     for i in range(len(rows)):
         row = read_row(table, i, settings)
-        needed = NEEDED if row.travel_ratio == 2 else NEEDED[:1]
-        for name in needed:
+        required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
+        for name in required:
             if name not in row.values and all(problem.column != name for problem in row.problems):  # noqa: PD011
                 row.add("is missing", name, allowed=COLUMNS[name].allowed, remedy="give it as a column of the frame")
         check_wall(row)
