@@ -70,10 +70,10 @@ def test_a_set_that_mends_everything_but_is_worth_no_more_than_chance_is_said_to
     )
     questions: Any = SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=2.0))
     monkeypatch.setattr(selection, "EffectSets", lambda *_: sets)
-    monkeypatch.setattr(selection, "mending", lambda *_: ([pair], {}, questions))
-    (step,) = selection._together(questions, questions, [pair], str)  # type: ignore[list-item]
+    monkeypatch.setattr(selection, "adequate_hypotheses", lambda *_: ([pair], {}, questions))
+    (step,) = selection._effect_set_rounds(questions, questions, [pair], str)  # type: ignore[list-item]
     assert step.verdict == "unexplained"
-    assert step.rejected == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)
+    assert step.rejected == (("leak with air_drag", "its gain over the best smaller set is within chance"),)
 
 
 @pytest.mark.parametrize(
@@ -92,9 +92,9 @@ def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like
         fitted=dict(enumerate(singles)), subset=lambda *_: None, search=SimpleNamespace(tests_after=lambda _: None)
     )
     monkeypatch.setattr(selection, "_shared_step", lambda verdict, *parts: (verdict, parts[4]))
-    monkeypatch.setattr(selection, "_beside", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))
+    monkeypatch.setattr(selection, "_remainder", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))
     monkeypatch.setattr(selection, "SelectionStep", lambda *_, **__: None)
-    steps = selection._of_sets(sets, sets, [pair], {}, sets)  # type: ignore[list-item]
+    steps = selection._rounds_of_sets(sets, sets, [pair], {}, sets)  # type: ignore[list-item]
     assert [step for step in steps if step is not None] == named
 
 

@@ -38,8 +38,8 @@ def search(
     tried.same_minimum, tried.started, begun = set(), {}, []
     tried.tests = cast("Any", SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=100.0 if far_off else 1.0)))
 
-    def from_climb(_: Any, climb: SubsetFit, *best: float, afresh: bool = False, **led: bool) -> Any:  # noqa: ARG001
-        begun.append(math.inf if afresh else climb.values["leak.rate"])
+    def from_climb(_: Any, climb: SubsetFit, *best: float, reset: bool = False, **rescue: bool) -> Any:  # noqa: ARG001
+        begun.append(math.inf if reset else climb.values["leak.rate"])
         return ended(ends[len(begun) - 1])
 
     monkeypatch.setattr(candidate_fits, "is_poor_fit", lambda *_: far_off)
@@ -51,10 +51,10 @@ def search(
 def test_two_starts_that_end_in_the_same_place_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, begun = search(monkeypatch, [-6.2])
     first = ended(-6.5)
-    assert tried._restarted(LEAK, first, 0.0, led=True).delta_chi2 == -6.2
+    assert tried._restarted(LEAK, first, 0.0, rescue=True).delta_chi2 == -6.2
     assert begun == [1e-3]
     # From its other shapes it is fitted once each, and not begun again.
-    assert tried._restarted(LEAK, first, 0.0, led=True) is first
+    assert tried._restarted(LEAK, first, 0.0, rescue=True) is first
     assert begun == [1e-3]
 
 
@@ -62,14 +62,14 @@ def test_a_start_where_it_hardly_acts_is_not_made_twice(monkeypatch: pytest.Monk
     tried, begun = search(monkeypatch, [12.0])
     small = SubsetFit(LEAK.effects, math.nan, {"leak.rate": 1e-3})
     first = ended(-6.5)
-    assert tried._restarted(small, first, 0.0, led=True).delta_chi2 == 12.0
+    assert tried._restarted(small, first, 0.0, rescue=True).delta_chi2 == 12.0
     assert begun == [math.inf]
 
 
 def test_starts_that_end_apart_are_followed_by_one_with_nothing_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, begun = search(monkeypatch, [3.0, 40.0])
     first = ended(-6.5)
-    assert tried._restarted(LEAK, first, 0.0, led=True).delta_chi2 == 40.0
+    assert tried._restarted(LEAK, first, 0.0, rescue=True).delta_chi2 == 40.0
     assert begun == [1e-3, math.inf]
     assert not tried.same_minimum
 
@@ -80,7 +80,7 @@ def test_far_off_the_tracks_fits_that_miss_by_as_much_are_in_the_same_place(
 ) -> None:
     """Half a per cent of what is missed, of 3600 points: −2 ln L of 36."""
     tried, begun = search(monkeypatch, [second, 1000.0], far_off=True)
-    assert tried._restarted(LEAK, ended(-6.5), 0.0, led=True).delta_chi2 == (second if same else 1000.0)
+    assert tried._restarted(LEAK, ended(-6.5), 0.0, rescue=True).delta_chi2 == (second if same else 1000.0)
     assert len(begun) == (1 if same else 2)
     assert bool(tried.same_minimum) == same
 
@@ -89,17 +89,17 @@ def test_of_a_model_far_off_which_takes_nothing_over_a_start_is_not_made_afresh_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tried, begun = search(monkeypatch, [40.0], far_off=True)
-    assert tried._is_new_start(LEAK, led=True)
-    assert tried._restarted(LEAK, ended(-6.5), 0.0, led=True).delta_chi2 == 40.0
+    assert tried._is_new_start(LEAK, rescue=True)
+    assert tried._restarted(LEAK, ended(-6.5), 0.0, rescue=True).delta_chi2 == 40.0
     assert begun == [1e-3]
     assert tried.same_minimum == {"leak"}
 
 
 def test_a_start_is_made_again_only_to_be_led_on(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, _ = search(monkeypatch, [])
-    assert tried._is_new_start(LEAK, led=False)
-    assert not tried._is_new_start(LEAK, led=False)
-    assert tried._is_new_start(LEAK, led=True)
-    assert not tried._is_new_start(LEAK, led=True)
-    assert not tried._is_new_start(LEAK, led=False)
-    assert tried._is_new_start(LEAK, led=True, afresh=True)
+    assert tried._is_new_start(LEAK, rescue=False)
+    assert not tried._is_new_start(LEAK, rescue=False)
+    assert tried._is_new_start(LEAK, rescue=True)
+    assert not tried._is_new_start(LEAK, rescue=True)
+    assert not tried._is_new_start(LEAK, rescue=False)
+    assert tried._is_new_start(LEAK, rescue=True, reset=True)

@@ -46,7 +46,7 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) != enough
     if not enough:
-        assert f"tail_friction is worth {worth:.1f} σ beside the others, and 6.0 σ are asked" in sets.superfluous(
+        assert f"tail_friction reaches {worth:.1f} σ given the others, and 6.0 σ are required" in sets.superfluous(
             triple
         )
 
@@ -60,7 +60,7 @@ def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely() -> None:
 def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold() -> None:
     triple = of(NAMES, TRIPLE)
     assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
-    assert "6.6 σ are asked" in sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple)
+    assert "6.6 σ are required" in sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple)
 
 
 @pytest.mark.parametrize(("gain", "better"), [(0.0, False), (4.9, False), (5.1, True)])

@@ -1,4 +1,4 @@
-"""One effect put into the model by hand: both fitted, both held against what they had not seen."""
+"""One effect added to the model by hand: both models are fitted, and compared on conditions that were left out."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def add(
     experiment: Experiment, tracks: Mapping[str, Track], name: str, report: Callable[[str], None]
 ) -> tuple[Fit, Fit, pd.DataFrame]:
-    """The model in use fitted without and with an effect, and the ladder of both.
+    """Fit the model in use without and with an effect, and work out the ladder of both.
 
     Parameters
     ----------
@@ -52,14 +52,14 @@ def add(
     -------
     before, after : Fit
     table : DataFrame
-        The ladder of both.
+        The ladder of errors, one row for each model.
 
     Raises
     ------
     EffectError
         If there is no such effect, it is in the model already, or a trial lacks what it needs.
     FitError
-        If a model cannot be followed.
+        If the simulation of a model fails.
     """
     from vinetrack.diagnosis.ladder import ladder
     from vinetrack.effects import own_effects
@@ -73,17 +73,17 @@ def add(
         raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
     check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
     report("fitting the model as it is")
-    questioned = candidates_of(model, experiment.settings.candidates, user_effects)
-    if effect not in questioned:
-        questioned = (*questioned, effect)
-    before = initial_fit(model, pairs_of(experiment, tracks)[0], questioned, profile=False)
+    candidates = candidates_of(model, experiment.settings.candidates, user_effects)
+    if effect not in candidates:
+        candidates = (*candidates, effect)
+    before = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
     before, after = both_fits(before, effect, report)
     report("errors before and after")
     return before, after, ladder((before, after), ("", effect.name))
 
 
 def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
-    """The fits without and with an effect, each from its best minimum, as the diagnosis compares them.
+    """Fit a model without and with an effect, each from its best minimum, as the diagnosis does.
 
     Parameters
     ----------
@@ -98,29 +98,29 @@ def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tup
     Raises
     ------
     FitError
-        If the model with the effect cannot be followed from any start.
+        If the simulation of the model with the effect fails from every start.
     """
     if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
         before = restart_exponents(before)
     for _ in range(1 + MAX_RESTARTS):
         report(f"fitting it with {effect.name}")
-        after = _with(before, effect)
-        rival = restart_without(before, after)
-        if rival.log_likelihood <= before.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
+        after = _fit_with(before, effect)
+        refitted = restart_without(before, after)
+        if refitted.log_likelihood <= before.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
             break
-        before = rival
+        before = refitted
     return before, after
 
 
-def _with(before: Fit, effect: Effect) -> Fit:
-    """The fit with an effect, from several starts."""
-    slope = SubsetFitter(before)
+def _fit_with(before: Fit, effect: Effect) -> Fit:
+    """Fit a model with an effect added, from several starts."""
+    fitter = SubsetFitter(before)
     starts = [((effect,), start_values(shape, shape.step * 10)) for shape in shapes_of(effect)]
-    climb = best_subset_fit(slope, starts, float("inf"))
-    after = full_fit(before, climb) if climb is not None else None
+    subset_fit = best_subset_fit(fitter, starts, float("inf"))
+    after = full_fit(before, subset_fit) if subset_fit is not None else None
     if after is None:
-        raise FitError(f"The model with {effect.name} cannot be followed from any start.")
+        raise FitError(f"The simulation of the model with {effect.name} fails from every start.")
     if after.log_likelihood < before.log_likelihood:
-        again = refit(before, before.model + effect)
-        after = max((after, again), key=lambda fit: fit.log_likelihood)
+        from_before = refit(before, before.model + effect)
+        after = max((after, from_before), key=lambda fit: fit.log_likelihood)
     return after

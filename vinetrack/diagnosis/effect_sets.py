@@ -1,8 +1,8 @@
-"""Several effects together: forward and backward steps over sets of effects.
+"""Sets of several effects, by forward and backward steps.
 
-Forward, the best sets of k effects are questioned, and those effects are added that promise to mend what is left.
-Backward, each member of the best set of k + 1 is taken out again: what was added early may only have stood for two that
-were added later, and a smaller set that is better than all before it is followed instead (floating search; Pudil,
+Forward, effects are added to the best sets of k effects: those that the score tests predict to improve the fit most.
+Backward, each member of the best set of k + 1 is removed: an effect added early may only have stood in for two added
+later, and a smaller set that is better than all known of its size is followed instead (floating search; Pudil,
 Novovičová & Kittler, Pattern Recognition Letters 15, 1119, 1994).
 """
 
@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
-from vinetrack.diagnosis.held_fits import let_go, with_curves
+from vinetrack.diagnosis.fit_memory import drop_curves, with_curves
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS
 from vinetrack.diagnosis.multi_start import MIN_SHARE_OF_BEST_GAIN
@@ -34,16 +34,17 @@ PAIR_BASES, PAIR_PARTNERS = 3, 4
 MIN_SHARE_OF_BEST_GAIN of the best one's gain. Chosen for time."""
 
 LARGER_SET_BASES, LARGER_SET_PARTNERS = 2, 3
-"""Larger sets are built on the two best and the best credible one of those a size smaller. Chosen for time."""
+"""The same for larger sets: the best sets of one effect fewer, and the best of credible sizes besides. Chosen for
+time."""
 
 MIN_LOG_LIKELIHOOD_GAIN = 1.0
-"""Difference in ln L that counts as better. Chosen: unsettled iterations differ by a tenth."""
+"""Difference in ln L from which a fit counts as better. Chosen: iterations that have not settled differ by a tenth."""
 
 Names = frozenset[str]
 
 
 class EffectSets:
-    """Sets of effects tried from one fit, by their names; each is fitted once, unless it is met from a better start."""
+    """Sets of effects fitted from one model, by their names. A set is fitted again only from a better start."""
 
     def __init__(self, search: CandidateFits, singles: Sequence[LikelihoodRatio], report: Report) -> None:
         self.search, self.report = search, report
@@ -51,12 +52,12 @@ class EffectSets:
         self.effects = search.tests.effects
         self.fitted: dict[Names, LikelihoodRatio] = {}
         for single in singles:
-            self._keep(single)
+            self._keep_best(single)
         self.extended: set[Names] = set()
         self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
-        """Known sets of so many effects, most likely first.
+        """Fitted sets of this many effects, the likeliest first.
 
         Parameters
         ----------
@@ -66,11 +67,11 @@ class EffectSets:
         -------
         list of LikelihoodRatio
         """
-        known = [hypothesis for names, hypothesis in self.fitted.items() if len(names) == size]
-        return sorted(known, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
+        of_size = [hypothesis for names, hypothesis in self.fitted.items() if len(names) == size]
+        return sorted(of_size, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
-        """Forward: fit sets of so many effects, built on the best of one less.
+        """Forward step: fit sets of this many effects, built on the best sets of one fewer.
 
         Parameters
         ----------
@@ -79,38 +80,42 @@ class EffectSets:
         Returns
         -------
         list of LikelihoodRatio
-            All known sets of that size, most likely first.
+            All fitted sets of that size, the likeliest first.
         """
-        partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
-        for first in self._firsts(size - 1):
-            names = frozenset(first.names)
+        n_partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
+        for base in self._bases(size - 1):
+            names = frozenset(base.names)
             if names in self.extended:
                 continue
             self.extended.add(names)
-            search = CandidateFits(self.search.tests_after(first.fit), self.report, max_full_fits=partners)
+            search = CandidateFits(self.search.tests_after(base.fit), self.report, max_full_fits=n_partners)
             search.fit_singles()
-            for name, likely, held, simpler in search.nested_tried:
-                self.nested_tried.add(("+".join(sorted((*first.names, name))), likely, held, simpler))
-            ranked = sorted(search.fitted.values(), key=lambda further: -further.fit.log_likelihood)
-            kept = [other for k, other in enumerate(ranked) if k < partners or other.label in search.nested_labels]
-            for further in kept:
-                self._keep(likelihood_ratio(self.before, (*first.effects, *further.effects), further.fit))
-        for hypothesis in self.of_size(size)[:partners]:
+            for name, log_likelihood, larger, simpler in search.nested_tried:
+                self.nested_tried.add(("+".join(sorted((*base.names, name))), log_likelihood, larger, simpler))
+            ranked = sorted(search.fitted.values(), key=lambda partner: -partner.fit.log_likelihood)
+            partners = [
+                partner for k, partner in enumerate(ranked) if k < n_partners or partner.label in search.nested_labels
+            ]
+            for partner in partners:
+                self._keep_best(likelihood_ratio(self.before, (*base.effects, *partner.effects), partner.fit))
+        for hypothesis in self.of_size(size)[:n_partners]:
             for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.nested_tried):
-                self._keep(likelihood_ratio(self.before, effects, fit))
+                self._keep_best(likelihood_ratio(self.before, effects, fit))
         return self.of_size(size)
 
-    def _firsts(self, size: int) -> list[LikelihoodRatio]:
-        known = self.of_size(size)
-        top = max((hypothesis.delta_chi2 for hypothesis in known), default=0.0)
-        known = [hypothesis for hypothesis in known if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * top]
+    def _bases(self, size: int) -> list[LikelihoodRatio]:
+        """Sets of this many effects on which larger ones are built."""
+        of_size = self.of_size(size)
+        best_gain = max((hypothesis.delta_chi2 for hypothesis in of_size), default=0.0)
+        strong = [hypothesis for hypothesis in of_size if hypothesis.delta_chi2 >= MIN_SHARE_OF_BEST_GAIN * best_gain]
         if size == 1:
-            return known[:PAIR_BASES]
-        credible = [hypothesis for hypothesis in known if hypothesis.credible]
-        return [*known[:LARGER_SET_BASES], *(best for best in credible[:1] if best not in known[:LARGER_SET_BASES])]
+            return strong[:PAIR_BASES]
+        bases = strong[:LARGER_SET_BASES]
+        credible = [hypothesis for hypothesis in strong if hypothesis.credible]
+        return [*bases, *(best for best in credible[:1] if best not in bases)]
 
     def prune(self, hypothesis: LikelihoodRatio) -> bool:
-        """Backward: take each member out of a set.
+        """Backward step: remove each member from a set in turn.
 
         Parameters
         ----------
@@ -119,7 +124,7 @@ class EffectSets:
         Returns
         -------
         bool
-            Whether one of the smaller sets is better than all of its size before it.
+            Whether one of the smaller sets is better than all that were fitted of its size before.
         """
         size = len(hypothesis.effects) - 1
         best = max((known.fit.log_likelihood for known in self.of_size(size)), default=-math.inf)
@@ -128,7 +133,7 @@ class EffectSets:
         return self.of_size(size)[0].fit.log_likelihood > best + MIN_LOG_LIKELIHOOD_GAIN
 
     def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
-        """A set with one member taken out, the others fitted again; None where that cannot be followed.
+        """Fit a set without one of its members; None where the fit fails.
 
         Parameters
         ----------
@@ -138,18 +143,20 @@ class EffectSets:
         Returns
         -------
         LikelihoodRatio or None
+            Not refitted if a set of these effects is known that is no likelier than the larger set.
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
-        known = self.fitted.get(frozenset(other.name for other in others))
+        names = frozenset(other.name for other in others)
+        known = self.fitted.get(names)
         if known is None or known.fit.log_likelihood > hypothesis.fit.log_likelihood:
             self.report(f"taking out {effect.name}")
             fit = self._refitted(hypothesis.fit, others)
             if fit is not None:
-                self._keep(likelihood_ratio(self.before, others, fit))
-        return self.fitted.get(frozenset(other.name for other in others))
+                self._keep_best(likelihood_ratio(self.before, others, fit))
+        return self.fitted.get(names)
 
     def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
-        """Some members of a set alone, fitted from the set where they are not known; None where that fails.
+        """Some members of a set alone, refitted from the set unless known already; None where the fit fails.
 
         Parameters
         ----------
@@ -164,7 +171,7 @@ class EffectSets:
         if names not in self.fitted:
             fit = self._refitted(hypothesis.fit, effects)
             if fit is not None:
-                self._keep(likelihood_ratio(self.before, effects, fit))
+                self._keep_best(likelihood_ratio(self.before, effects, fit))
         known = self.fitted.get(names)
         return None if known is None else replace(known, fit=with_curves(known.fit))
 
@@ -175,7 +182,7 @@ class EffectSets:
             return None
 
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
-        """What a member of a set is worth beside the others, in standard deviations; 0 where it is not known.
+        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known.
 
         Parameters
         ----------
@@ -189,11 +196,11 @@ class EffectSets:
         others = self.leave_out(hypothesis, effect)
         if others is None:
             return 0.0
-        fall = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
-        return math.sqrt(max(fall, 0.0) / hypothesis.inflation)
+        delta_chi2 = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
+        return math.sqrt(max(delta_chi2, 0.0) / hypothesis.inflation)
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> str:
-        """The first member of a set that it can do without, or that is worth too little; blank where there is none.
+        """Find the first member of a set whose significance given the others is too low.
 
         Parameters
         ----------
@@ -202,38 +209,38 @@ class EffectSets:
         Returns
         -------
         str
-            What to say of it.
+            The reason, in words; blank where every member is significant.
         """
         for effect in hypothesis.effects:
-            others = tuple(other for other in hypothesis.effects if other is not effect)
+            others = frozenset(other.name for other in hypothesis.effects if other is not effect)
             sigmas = self.member_sigmas(hypothesis, effect)
-            asked = SEARCH_SIGMAS
-            smaller = self.fitted.get(frozenset(other.name for other in others))
+            required = SEARCH_SIGMAS
+            smaller = self.fitted.get(others)
             if smaller is not None:
-                asked = max(asked, self.search.tests_after(smaller.fit).family.threshold(effect.name))
-            if sigmas < asked:
-                return f"{effect.name} is worth {sigmas:.1f} σ beside the others, and {asked:.1f} σ are asked of it"
+                required = max(required, self.search.tests_after(smaller.fit).family.threshold(effect.name))
+            if sigmas < required:
+                return f"{effect.name} reaches {sigmas:.1f} σ given the others, and {required:.1f} σ are required"
         return ""
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
-        """Whether a set is better than a smaller one by more than chance gives a further effect.
+        """Whether a set is better than a smaller one by more than the threshold of its additional effect.
 
         Parameters
         ----------
         hypothesis : a set of at least two effects.
-        smaller : another set; the likeliest that is smaller by one where it is not given.
+        smaller : a smaller set; by default the likeliest of one effect fewer.
 
         Returns
         -------
         bool
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
-        further = self.search.tests_after(smaller.fit).family
-        limit = max(further.threshold(name) for name in hypothesis.names if name not in smaller.names)
-        return 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood) >= limit**2
+        family = self.search.tests_after(smaller.fit).family
+        threshold = max(family.threshold(name) for name in hypothesis.names if name not in smaller.names)
+        return 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood) >= threshold**2
 
     def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
-        """The steps to the largest set of plausible sizes in which each effect more is no chance, one effect a step.
+        """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.
 
         Returns
         -------
@@ -251,11 +258,12 @@ class EffectSets:
         steps = [self.subset(best, best.effects[: k + 1]) for k in range(len(best.effects))]
         return tuple(step for step in steps if step is not None)
 
-    def _keep(self, hypothesis: LikelihoodRatio) -> None:
+    def _keep_best(self, hypothesis: LikelihoodRatio) -> None:
+        """Keep a set if no likelier fit of the same effects is known, and drop curves that are not needed."""
         names = frozenset(hypothesis.names)
         known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
             self.fitted[names] = hypothesis
-            same = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
-            let_go(same)
-            self.fitted |= same
+            of_size = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
+            drop_curves(of_size)
+            self.fitted |= of_size

@@ -1,4 +1,10 @@
-"""One fit questioned: is anything missing, and what could it be, without a single refit."""
+"""Tests of one fitted model: is anything missing, and which effect would explain it. No model is refitted.
+
+A model is rejected by any of three kinds of test. Score tests ask each candidate of the catalogue (`score_test`, with
+family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces
+(`structure_test`), and tests of the trial effects and the noise (`trial_effect_tests`). The last compares the misfit
+with the noise and the slow errors of the tracks.
+"""
 
 from __future__ import annotations
 
@@ -24,30 +30,32 @@ from vinetrack.inference.optimiser import is_poor_fit, missed_fraction
 from vinetrack.inference.systematics import systematics_of
 
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
-"""Chance at which nothing missing may be taken for something by the best of all candidates; once an effect was added
-the gate is stricter, for a pair of effects can imitate what no catalogue holds. Chosen from the bar of 3 % false
-alarms on null campaigns, a tenth of it for each of the tests that may raise one; measured 0 of 42
-(benchmarks/hidden_effects.py, scoring seeds 16000 and 17000)."""
+"""Probability that the best of all candidates exceeds its threshold where nothing is missing: in the first round, and
+once an effect was added. The later level is stricter because a pair of effects can imitate what is in no catalogue.
+Chosen as a tenth of the required 3 % false alarms on null campaigns, for each of the tests that may raise one; measured
+0 of 42 (benchmarks/hidden_effects.py, scoring seeds 16000 and 17000)."""
 
 SINGLE_PROBE_LEVEL = 3e-4
 """Level of the test of the single most significant probe. Chosen: a tenth of FALSE_ALARM_LEVEL_FIRST_ROUND, for eight
 kinds of probes are tried."""
 
 FAR_OFF_CHI2_PER_DOF = 4.0
-"""χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8.
-Chosen: twice what heavy tails reach."""
+"""χ² per degree of freedom, against the noise of the tracks alone, from which a model is far off. Chosen: twice the 1.8
+that heavy-tailed noise reaches."""
 
 MISSED_FRACTION, MISSED_FRACTION_WITHOUT_SLOW_ERRORS = 6e-4, 1.5e-4
-"""Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
-that somebody else measured, and pressures that were set, have no such errors that anybody knows of."""
+"""Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any
+tracker: 0.1 mm of 170 mm. The second holds for positions measured elsewhere under a set pressure, which have no known
+slow errors."""
 
 SEARCH_CHI2_PER_DOF, SEARCH_P_VALUE, SEARCH_SIGMAS = 1.5, 1e-2, 6.0
-"""χ² per degree of freedom, and chance of what trials bend, from which effects are fitted although no score is high,
-and what one must then be worth in standard deviations. Heavy tails alone reach 1.5."""
+"""A model that passes every test is searched nevertheless from this χ² per degree of freedom, or below this p-value of
+the trial effects; an effect must then reach this many standard deviations. Chosen: heavy tails alone reach a χ² per
+degree of freedom of 1.5."""
 
 TESTABLE_SIGMAS = 3.0
-"""An effect whose largest plausible size would show by less than this cannot be tested here. Chosen: what would show
-by less than three standard deviations would not pass FALSE_ALARM_LEVEL_FIRST_ROUND."""
+"""Significance that the largest plausible size of an effect must reach for the effect to be testable. Chosen: below
+three standard deviations it would not pass FALSE_ALARM_LEVEL_FIRST_ROUND."""
 
 ONE_SIDED_95 = 1.645
 """Derived: quantile of the normal distribution."""
@@ -55,7 +63,7 @@ ONE_SIDED_95 = 1.645
 
 @dataclass(frozen=True)
 class MisfitTests:
-    """What a fit leaves, held against every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
+    """Test statistics of one fit for every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
 
     fit: Fit
     effects: tuple[Effect, ...]
@@ -67,34 +75,34 @@ class MisfitTests:
 
     @cached_property
     def one_sided_z(self) -> Floats:
-        """The z of every shape where its size can have that sign, 0 where it cannot, always positive.
+        """Score of every shape in standard errors (z) where its sign is allowed; 0 where it is not.
 
-        As a quantile of the normal distribution: by the noise model, or, where that is less, by the scatter of single
-        trials, which has Student's t for few of them.
+        The smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to
+        the normal quantile of the same tail probability.
         """
         from scipy.stats import norm, t
 
         size, signs = self.scores.size, np.array(self.signs)
-        one_way = np.where(signs == 0, np.abs(size), np.maximum(size * signs, 0.0))
+        allowed_size = np.where(signs == 0, np.abs(size), np.maximum(size * signs, 0.0))
         plain, robust = self.scores.plain_sigma, self.scores.robust_sigma
-        z = one_way / plain
+        z = allowed_size / plain
         with np.errstate(divide="ignore", invalid="ignore"):
-            by_scatter = np.where(robust > 0, one_way / robust, np.inf)
-        tail = t.logsf(np.minimum(by_scatter, 1e6), max(self.scores.degrees, 3.0))
-        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(tail, -700.0)))))
+            robust_t = np.where(robust > 0, allowed_size / robust, np.inf)
+        log_tail = t.logsf(np.minimum(robust_t, 1e6), max(self.scores.degrees, 3.0))
+        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(log_tail, -700.0)))))
 
     @property
     def signs(self) -> list[int]:
-        """1 or −1 where physics fixes the sign of a shape's size."""
+        """Sign of each shape's size: 1 or −1 where physics fixes it, else 0."""
         return [shape.size.sign if shape.effect.parameters else 1 for shape in self.sensitivities.shapes]
 
     @cached_property
     def family(self) -> FamilyTest:
-        """The z that each candidate has to exceed, so that any of them does by chance with probability `level`."""
+        """Thresholds of z for the candidates, such that any exceeds its own by chance with probability `level`."""
         return family_test(self.scores.cosines, self.signs, self.sensitivities.effects, self.level)
 
     def largest_excess(self, family: FamilyTest) -> float:
-        """By how much the candidate that stands out most exceeds its threshold; below 0 where none does.
+        """Largest excess of a candidate's z over its threshold; negative where no candidate exceeds its own.
 
         Parameters
         ----------
@@ -104,32 +112,32 @@ class MisfitTests:
         -------
         float
         """
-        limits = np.array([family.threshold(name) for name in self.sensitivities.effects])
-        return float(np.max(self.one_sided_z - limits, initial=-math.inf))
+        thresholds = np.array([family.threshold(name) for name in self.sensitivities.effects])
+        return float(np.max(self.one_sided_z - thresholds, initial=-math.inf))
 
     @property
     def rejects_model(self) -> bool:
-        """Whether anything is missing, known or not."""
+        """Whether any test rejects the model: something is missing, in the catalogue or not."""
         return bool(self.exceeds_slow_errors or self.omnibus_rejects or self.largest_excess(self.family) > 0)
 
     @property
     def omnibus_rejects(self) -> bool:
-        """Whether what is left has a shape, is alike in replicates, or is louder in motion than at rest."""
+        """Whether a test that names no candidate rejects: probe forces, or trial effects and noise."""
         return self.probes_reject or self.trial_effect_p < 0.1 * self.level
 
     @cached_property
     def trial_effect_p(self) -> float:
-        """Chance of what trials take upon themselves, or lets pass for noise."""
+        """p-value of the trial effects: conditions differ more than replicates, or noise is larger in motion."""
         return min(between_conditions_p(self.fit), noise_in_motion_p(self.fit))
 
     @property
     def needs_search(self) -> bool:
-        """Whether a fit that passes is worth a search all the same: it may have bent everything until it fits."""
+        """Whether to search even where every test passes: trial effects and noise may have absorbed the misfit."""
         return self.fit.chi2_per_dof > SEARCH_CHI2_PER_DOF or self.trial_effect_p < SEARCH_P_VALUE
 
     @cached_property
     def rejects_at_first_round_level(self) -> bool:
-        """Whether any candidate stands out as far as would say of a first model that something is missing."""
+        """Whether any candidate exceeds its threshold at the level of the first round."""
         return (
             self.largest_excess(
                 family_test(self.scores.cosines, self.signs, self.sensitivities.effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
@@ -139,46 +147,46 @@ class MisfitTests:
 
     @property
     def probes_reject(self) -> bool:
-        """Whether what is left has a shape that some smooth force would give it."""
+        """Whether a smooth force would improve the fit: all probes together, or the most significant one."""
         all_probes = self.structure.p < 0.1 * self.level
         return all_probes or self.structure.smallest_probe_p < min(SINGLE_PROBE_LEVEL, self.level)
 
     @property
     def far_off(self) -> bool:
-        """Whether the fit misses more than any noise could."""
+        """Whether the misfit exceeds any noise."""
         return self.fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF
 
     @property
     def exceeds_slow_errors(self) -> bool:
-        """Whether it misses more than noise, and more of the growth than a tracker's slow errors amount to."""
-        return self.far_off and missed_fraction(self.fit.predictor, self.fit.solution) > self._allowed
+        """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
+        return self.far_off and missed_fraction(self.fit.predictor, self.fit.solution) > self._slow_error_fraction
 
     @property
-    def _allowed(self) -> float:
-        """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
+    def _slow_error_fraction(self) -> float:
+        """Fraction of growth that slow errors may explain; less where neither tracks nor a gauge have such errors."""
         data = self.fit.predictor.data
-        smooth = float(
+        systematic = float(
             np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
         )
-        slow = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
-        return max(MISSED_FRACTION if slow else MISSED_FRACTION_WITHOUT_SLOW_ERRORS, smooth)
+        has_slow_errors = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
+        return max(MISSED_FRACTION if has_slow_errors else MISSED_FRACTION_WITHOUT_SLOW_ERRORS, systematic)
 
     @property
     def poorly_fitted(self) -> bool:
-        """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
+        """Whether the model misses a visible part of the growth: linear predictions from this fit are meaningless."""
         return is_poor_fit(self.fit.predictor, self.fit.solution)
 
     @cached_property
     def predicted_gains(self) -> tuple[Floats, Floats]:
-        """Fall of −2 ln L that each shape promises, and the size it is promised for."""
+        """Predicted fall of −2 ln L with each shape, and the size it is predicted at (linear)."""
         if self.far_off:
             return linear_gains(self.fit, self.products, track_correlation(self.fit.predictor.data))
         signs, size = np.array(self.signs), self.scores.size
-        right = (signs == 0) | (size * signs > 0)
-        return np.where(right, self.scores.score * size, 0.0), size
+        sign_allowed = (signs == 0) | (size * signs > 0)
+        return np.where(sign_allowed, self.scores.score * size, 0.0), size
 
     def ranked_shapes(self, name: str) -> list[int]:
-        """Places of an effect's shapes, the most promising first.
+        """Indices of an effect's shapes, the largest predicted gain first.
 
         Parameters
         ----------
@@ -190,11 +198,14 @@ class MisfitTests:
         list of int
         """
         gains = self.predicted_gains[0]
-        places = [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
-        return sorted(places, key=lambda i: -gains[i])
+        return sorted(self._shapes_of(name), key=lambda i: -gains[i])
+
+    def _shapes_of(self, name: str) -> list[int]:
+        """Indices of an effect's shapes, in their order."""
+        return [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
 
     def predicted_gain(self, name: str) -> float:
-        """The largest fall of −2 ln L that any shape of an effect promises.
+        """Largest fall of −2 ln L that is predicted for any shape of an effect; 0 without shapes.
 
         Parameters
         ----------
@@ -205,11 +216,11 @@ class MisfitTests:
         -------
         float
         """
-        places = self.ranked_shapes(name)
-        return float(self.predicted_gains[0][places[0]]) if places else 0.0
+        indices = self.ranked_shapes(name)
+        return float(self.predicted_gains[0][indices[0]]) if indices else 0.0
 
     def best_z(self, name: str) -> tuple[float, int]:
-        """Largest z of an effect and the place of its shape; 0 and −1 where it is silent.
+        """Largest z of an effect and the index of its shape; 0 and −1 where no trial responds to it.
 
         Parameters
         ----------
@@ -219,13 +230,13 @@ class MisfitTests:
         Returns
         -------
         z : float
-        place : int
+        index : int
         """
-        places = [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
-        if not places:
+        indices = self._shapes_of(name)
+        if not indices:
             return 0.0, -1
-        place = max(places, key=lambda i: self.one_sided_z[i])
-        return float(self.one_sided_z[place]), place
+        index = max(indices, key=lambda i: self.one_sided_z[i])
+        return float(self.one_sided_z[index]), index
 
     def cosine(self, first: str, second: str) -> float:
         """Largest |cosine| between shapes of two effects.
@@ -239,12 +250,11 @@ class MisfitTests:
         -------
         float
         """
-        a = [i for i, effect in enumerate(self.sensitivities.effects) if effect == first]
-        b = [i for i, effect in enumerate(self.sensitivities.effects) if effect == second]
-        return float(np.max(np.abs(self.scores.cosines[np.ix_(a, b)]), initial=0.0))
+        pairs = np.ix_(self._shapes_of(first), self._shapes_of(second))
+        return float(np.max(np.abs(self.scores.cosines[pairs]), initial=0.0))
 
     def upper_limits(self, effect: Effect) -> tuple[dict[str, float], bool]:
-        """The largest sizes that could hide, one-sided 95 %, and whether a plausible one would show at all.
+        """Upper limit (one-sided 95 %) of an undetected size, and whether a plausible size would be detected at all.
 
         Parameters
         ----------
@@ -254,19 +264,19 @@ class MisfitTests:
         Returns
         -------
         limits : dict of float
-            By `effect.parameter`, SI; blank where the effect is silent.
+            By `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable.
         testable : bool
         """
-        places = [i for i, name in enumerate(self.sensitivities.effects) if name == effect.name]
-        if not places or not effect.parameters:
-            return {}, bool(places)
-        # The shape that shows least: whatever form the effect has, it is no larger than this.
-        place = max(places, key=lambda i: self.scores.sigma[i])
-        size, sigma = float(self.scores.size[place]), float(self.scores.sigma[place])
-        parameter = self.sensitivities.shapes[place].size
-        top = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
+        indices = self._shapes_of(effect.name)
+        if not indices or not effect.parameters:
+            return {}, bool(indices)
+        # The shape with the largest standard error gives a limit that holds whatever form the effect has.
+        index = max(indices, key=lambda i: self.scores.sigma[i])
+        size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
+        parameter = self.sensitivities.shapes[index].size
+        largest_plausible = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
         key = f"{effect.name}.{parameter.name}"
-        if not math.isfinite(sigma) or top < TESTABLE_SIGMAS * self.scores.sigma[places].min():
+        if not math.isfinite(sigma) or largest_plausible < TESTABLE_SIGMAS * self.scores.sigma[indices].min():
             return {}, False
         if parameter.sign:
             return {
@@ -274,27 +284,27 @@ class MisfitTests:
             }, True
         return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
 
-    def predicted_size(self, effect: Effect, place: int) -> tuple[Number, ...]:
-        """The size that the sensitivities predict, with its error; none where the model is too far off for that.
+    def predicted_size(self, effect: Effect, index: int) -> tuple[Number, ...]:
+        """One-step estimate of an effect's size with its standard error; empty where the model is too far off.
 
         Parameters
         ----------
-        effect : of the shape.
-        place : of one of its shapes, negative where it has none.
+        effect : the effect of the shape.
+        index : index of one of its shapes, negative where it has none.
 
         Returns
         -------
         tuple of Number
         """
-        if place < 0 or not effect.parameters or self.poorly_fitted:
+        if index < 0 or not effect.parameters or self.poorly_fitted:
             return ()
-        size, sigma = float(self.scores.size[place]), float(self.scores.sigma[place])
-        parameter = self.sensitivities.shapes[place].size
+        size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
+        parameter = self.sensitivities.shapes[index].size
         value = parameter.zero + size
         return (
             Number(
                 key=f"{effect.name}.{parameter.name}",
-                vine=self.sensitivities.shapes[place].group,
+                vine=self.sensitivities.shapes[index].group,
                 symbol=parameter.symbol,
                 unit=parameter.unit,
                 value=value,
@@ -310,17 +320,17 @@ class MisfitTests:
 
 
 def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: bool = False) -> MisfitTests:
-    """Question a fit about these effects.
+    """Test a fit for these candidates and for misfit that none of them describes.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fitted model.
     effects : sequence of Effect
-        Candidates; those of the model are passed over.
+        Candidates; those already in the model are skipped.
     level : float
-        Chance of a false alarm of all tests.
+        Family-wise false-alarm probability of the candidates.
     film : bool
-        Whether the film of each vine may weigh a little other than stated.
+        Whether the film mass of each vine is a nuisance parameter, free within its usual error.
 
     Returns
     -------

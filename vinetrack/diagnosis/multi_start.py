@@ -1,8 +1,8 @@
-"""Fits of hypotheses: a quick climb on a part of the trials, then a fit to all of them.
+"""Fits of hypotheses from several starts: a short fit to a subset of the trials, then a full fit to all of them.
 
-A climb takes one trial of every condition, spreads as a batch of vines shows them, and noise as correlated as in the
-tracks: so it is guided by what a hypothesis misses. Left free, correlation and spreads would take that in and hold the
-fit where it is.
+A subset fit takes one trial of every condition. Its between-trial standard deviations are those of a typical batch of
+vines, and its noise is as correlated as the noise of the tracks. If they were free they would absorb the misfit and
+stall the optimiser.
 """
 
 from __future__ import annotations
@@ -31,49 +31,49 @@ from vinetrack.inference.starts import align, one_of_each_condition
 from vinetrack.inference.trace_errors import as_recorded
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
-"""Effects to add and values to begin from."""
+"""Effects to add, and parameter values to start from."""
 
 SUBSET_SPREADS = (0.01, 0.03)
-"""Between-trial standard deviations of pressure and ln B, and iterations, of a subset fit. Chosen as FIRST_SPREADS of
-the optimiser; for time."""
+"""Between-trial standard deviations of pressure and ln B in a subset fit. Chosen as FIRST_SPREADS of the optimiser."""
 
 SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
-"""Iterations of a subset fit from each start, and of the best of them each further time. Chosen for time: a start that
+"""Iterations of a subset fit from each start, and of the best one each further time. Chosen for time: a start that
 leads anywhere has shown it after four steps."""
 
 MAX_SUBSET_TRIALS = 14
-"""Trials of a climb: one of every condition, no more than this. Chosen for time."""
+"""Trials of a subset fit: one of every condition, at most this many. Chosen for time."""
 
 FULL_FIT_FIRST_ITERATIONS, FULL_FIT_MAX_ITERATIONS, ABANDONED_BEHIND = 14, 40, 50.0
-"""Iterations of a full fit at first and in all, and how far behind the best in −2 ln L it is given up. Chosen for
-time."""
+"""Iterations of a full fit at first and in all, and the difference in ln L to the best from which a fit is not
+continued. Chosen for time."""
 
 MIN_SHARE_OF_BEST_GAIN = 0.3
-"""Part of what the best hypothesis explains that another must explain for larger sets to be built on it. So a fit far
-off that cannot come to it need not be led to its end. Chosen for time: effects that share a misfit evenly explain a
-third of it each; at half weaker ones are built on too (time), at twice two that explain half each may not be."""
+"""Share of the best hypothesis's gain from which larger sets are built on a hypothesis. A fit that is far off and
+cannot reach it need not be completed. Chosen for time: effects that share a misfit evenly explain a third of it each;
+at half weaker ones are built on too (time), at twice two that explain half each may not be."""
 
 MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
-"""By how much −2 ln L of a climb must end lower for its start to be worth a fit. Chosen: unsettled iterations differ
-by as much."""
+"""Fall of −2 ln L of a subset fit from which its start is worth a full fit. Chosen: iterations that have not settled
+differ by as much."""
 
 HOPELESS_RANGE_FACTOR = 6.0
-"""Times its plausible range. Chosen: twice what CREDIBLE_RANGE_FACTOR refuses."""
+"""Multiple of its plausible range beyond which a size of a subset fit is hopeless. Chosen: twice
+CREDIBLE_RANGE_FACTOR."""
 
 START_EXPONENTS = (0.2, 0.4, 0.7)
-"""Exponents from which a model is begun again. Chosen: about the published 0.37, each within a factor of two."""
+"""Exponents from which a model is started. Chosen: about the published 0.37, each within a factor of two."""
 
 HOPELESS_DEVIANCE_PER_POINT = 0.5
-"""A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far. Chosen
-for time."""
+"""−2 ln L per point by which a subset fit may stay behind the best so far after its first iterations and still be
+continued. Chosen for time."""
 
 
 @dataclass(frozen=True)
 class SubsetFit:
-    """Where a climb ended: −2 ln L on its trials, what to begin a full fit from, and whether it is far off.
+    """End of a subset fit, from which a full fit starts: −2 ln L on its trials, values, and whether it is far off.
 
-    `yields_Pa` are yield pressures by the name of their number: beside a friction at rest, those that were found
-    without it may hold a vine back altogether.
+    `yields_Pa` are yield pressures by name of number: with a friction at rest added, those fitted without it may stop a
+    vine altogether. A start that no subset fit was made for has the deviance NaN.
     """
 
     effects: tuple[Effect, ...]
@@ -89,7 +89,7 @@ class SubsetFit:
 
     @property
     def far_beyond_plausible(self) -> bool:
-        """Whether it ended at sizes so far beyond what is plausible that a full fit will not bring it back."""
+        """Whether a size is so far beyond its plausible range that a full fit will not bring it back."""
         return any(
             not is_plausible(parameter, value, 0.0, widened=HOPELESS_RANGE_FACTOR)
             for effect in self.effects
@@ -99,11 +99,11 @@ class SubsetFit:
 
 
 class SubsetFitter:
-    """Climbs from one fit, all on the same trials, so that their deviances can be held against each other."""
+    """Subset fits of hypotheses about one fit, all on the same trials, so that their deviances can be compared."""
 
     def __init__(self, fit: Fit) -> None:
         self.fit = fit
-        self.chosen = _one_of_each(fit.predictor.data)
+        self.chosen = _subset(fit.predictor.data)
         self.data = [as_recorded(fit.predictor.data[i]) for i in self.chosen]
         self.correlation = track_correlation(self.data)
 
@@ -116,20 +116,20 @@ class SubsetFitter:
         align_first: bool = True,
         search: bool = False,
     ) -> SubsetFit | None:
-        """Fit with these effects added from `start`; None where the start cannot be followed.
+        """Fit the model with these effects added; None where the fit fails.
 
         Parameters
         ----------
         effects : sequence of Effect
             Added to the model.
         start : mapping
-            Values of parameters, SI.
+            Values of parameters to start from, SI.
         iterations : int
-            Steps at most.
+            Maximum number of iterations.
         align_first : bool
-            Whether releases are looked for first.
+            Whether releases are searched first.
         search : bool
-            Whether it is one of many, see `optimiser.solve`.
+            Whether it is one of many fits, see `optimiser.solve`.
 
         Returns
         -------
@@ -140,14 +140,14 @@ class SubsetFitter:
         predictor = Predictor(layout, self.data, self.fit.predictor.host)
         trial_effects = self.fit.solution.state.trial_effects[self.chosen].copy()
         trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-        held = FixedTerms(spread=SUBSET_SPREADS, correlation=self.correlation)
+        fixed = FixedTerms(spread=SUBSET_SPREADS, correlation=self.correlation)
         try:
             theta = layout.start
             if align_first:
                 trial_effects, _ = align(self.data, predictor, theta, trial_effects)
             problem = make_problem(predictor, trial_effects)
             state = first_state(self.data, theta, trial_effects)
-            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations, search=search)
+            solution = solve(predictor, problem, state, fixed, warm=True, most_iterations=iterations, search=search)
             part = marginal(solution.cross_products, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
@@ -159,21 +159,21 @@ class SubsetFitter:
 
     @property
     def n_points(self) -> int:
-        """How many points the trials of a climb have."""
+        """Number of points of the subset."""
         return sum(trial_data.time_s.size for trial_data in self.data)
 
     def null_deviance(self) -> float:
-        """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
-        climb = self.fit_hypothesis((), {}, iterations=SUBSET_FIRST_ITERATIONS, align_first=False)
-        return math.inf if climb is None else climb.deviance
+        """−2 ln L of the model without further effects, after a few iterations; infinite where the fit fails."""
+        null_fit = self.fit_hypothesis((), {}, iterations=SUBSET_FIRST_ITERATIONS, align_first=False)
+        return math.inf if null_fit is None else null_fit.deviance
 
     def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
-        held = self.fit.options["fixed"]
-        return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
+        fixed = self.fit.options["fixed"]
+        return tuple(name for name in fixed if name in names or any(name == full.split(".")[1] for full in names))
 
 
 def _values(layout: ParameterMap, theta: Floats) -> tuple[dict[str, Value], dict[str, float]]:
-    """Parameters by name, those of single vines as mappings, and yield pressures, Pa, by the name of their number."""
+    """Parameter values by name, those of single vines as mappings; and yield pressures, Pa, by name of number."""
     numbers = list(zip(layout.free, layout.values(theta).tolist(), strict=True))
     return (
         values_by_key((number.key, number.vine, value) for number, value in numbers if number.key != YIELD_PRESSURE),
@@ -181,24 +181,28 @@ def _values(layout: ParameterMap, theta: Floats) -> tuple[dict[str, Value], dict
     )
 
 
-def _one_of_each(data: Sequence[FitTrial]) -> list[int]:
-    """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
-    places = one_of_each_condition(data)
-    if len(places) <= MAX_SUBSET_TRIALS:
-        return places
-    vines = {data[i].trial.vine for i in places}
-    take = [places[k] for k in np.unique(np.linspace(0, len(places) - 1, MAX_SUBSET_TRIALS).round().astype(int))]
-    lacking = vines - {data[i].trial.vine for i in take}
-    return sorted({*take, *(next(i for i in places if data[i].trial.vine == vine) for vine in lacking)})
+def _subset(data: Sequence[FitTrial]) -> list[int]:
+    """Indices of one trial of every condition, that with the most points; evenly thinned where there are too many.
+
+    Every vine keeps at least one trial.
+    """
+    candidates = one_of_each_condition(data)
+    if len(candidates) <= MAX_SUBSET_TRIALS:
+        return candidates
+    vines = {data[i].trial.vine for i in candidates}
+    evenly = np.unique(np.linspace(0, len(candidates) - 1, MAX_SUBSET_TRIALS).round().astype(int))
+    chosen = [candidates[k] for k in evenly]
+    missing = vines - {data[i].trial.vine for i in chosen}
+    return sorted({*chosen, *(next(i for i in candidates if data[i].trial.vine == vine) for vine in missing)})
 
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
-    """Values of an effect's parameters to begin from: the predicted size brought inside what is possible.
+    """Values of an effect's parameters to start from: the predicted size, limited to what is possible.
 
     Parameters
     ----------
     shape
-        Form in which the effect is tried.
+        Shape of the effect.
     size : float, SI
         Predicted size, from the parameter's zero.
 
@@ -215,106 +219,103 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
     if shape.whole:
         size = shape.step
     elif parameter.plausible is not None:
-        # A prediction far beyond what is plausible is a straight line drawn too far.
+        # A prediction far beyond the plausible range is an extrapolation of the linear model.
         reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
         size = float(np.clip(size, -reach, reach))
     if parameter.sign * size < 0 or size == 0:
         size = parameter.sign * abs(shape.step) or shape.step
-    begun = float(np.clip(parameter.zero + size, low, high))
-    of_groups = dict.fromkeys(shape.other_groups, parameter.zero) | {shape.group: begun}
-    values: tuple[Value, ...] = (of_groups if shape.group else begun, *shape.other_values)
-    return {f"{effect.name}.{known.name}": value for known, value in zip(effect.parameters, values, strict=True)}
+    start = float(np.clip(parameter.zero + size, low, high))
+    by_group = dict.fromkeys(shape.other_groups, parameter.zero) | {shape.group: start}
+    values: tuple[Value, ...] = (by_group if shape.group else start, *shape.other_values)
+    return {f"{effect.name}.{p.name}": value for p, value in zip(effect.parameters, values, strict=True)}
 
 
 def best_subset_fit(
-    slope: SubsetFitter, starts: Sequence[Start], goal: float, *, search: bool = False
+    fitter: SubsetFitter, starts: Sequence[Start], goal: float, *, search: bool = False
 ) -> SubsetFit | None:
-    """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
-
-    One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
+    """Fit one hypothesis to the subset from several starts: a few iterations from each, then the best one on.
 
     Parameters
     ----------
-    slope
-        Fits to one trial of every condition.
+    fitter
+        Makes the subset fits.
     starts : sequence of Start
         Of one hypothesis.
     goal : float
-        Best deviance of any hypothesis so far.
+        Best deviance of any hypothesis so far; a hypothesis that is far above it is not continued.
     search : bool
-        Whether the hypothesis is one of many: far off, it is not followed where it only creeps.
+        Whether the hypothesis is one of many: if it is far off, it is not continued where it improves slowly.
 
     Returns
     -------
     SubsetFit or None
+        None where the fit fails from every start.
     """
-    first = [
+    first_fits = [
         subset_fit
         for effects, start in starts
-        if (subset_fit := slope.fit_hypothesis(effects, start, iterations=SUBSET_FIRST_ITERATIONS)) is not None
+        if (subset_fit := fitter.fit_hypothesis(effects, start, iterations=SUBSET_FIRST_ITERATIONS)) is not None
     ]
-    if not first:
+    if not first_fits:
         return None
-    best = min(first, key=lambda subset_fit: subset_fit.deviance)
-    if best.deviance - goal > HOPELESS_DEVIANCE_PER_POINT * slope.n_points:
+    best = min(first_fits, key=lambda subset_fit: subset_fit.deviance)
+    if best.deviance - goal > HOPELESS_DEVIANCE_PER_POINT * fitter.n_points:
         return best
     for _ in range(3):
-        again = slope.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
-        if again is None:
+        further = fitter.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
+        if further is None:
             break
-        least = CREEPING * slope.n_points if search and again.far_off else 0.1
-        creeps = again.deviance > best.deviance - least
-        best = min((best, again), key=lambda subset_fit: subset_fit.deviance)
-        if creeps:
+        required_fall = CREEPING * fitter.n_points if search and further.far_off else 0.1
+        improves_slowly = further.deviance > best.deviance - required_fall
+        best = min((best, further), key=lambda subset_fit: subset_fit.deviance)
+        if improves_slowly:
             break
     return best
 
 
 def full_fit(
-    before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False, led: bool = True
+    before: Fit, start: SubsetFit, best: float = -math.inf, *, reset: bool = False, rescue: bool = True
 ) -> Fit | None:
-    """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
-
-    `afresh` begins with nothing of what the fit had bent to do without it. One whose ln L is still far below the `best`
-    after the first iterations is left unsettled.
+    """Fit a hypothesis to all trials from where its subset fit ended; None where the fit fails.
 
     Parameters
     ----------
     before
         The fit without the effects.
-    climb
+    start
         Where the subset fit ended.
     best : float
-        Largest ln L of any hypothesis so far.
-    afresh : bool
-        Begin with releases, deviations and noise as the tracks show them.
-    led : bool
-        Whether a fit that ends far off is begun again, see `refit`.
+        Largest ln L of any hypothesis so far. A fit that is far below it after the first iterations is not continued.
+    reset : bool
+        Start with releases, deviations and noise as the tracks show them, not as `before` has adapted them.
+    rescue : bool
+        Whether a fit that ends far off is started again, see `refit`.
 
     Returns
     -------
     Fit or None
     """
-    model = before.model.with_effects(climb.effects)
+    model = before.model.with_effects(start.effects)
     goal = (
-        before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood) if climb.effects else -math.inf
+        before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood) if start.effects else -math.inf
     )
     try:
         fit = refit(
             before,
             model,
-            start=climb.values,
-            yields_Pa=climb.yields_Pa,
+            start=start.values,
+            yields_Pa=start.yields_Pa,
             most_iterations=FULL_FIT_FIRST_ITERATIONS,
             thorough=False,
-            afresh=afresh,
-            led=led,
+            afresh=reset,
+            led=rescue,
             goal=goal,
         )
-        if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
-            # Noise that wanders as it likes makes anything likely.
+        poor = is_poor_fit(fit.predictor, fit.solution)
+        if fit.noise_correlation > SLOW_NOISE and poor:
+            # Strongly correlated noise absorbs any misfit, and the likelihood says nothing.
             return None
-        if fit.converged or fit.log_likelihood < best - ABANDONED_BEHIND or is_poor_fit(fit.predictor, fit.solution):
+        if fit.converged or fit.log_likelihood < best - ABANDONED_BEHIND or poor:
             return fit
         return refit(fit, most_iterations=FULL_FIT_MAX_ITERATIONS, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
@@ -322,7 +323,7 @@ def full_fit(
 
 
 def restart_exponents(fit: Fit) -> Fit:
-    """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself.
+    """Refit a model from several exponents of the damping law; return the better of this and the given fit.
 
     Parameters
     ----------
@@ -336,12 +337,12 @@ def restart_exponents(fit: Fit) -> Fit:
     starts = exponent_starts(fit)
     if len(starts) == 1:
         return fit
-    slope = SubsetFitter(fit)
-    return _from(slope, starts, slope.null_deviance(), MIN_DEVIANCE_FALL_PER_POINT * slope.n_points)
+    fitter = SubsetFitter(fit)
+    return _restart(fitter, starts, fitter.null_deviance(), MIN_DEVIANCE_FALL_PER_POINT * fitter.n_points)
 
 
 def exponent_starts(fit: Fit) -> list[Start]:
-    """Starts from several exponents n of the damping law; the fit's own numbers alone where n is not free.
+    """Starts from several exponents n of the damping law; the fit's own values alone where n is not free.
 
     Parameters
     ----------
@@ -357,41 +358,46 @@ def exponent_starts(fit: Fit) -> list[Start]:
     return [((), {EXPONENT: n}) for n in START_EXPONENTS]
 
 
-def restart_without(fit: Fit, other: Fit) -> Fit:
-    """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit.
+def restart_without(fit: Fit, larger: Fit) -> Fit:
+    """Refit a model from the values of a larger model's fit; return the better of this and the given fit.
 
-    It is fitted where a climb from there makes up for half of what the other fit is better by.
+    The refit is made where a subset fit from there recovers half of the larger model's advantage.
 
     Parameters
     ----------
     fit
-        The fit without the effect.
-    other
-        A fit whose model holds that of `fit`.
+        The fit without the effects.
+    larger
+        A fit whose model contains that of `fit`.
 
     Returns
     -------
     Fit
     """
-    slope, names = SubsetFitter(fit), set(fit.model.parameter_names)
-    added = [effect for effect in other.model if effect.name not in fit.model]
-    here, there = slope.null_deviance(), slope.fit_hypothesis(added, other.model.values, iterations=1)
-    lower = math.inf if there is None else max(MIN_DEVIANCE_FALL, 0.5 * (here - there.deviance))
-    return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], here, lower)
+    fitter, names = SubsetFitter(fit), set(fit.model.parameter_names)
+    added = [effect for effect in larger.model if effect.name not in fit.model]
+    null_deviance = fitter.null_deviance()
+    with_effects = fitter.fit_hypothesis(added, larger.model.values, iterations=1)
+    if with_effects is None:
+        required_fall = math.inf
+    else:
+        required_fall = max(MIN_DEVIANCE_FALL, 0.5 * (null_deviance - with_effects.deviance))
+    start = {key: value for key, value in larger.model.values.items() if key in names}
+    return _restart(fitter, [((), start)], null_deviance, required_fall)
 
 
-def _from(slope: SubsetFitter, starts: Sequence[Start], here: float, lower: float) -> Fit:
-    """The model of a fit begun elsewhere, where a climb from there ends lower than `here` by this."""
-    fit = slope.fit
-    climb = best_subset_fit(slope, starts, here)
-    if climb is None or climb.deviance > here - lower:
+def _restart(fitter: SubsetFitter, starts: Sequence[Start], null_deviance: float, required_fall: float) -> Fit:
+    """Refit a model from other starts if the deviance of its subset fit falls enough; return the better fit."""
+    fit = fitter.fit
+    subset_fit = best_subset_fit(fitter, starts, null_deviance)
+    if subset_fit is None or subset_fit.deviance > null_deviance - required_fall:
         return fit
-    other = full_fit(fit, climb, fit.log_likelihood)
-    return other if other is not None and other.log_likelihood > fit.log_likelihood else fit
+    refitted = full_fit(fit, subset_fit, fit.log_likelihood)
+    return refitted if refitted is not None and refitted.log_likelihood > fit.log_likelihood else fit
 
 
 def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
-    """Starts of one effect from its shapes and the sizes predicted for them.
+    """Starts of one effect from its shapes at their predicted sizes, without duplicates.
 
     Parameters
     ----------
@@ -414,7 +420,7 @@ def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Star
 
 
 def sheet_slip_starts(effect: Effect) -> list[Start]:
-    """Starts of one effect from what common slips in the sheet leave.
+    """Starts of one effect from the sizes that common slips in the sheet would produce.
 
     Parameters
     ----------

@@ -1,7 +1,9 @@
-"""From a fit to verdicts: is something missing, which effect, is anything left once it is there.
+"""Forward selection of missing effects: from a fitted model to the verdict of every round.
 
-A verdict is never more certain than the data. One effect alone must mend everything; if something is left, several
-together must, up to five; if something is left then, the truth is not in the catalogue.
+Misfit tests decide whether anything is missing. If so, candidates are fitted, compared by likelihood ratios, and those
+that cannot be excluded form the answer set. A hypothesis counts only if the model passes every test once the hypothesis
+is added: first single effects are tried, then sets of two to five. If no set passes either, the verdict is
+`unexplained`.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from vinetrack.diagnosis.adequate_hypotheses import MISFIT_REMAINS, adequate_hypotheses, has_credible_sizes
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import confounders_of
@@ -22,7 +25,6 @@ from vinetrack.diagnosis.likelihood_ratio import (
     best_of,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.mending import has_credible_sizes, mending
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
@@ -39,26 +41,27 @@ from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
 MAX_RESTARTS = 2
-"""Times that all is asked again of a better minimum. Chosen as a safeguard."""
+"""Times that the selection is repeated from a better minimum of the model. Chosen as a safeguard."""
 
 CLEAR_SCORE_EXCESS = 1.0
-"""Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
+"""Standard deviations by which a score must exceed its threshold to count although no refit confirms it. Chosen."""
 
 STALLED_CHI2_SHARE = 0.7
-"""Part of χ² that a third or further effect may leave of a fit that stays far off, or no more are added. Chosen for
-time: on what no catalogue holds steps go on for ever; at half of it four equal effects would not be found, at twice no
-step is refused."""
+"""If the model is still far off, a third or further effect must reduce χ² to less than this share, or no more effects
+are added. Chosen for time: where the truth is not in the catalogue, steps would go on forever; at half of it four equal
+effects would not be found, at twice no step is refused."""
 
 PARTIAL_SHARE = 0.5
-"""Part of the excess of χ² per degree of freedom over 1 that steps must take away for `unexplained` to show them as
-partial. Chosen: what explains less than half says little of where to look; at half of it a quarter is enough,
-at twice nothing is."""
+"""Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them.
+Chosen: what explains less than half says little of where to look; at half of it a quarter is enough, at twice nothing
+is shown."""
 
 LEADING_TERMS, LEADING_TERM_SHARE = ("lens", "perspective"), 0.95
-"""Effects that are the first term of a series in the place in the picture, and the part of what a set gains that such a
-term gains alone where the rest of the set may stand for the next term. Derived: at the edge of the picture the fifth
-order of a lens is up to a fifth of its third, 4 % of the squares. At half, physics that is a few times weaker than a
-lens waits until that is put right; at twice (0.975) a strong lens is taken for a lens and physics."""
+"""Effects that are the leading term of a series in the image position, and the share of a set's gain that such a term
+must gain alone for the rest of the set to count as possibly its next term. Derived: at the edge of the picture the
+fifth order of a lens is up to a fifth of its third, 4 % of the squares. At half, physics that is a few times weaker
+than a lens is named only after the lens was corrected; at twice (0.975) a strong lens is taken for a lens and
+physics."""
 
 NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)
 """Kinds of hypotheses that are no physics."""
@@ -66,12 +69,13 @@ NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One round before it is put in words.
+    """One round of the selection: a model, its tests, and the hypotheses compared.
 
-    `kept` are the hypotheses in the answer set (of sets of effects: the rest of them, given what was added before),
-    `tried` all that were fitted, `aside` what was set aside and why, by name; `confounded` are sizes that may hold
-    another effect. `unstated` are differences between trials that an adequate model stands beside, by an order that the
-    sheet does not state. `partial` are steps, each of one effect more, that mend most of what nothing mends in full.
+    `answer_set` holds the hypotheses that cannot be excluded (of sets of effects, what they add to the effects of
+    earlier rounds), `answer_names` their names; `fitted` every hypothesis fitted; `rejected` labels and reasons.
+    `confounded` lists other effects that the sizes may include. `unstated_differences` are differences between trials
+    by an order that the sheet does not state, reported beside an adequate model. `partial` are the steps, one effect
+    each, that remove most of a misfit that no hypothesis removes entirely.
     """
 
     verdict: str
@@ -87,314 +91,333 @@ class SelectionStep:
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
 
 
-def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
-    """The findings of all rounds, the first about the fit itself.
+def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, restarts: int = 0) -> list[SelectionStep]:
+    """Select the effects that a model lacks.
 
-    A fit may have ended in a local minimum, from which any effect seems to help. So one that is far off is begun again
-    elsewhere before it is questioned, and again from where the best hypothesis ended: if it then does better without
-    the effect, all is asked again of that, twice at most.
+    At a local minimum any effect seems to help. A fit that is far off is therefore refitted from other starts first,
+    and the model is also refitted from where the best hypothesis ended. If it then fits better without the effect, the
+    selection is repeated from there, twice at most.
 
     Parameters
     ----------
     fit
-        The fit that is questioned.
+        The fit of the model.
     effects : sequence of Effect
         Candidates.
     report : callable
         Called with a sentence at each step.
-    again : int
-        How often it has been begun again.
+    restarts : int
+        How often the selection was repeated already.
 
     Returns
     -------
     list of SelectionStep
+        One a round; the first is about the model itself.
     """
-    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and not again:
+    if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and not restarts:
         report("fitting the model from other starts")
         fit = restart_exponents(fit)
-    report("questioning the model")
-    questions = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
-    among = differences(fit)
-    apart = significant(among, FALSE_ALARM_LEVEL_FIRST_ROUND)
-    differ = any(difference.stated for difference in apart)
-    if not questions.rejects_model and not questions.needs_search and not differ:
-        return [SelectionStep(ADEQUATE, questions, unstated_differences=tuple(between_fits(fit, apart, 0.0, report)))]
-    slack = _slack(questions, effects, report) if questions.rejects_model else None
-    if slack is not None and not _leaves_room(slack[0].answer_set) and not slack[-1].tests.needs_search:
+    report("testing the model")
+    tests = misfit_tests(fit, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    trial_differences = differences(fit)
+    significant_differences = significant(trial_differences, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    stated_difference = any(difference.stated for difference in significant_differences)
+    if not tests.rejects_model and not tests.needs_search and not stated_difference:
+        unstated = tuple(between_fits(fit, significant_differences, 0.0, report))
+        return [SelectionStep(ADEQUATE, tests, unstated_differences=unstated)]
+    slack = _slack_rounds(tests, effects, report) if tests.rejects_model else None
+    if slack is not None and not _may_be_improved(slack[0].answer_set) and not slack[-1].tests.needs_search:
         return slack
-    search = CandidateFits(questions, report)
+
+    # The most promising single effects, and differences between trials.
+    search = CandidateFits(tests, report)
     search.fit_singles()
-    tried = search.fit_to_all_trials()
-    between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
-    by_rows = {difference.name for difference in apart if not difference.stated}
-    unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in by_rows)
-    tried += between
-    if slack is not None and not _is_better(tried, slack[0].answer_set[0]):
+    hypotheses = search.fit_to_all_trials()
+    best_gain = max((hypothesis.delta_chi2 for hypothesis in hypotheses), default=0.0)
+    between = between_fits(fit, trial_differences, best_gain, report)
+    unstated_names = {difference.name for difference in significant_differences if not difference.stated}
+    unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in unstated_names)
+    hypotheses += between
+    if slack is not None and not _is_better(hypotheses, slack[0].answer_set[0]):
         return slack
-    if not questions.rejects_model and not differ and (not tried or best_of(tried).sigma < SEARCH_SIGMAS):
-        return [SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, unstated_differences=unstated)]
-    if tried and again < MAX_RESTARTS and best_of(tried) not in between:
-        rival = restart_without(fit, best_of(tried).fit)
-        if rival.log_likelihood > fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
-            return select_effects(rival, effects, report, again=again + 1)
-    alone = None if _leaves_room(tried) else _alone(questions, search, tried)
-    if alone is not None:
-        return alone
-    # Linear promises choose well near the truth, not far from it. Where the best of those they chose leaves room for a
-    # better one, and before `unexplained`, all are fitted.
+    only_suspected = not tests.rejects_model and not stated_difference
+    if only_suspected and (not hypotheses or best_of(hypotheses).sigma < SEARCH_SIGMAS):
+        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
+    if hypotheses and restarts < MAX_RESTARTS and best_of(hypotheses) not in between:
+        refitted = restart_without(fit, best_of(hypotheses).fit)
+        if refitted.log_likelihood > fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
+            return select_effects(refitted, effects, report, restarts=restarts + 1)
+    rounds = None if _may_be_improved(hypotheses) else _single_effect_rounds(tests, search, hypotheses)
+    if rounds is not None:
+        return rounds
+
+    # All single effects: linear predictions rank candidates well near the truth, not far from it.
     search.fit_singles(all_of_them=True)
-    tried = [*search.fit_to_all_trials(all_of_them=True), *between]
-    alone = _alone(questions, search, tried)
-    if alone is not None:
-        return alone
-    if not questions.rejects_model and not questions.needs_search:
-        return [SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, unstated_differences=unstated)]
-    tried = [hypothesis for hypothesis in tried if hypothesis not in between]
-    credible = [hypothesis for hypothesis in tried if hypothesis.credible]
-    if not credible or not _any_stands_out(credible, questions):
-        # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
-        loud = questions.largest_excess(questions.family) > CLEAR_SCORE_EXCESS
-        fails = questions.omnibus_rejects or questions.exceeds_slow_errors or loud
-        verdict = UNEXPLAINED if fails else ADEQUATE
-        told = unstated if verdict == ADEQUATE else ()
-        return [SelectionStep(verdict, questions, fitted=tuple(tried), search=search, unstated_differences=told)]
-    return _together(questions, search, tried, report)
+    hypotheses = [*search.fit_to_all_trials(all_of_them=True), *between]
+    rounds = _single_effect_rounds(tests, search, hypotheses)
+    if rounds is not None:
+        return rounds
+    if not tests.rejects_model and not tests.needs_search:
+        return [SelectionStep(ADEQUATE, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
+
+    # Sets of effects.
+    hypotheses = [hypothesis for hypothesis in hypotheses if hypothesis not in between]
+    credible = [hypothesis for hypothesis in hypotheses if hypothesis.credible]
+    if not credible or not _any_exceeds_threshold(credible, tests):
+        # A score that no refit confirms counts only if it is high or another test rejects the model too.
+        clear_score = tests.largest_excess(tests.family) > CLEAR_SCORE_EXCESS
+        rejected = tests.omnibus_rejects or tests.exceeds_slow_errors or clear_score
+        verdict = UNEXPLAINED if rejected else ADEQUATE
+        unstated = unstated if verdict == ADEQUATE else ()
+        return [SelectionStep(verdict, tests, fitted=tuple(hypotheses), search=search, unstated_differences=unstated)]
+    return _effect_set_rounds(tests, search, hypotheses, report)
 
 
-def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
-    """Whether the best hypothesis may stand for a better one: it is far off, or bends the trials until they fit.
+def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
+    """Whether a better hypothesis than the best may exist: it is far off, or its trial effects absorb a misfit.
 
-    One that leaves the noise of the tracks, and trials that scatter no more than care allows, has taken all there is.
+    A hypothesis whose residuals are at the noise of the tracks, with trials that scatter no more than careful work
+    allows, leaves nothing to be gained.
     """
-    if not tried:
+    if not hypotheses:
         return True
-    best = best_of(tried).fit
+    best = best_of(hypotheses).fit
     return best.chi2_per_dof > FAR_OFF_CHI2_PER_DOF or has_excess_scatter(best)
 
 
-def _is_better(tried: Sequence[LikelihoodRatio], than: LikelihoodRatio) -> bool:
-    """Whether the best of these hypotheses is likelier than another."""
-    return bool(tried) and best_of(tried).fit.log_likelihood > than.fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN
+def _is_better(hypotheses: Sequence[LikelihoodRatio], reference: LikelihoodRatio) -> bool:
+    """Whether the best of these hypotheses is likelier than the reference."""
+    if not hypotheses:
+        return False
+    return best_of(hypotheses).fit.log_likelihood > reference.fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN
 
 
-def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
-    """Findings where a tail that may go slack explains what a tail that pushes does not; None where it does not.
+def _slack_rounds(tests: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
+    """Rounds in which a tail that may go slack explains the misfit; None where it does not.
 
-    It is asked first: a tail cannot push, and the rule brings no number that could make up for something else. But
-    where its trials scatter much they may have been bent to it: then it stands only if no effect alone does better.
+    The rule is tried first: a tail cannot push, and the rule has no parameter that could absorb another effect. If
+    trials scatter much, their effects may have adapted to the rule, and it stands only if no single effect fits better.
     """
-    slack = slack_fit(questions.fit)
-    if slack is None or not _stands_out(slack, questions):
+    slack = slack_fit(tests.fit)
+    if slack is None or not _exceeds_threshold(slack, tests):
         return None
     report("letting the tail go slack")
-    slack = replace(slack, fit=with_host(slack.fit, questions.fit.predictor.host))
-    # A model far off may gain by any freedom: the rule is named only where it leaves nothing to explain.
+    slack = replace(slack, fit=with_host(slack.fit, tests.fit.predictor.host))
+    # Any additional freedom may improve a model that is far off: the rule counts only if every test passes with it.
     after = misfit_tests(slack.fit, effects, FALSE_ALARM_LEVEL_LATER_ROUNDS)
     if after.rejects_model or after.omnibus_rejects or after.exceeds_slow_errors:
         return None
-    first = SelectionStep(MISSING, questions, (slack,), (slack,), (), slack.names)
+    first = SelectionStep(MISSING, tests, (slack,), (slack,), (), slack.names)
     return [first, SelectionStep(ADEQUATE, after)]
 
 
-def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
-    """Whether an effect is worth more standard deviations than chance alone gives one of the candidates."""
-    return hypothesis.sigma >= questions.family.threshold(hypothesis.names[-1])
+def _exceeds_threshold(hypothesis: LikelihoodRatio, tests: MisfitTests) -> bool:
+    """Whether the significance of a hypothesis reaches the family-wise threshold of its effect."""
+    return hypothesis.sigma >= tests.family.threshold(hypothesis.names[-1])
 
 
-def _any_stands_out(tried: Sequence[LikelihoodRatio], questions: MisfitTests) -> bool:
-    """Whether the best does, or one that cannot be excluded beside it: each may scatter in its own way."""
-    best = best_of(tried)
+def _any_exceeds_threshold(hypotheses: Sequence[LikelihoodRatio], tests: MisfitTests) -> bool:
+    """Whether the best hypothesis, or one that cannot be excluded beside it, exceeds its threshold.
+
+    Significances differ within the answer set, because each is reduced by the scatter of its own size between trials.
+    """
+    best = best_of(hypotheses)
     return any(
-        _stands_out(known, questions)
-        for known in tried
-        if known.deviance_excess(best) <= ANSWER_SET_DELTA_CHI2 * best.inflation
+        _exceeds_threshold(hypothesis, tests)
+        for hypothesis in hypotheses
+        if hypothesis.deviance_excess(best) <= ANSWER_SET_DELTA_CHI2 * best.inflation
     )
 
 
-def _alone(
-    questions: MisfitTests, search: CandidateFits, tried: Sequence[LikelihoodRatio]
+def _single_effect_rounds(
+    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio]
 ) -> list[SelectionStep] | None:
-    """Findings where one effect mends everything; None where none does."""
-    if not tried:
+    """Rounds in which a single effect explains the misfit; None where none does."""
+    if not hypotheses:
         return None
-    if not _any_stands_out(tried, questions):
+    if not _any_exceeds_threshold(hypotheses, tests):
         return None
-    kept, aside, after = mending(tried, search)
+    adequate, rejected, after = adequate_hypotheses(hypotheses, search)
     if after is None:
         return None
-    verdict = verdict_of(kept)
-    if verdict == MISSING and is_within_position_errors(questions.fit, kept[0].fit):
-        return [
-            SelectionStep(ADEQUATE, questions, fitted=tuple(tried), search=search, note=_too_small(kept[0], questions))
-        ]
+    best, fitted = adequate[0], tuple(hypotheses)
+    verdict = verdict_of(adequate)
+    if verdict == MISSING and is_within_position_errors(tests.fit, best.fit):
+        return [SelectionStep(ADEQUATE, tests, fitted=fitted, search=search, note=_negligible_note(best, tests))]
     first = SelectionStep(
         verdict,
-        questions,
-        tuple(kept),
-        tuple(tried),
-        tuple(aside.items()),
-        tuple(hypothesis.names[0] for hypothesis in kept),
+        tests,
+        tuple(adequate),
+        fitted,
+        tuple(rejected.items()),
+        tuple(hypothesis.names[0] for hypothesis in adequate),
         search,
-        confounded=confounders_of(after, kept[0].names) if verdict == MISSING else (),
+        confounded=confounders_of(after, best.names) if verdict == MISSING else (),
     )
     return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
 
 
-def _too_small(best: LikelihoodRatio, questions: MisfitTests) -> str:
-    moved_mm = 1e3 * displacement_m(questions.fit, best.fit)
+def _negligible_note(best: LikelihoodRatio, tests: MisfitTests) -> str:
+    """Why an effect that improves the likelihood is not counted, in words."""
+    moved_mm = 1e3 * displacement_m(tests.fit, best.fit)
     return (
         f"{best.label} would improve the fit by {best.sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
         "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted"
     )
 
 
-def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
-    """What an answer set amounts to.
-
-    Where nothing in it is physics that is missing, the measurement or the trials are at fault.
+def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
+    """Verdict that follows from an answer set: `artefact` where it holds no physics, else `missing` or `ambiguous`.
 
     Parameters
     ----------
-    kept : sequence of LikelihoodRatio
+    adequate : sequence of LikelihoodRatio
         The answer set.
 
     Returns
     -------
     str
     """
-    if all(effect.kind in NONPHYSICAL_KINDS for hypothesis in kept for effect in hypothesis.effects):
+    if all(effect.kind in NONPHYSICAL_KINDS for hypothesis in adequate for effect in hypothesis.effects):
         return ARTEFACT
-    return MISSING if len(kept) == 1 else AMBIGUOUS
+    return MISSING if len(adequate) == 1 else AMBIGUOUS
 
 
-def _together(
-    questions: MisfitTests, search: CandidateFits, tried: Sequence[LikelihoodRatio], report: Report
+def _effect_set_rounds(
+    tests: MisfitTests, search: CandidateFits, hypotheses: Sequence[LikelihoodRatio], report: Report
 ) -> list[SelectionStep]:
-    """Findings where several effects together mend what fewer do not; else nothing known does."""
-    ranked = sorted(tried, key=lambda single: -single.fit.log_likelihood)
-    sets = EffectSets(search, ranked, report)
-    size, again, reached = 2, 0, ranked[0]
-    aside: dict[str, str] = {}
+    """Rounds in which a set of effects explains the misfit, smallest set first; else the verdict `unexplained`."""
+    singles = sorted(hypotheses, key=lambda single: -single.fit.log_likelihood)
+    sets = EffectSets(search, singles, report)
+    size, backward_steps, best_so_far = 2, 0, singles[0]
+    rejected: dict[str, str] = {}
     while size <= MAX_EFFECTS:
         report(f"{size} effects together")
-        grown = sets.grow(size)
-        if not grown or not any(hypothesis.credible for hypothesis in grown):
+        of_this_size = sets.grow(size)
+        if not of_this_size or not any(hypothesis.credible for hypothesis in of_this_size):
             break
-        kept, aside, after = mending(grown, search, sets)
+        adequate, rejected, after = adequate_hypotheses(of_this_size, search, sets)
         if after is not None:
-            if sets.is_better(kept[0]):
-                return _of_sets(questions, sets, kept, aside, after)
-            aside[kept[0].label] = "it gains no more over the best smaller set than chance may"
-        if not sets.is_better(grown[0]):
+            if sets.is_better(adequate[0]):
+                return _rounds_of_sets(tests, sets, adequate, rejected, after)
+            rejected[adequate[0].label] = "its gain over the best smaller set is within chance"
+        if not sets.is_better(of_this_size[0]):
             break
-        leads_nowhere = size > 2 and _leads_nowhere(grown, reached)
-        reached = grown[0]
-        if leads_nowhere:
+        stalled = size > 2 and _is_stalled(of_this_size, best_so_far)
+        best_so_far = of_this_size[0]
+        if stalled:
             break
-        # What was added first may have stood for two that came later: the search goes on from the better smaller set.
-        back = size > 2 and again < MAX_RESTARTS and sets.prune(grown[0])
-        size, again = (size - 1, again + 1) if back else (size + 1, again)
+        # An effect added early may have stood in for two added later: go on from a smaller set if that is now better.
+        step_back = size > 2 and backward_steps < MAX_RESTARTS and sets.prune(of_this_size[0])
+        size, backward_steps = (size - 1, backward_steps + 1) if step_back else (size + 1, backward_steps)
     fitted = tuple(sets.fitted.values())
-    why = _why_not((*ranked[:1], *sets.of_size(2)[:1], reached), aside)
-    steps = _partial(questions, sets)
-    return [SelectionStep(UNEXPLAINED, questions, fitted=fitted, search=search, rejected=why, partial=steps)]
+    reasons = _rejection_reasons((*singles[:1], *sets.of_size(2)[:1], best_so_far), rejected)
+    steps = _partial_steps(tests, sets)
+    return [SelectionStep(UNEXPLAINED, tests, fitted=fitted, search=search, rejected=reasons, partial=steps)]
 
 
-def _leads_nowhere(grown: Sequence[LikelihoodRatio], smaller: LikelihoodRatio) -> bool:
-    """Whether larger sets are not worth their time: no size is plausible, or the best stays as far off as before."""
-    if not any(has_credible_sizes(hypothesis) for hypothesis in grown):
+def _is_stalled(of_this_size: Sequence[LikelihoodRatio], best_so_far: LikelihoodRatio) -> bool:
+    """Whether larger sets are not worth their time: no set has credible sizes, or the best stays about as far off."""
+    if not any(has_credible_sizes(hypothesis) for hypothesis in of_this_size):
         return True
-    left = grown[0].fit.chi2_per_dof
-    return left > FAR_OFF_CHI2_PER_DOF and left > STALLED_CHI2_SHARE * smaller.fit.chi2_per_dof
+    remaining = of_this_size[0].fit.chi2_per_dof
+    return remaining > FAR_OFF_CHI2_PER_DOF and remaining > STALLED_CHI2_SHARE * best_so_far.fit.chi2_per_dof
 
 
-def _of_sets(
-    questions: MisfitTests,
+def _rounds_of_sets(
+    tests: MisfitTests,
     sets: EffectSets,
-    kept: Sequence[LikelihoodRatio],
-    aside: dict[str, str],
+    adequate: Sequence[LikelihoodRatio],
+    rejected: dict[str, str],
     after: MisfitTests,
 ) -> list[SelectionStep]:
-    """Rounds from sets of effects that mend everything: what all of them share, one by one, then what they differ in.
+    """Rounds from adequate sets of effects: one for each effect that all sets share, then one for the alternatives.
 
-    Physics comes before faults of the measurement, and of either what mends most alone. A picture bent by so much that
-    the first term of its bend mends nearly everything comes before all: what that leaves may be the next term.
+    Physics comes before faults of the measurement, and within both the effect with the largest gain alone. A distortion
+    of the picture whose leading term gains nearly everything comes first: the rest of the set may be its next term.
     """
-    tried, out_of_the_race = tuple(sets.fitted.values()), tuple(aside.items())
-    gains = {single.names[0]: single.delta_chi2 for single in tried if len(single.names) == 1}
-    kinds = {effect.name: effect.kind for hypothesis in kept for effect in hypothesis.effects}
-
-    bent = {name for name in LEADING_TERMS if gains.get(name, 0.0) > LEADING_TERM_SHARE * kept[0].delta_chi2}
+    fitted, reasons = tuple(sets.fitted.values()), tuple(rejected.items())
+    gains = {single.names[0]: single.delta_chi2 for single in fitted if len(single.names) == 1}
+    kinds = {effect.name: effect.kind for hypothesis in adequate for effect in hypothesis.effects}
+    best = adequate[0]
+    leading = {name for name in LEADING_TERMS if gains.get(name, 0.0) > LEADING_TERM_SHARE * best.delta_chi2}
 
     def order(name: str) -> tuple[bool, bool, float]:
-        return name not in bent, kinds[name] == "measurement", -gains.get(name, 0.0)
+        return name not in leading, kinds[name] == "measurement", -gains.get(name, 0.0)
 
-    common = sorted(set.intersection(*(set(hypothesis.names) for hypothesis in kept)), key=order)
+    common = sorted(set.intersection(*(set(hypothesis.names) for hypothesis in adequate)), key=order)
     if not common:
-        names = tuple(sorted(dict.fromkeys(name for hypothesis in kept for name in hypothesis.names), key=order))
-        return [SelectionStep(AMBIGUOUS, questions, tuple(kept), tried, out_of_the_race, names, sets.search)]
-    shared = common if len(kept) > 1 else common[:-1]
+        names = tuple(sorted(dict.fromkeys(name for hypothesis in adequate for name in hypothesis.names), key=order))
+        return [SelectionStep(AMBIGUOUS, tests, tuple(adequate), fitted, reasons, names, sets.search)]
+    shared = common if len(adequate) > 1 else common[:-1]
     steps: list[SelectionStep] = []
     added: tuple[Effect, ...] = ()
-    asked = questions
+    round_tests = tests
     for name in shared:
         if kinds[name] == "measurement":
-            return [*steps, _shared_step(ARTEFACT, asked, sets, kept[0], added, name, tried, out_of_the_race)]
-        steps.append(_shared_step(MISSING, asked, sets, kept[0], added, name, tried, out_of_the_race))
-        added = (*added, next(effect for effect in kept[0].effects if effect.name == name))
-        alone = sets.subset(kept[0], added)
-        asked = sets.search.tests_after(alone.fit if alone else kept[0].fit)
-    further = tuple(_beside(asked, hypothesis, added) for hypothesis in kept)
-    verdict = verdict_of(further)
-    names = tuple(sorted(dict.fromkeys(name for hypothesis in further for name in hypothesis.names), key=order))
-    confounded = confounders_of(after, kept[0].names) if verdict == MISSING else ()
-    steps.append(SelectionStep(verdict, asked, further, further, answer_names=names, confounded=confounded))
+            return [*steps, _shared_step(ARTEFACT, round_tests, sets, best, added, name, fitted, reasons)]
+        steps.append(_shared_step(MISSING, round_tests, sets, best, added, name, fitted, reasons))
+        added = (*added, next(effect for effect in best.effects if effect.name == name))
+        subset = sets.subset(best, added)
+        round_tests = sets.search.tests_after(subset.fit if subset else best.fit)
+    alternatives = tuple(_remainder(round_tests, hypothesis, added) for hypothesis in adequate)
+    verdict = verdict_of(alternatives)
+    names = tuple(sorted(dict.fromkeys(name for hypothesis in alternatives for name in hypothesis.names), key=order))
+    confounded = confounders_of(after, best.names) if verdict == MISSING else ()
+    steps.append(
+        SelectionStep(verdict, round_tests, alternatives, alternatives, answer_names=names, confounded=confounded)
+    )
     return [*steps, SelectionStep(ADEQUATE, after)] if verdict == MISSING else steps
 
 
 def _shared_step(
     verdict: str,
-    asked: MisfitTests,
+    tests: MisfitTests,
     sets: EffectSets,
-    whole: LikelihoodRatio,
+    best: LikelihoodRatio,
     added: tuple[Effect, ...],
     name: str,
-    tried: tuple[LikelihoodRatio, ...],
-    aside: tuple[tuple[str, str], ...],
+    fitted: tuple[LikelihoodRatio, ...],
+    rejected: tuple[tuple[str, str], ...],
 ) -> SelectionStep:
-    """The round in which an effect is named that all sets share, once those `added` before it are in the model."""
-    left = [effect for effect in whole.effects if effect not in added]
-    left.sort(key=lambda effect: effect.name != name)
-    together = likelihood_ratio(asked.fit, left, whole.fit)
-    several = {2: "two", 3: "three", 4: "four", 5: "five"}[len(left)] if len(left) > 1 else ""
-    note = f"{several} effects are missing: none alone mends everything" if several else ""
+    """The round that names an effect which all sets share; the effects in `added` are in the model already."""
+    remaining = [effect for effect in best.effects if effect not in added]
+    remaining.sort(key=lambda effect: effect.name != name)
+    together = likelihood_ratio(tests.fit, remaining, best.fit)
+    count = {2: "two", 3: "three", 4: "four", 5: "five"}[len(remaining)] if len(remaining) > 1 else ""
+    note = f"{count} effects are missing: none alone removes the misfit" if count else ""
     if not added:
-        return SelectionStep(verdict, asked, (together,), tried, aside, (name,), sets.search, note)
-    alone = sets.subset(whole, (*added, left[0]))
-    fits = (together,) if alone is None else (likelihood_ratio(asked.fit, left[:1], alone.fit), together)
-    return SelectionStep(verdict, asked, (together,), fits, (), (name,), None, note)
+        return SelectionStep(verdict, tests, (together,), fitted, rejected, (name,), sets.search, note)
+    subset = sets.subset(best, (*added, remaining[0]))
+    fits = (together,) if subset is None else (likelihood_ratio(tests.fit, remaining[:1], subset.fit), together)
+    return SelectionStep(verdict, tests, (together,), fits, (), (name,), None, note)
 
 
-def _beside(asked: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Effect]) -> LikelihoodRatio:
-    """What a set adds to those that were added."""
-    left = [effect for effect in hypothesis.effects if effect.name not in {effect.name for effect in added}]
-    return likelihood_ratio(asked.fit, left, hypothesis.fit)
+def _remainder(tests: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Effect]) -> LikelihoodRatio:
+    """What a set adds to the effects that are in the model already."""
+    names = {effect.name for effect in added}
+    remaining = [effect for effect in hypothesis.effects if effect.name not in names]
+    return likelihood_ratio(tests.fit, remaining, hypothesis.fit)
 
 
-def _partial(questions: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRatio, ...]:
-    """The steps that mend most of a misfit at plausible sizes; none where they mend little."""
+def _partial_steps(tests: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRatio, ...]:
+    """Steps of plausible size that remove most of the misfit; empty where they remove little."""
     steps = sets.plausible_steps()
-    before = questions.fit.chi2_per_dof - 1
-    mostly = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - PARTIAL_SHARE) * before
-    return steps if mostly else ()
+    excess = tests.fit.chi2_per_dof - 1
+    removes_most = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - PARTIAL_SHARE) * excess
+    return steps if removes_most else ()
 
 
-def _why_not(nearest: Sequence[LikelihoodRatio], aside: dict[str, str]) -> tuple[tuple[str, str], ...]:
-    """Why the nearest hypothesis of each size is no explanation."""
-    left = "something is left once it is added"
+def _rejection_reasons(
+    best_of_size: Sequence[LikelihoodRatio], rejected: dict[str, str]
+) -> tuple[tuple[str, str], ...]:
+    """Label of the best hypothesis of each size, and why it is no explanation."""
     return tuple(
         dict.fromkeys(
-            (hypothesis.label, hypothesis.reason if not hypothesis.credible else aside.get(hypothesis.label, left))
-            for hypothesis in nearest
+            (
+                hypothesis.label,
+                hypothesis.reason if not hypothesis.credible else rejected.get(hypothesis.label, MISFIT_REMAINS),
+            )
+            for hypothesis in best_of_size
         )
     )

@@ -1,8 +1,8 @@
 """The rule that a tail cannot push, as a hypothesis: the same model with `tail_slack: free`.
 
-Eq. (2) holds while the tail's tension T₁ = ½(P − P_y)A − ½Bẋⁿ − … is positive. A payload that falls faster than the tip
-everts makes it negative: then the true tail goes slack, and the model as written pushes. The rule brings no number to
-fit, so that a likelihood which rises by it is no matter of taste.
+Eq. (2) holds while the tail's tension T₁ = ½(P − P_y)A − ½Bẋⁿ − … is positive. It becomes negative where a payload
+falls faster than the tip everts: the real tail goes slack there, but the model predicts that it pushes. The rule has no
+parameter, so that any rise of the likelihood is due to it alone.
 """
 
 from __future__ import annotations
@@ -41,20 +41,21 @@ TAIL_SLACK = Effect(
 """Stands for the rule in answer sets. It is no term of a model: `tail_slack: free` in `experiment.yaml` turns it on."""
 
 MIN_PUSH_FRACTION = 0.02
-"""Part of the drive ½PA by which a tail must push to count. Chosen: the numbers of a fit are good to about 1 %; at half
-of it their errors ask for a fit in vain, at twice a push of 4 % of the drive goes untried."""
+"""Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried. Chosen: parameters of a fit
+are good to about 1 %; at half of it their errors cause a fit in vain, at twice a push of 4 % of the drive is not
+tried."""
 
 REFUTED_DEVIANCE_PER_POINT = 1.0
-"""By how much −2 ln L of a point rises on one trial of every condition where the rule is refuted without a refit, of
-trials that scatter much. Derived: −2 ln L of n points with noise s is n ln s², so their misfit is √e times as large.
-Measured: with hidden effects (tuning seeds 702, 703, 706) it rises by 6,500 to 20,000 in all, more than this a point;
-of vines that went slack with payloads of 15 to 60 g it falls. Not asked where trials scatter little: with 200 g, which
-a fit cannot bend away, it rose by 0.7 a point in one campaign of two. At half that one would be refuted if its trials
-scattered, at twice hardly any refit is spared."""
+"""Rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted without a full fit where
+trials scatter much. Derived: −2 ln L of n points with noise s is n ln s², so the misfit is √e times as large. Measured:
+with hidden effects (tuning seeds 702, 703, 706) it rises by 6,500 to 20,000 in all, more than this per point; for vines
+that went slack with payloads of 15 to 60 g it falls. Not applied where trials scatter little: with 200 g, which trial
+effects cannot absorb, it rose by 0.7 per point in one campaign of two. At half that one would be refuted if its trials
+scattered, at twice hardly any full fit is spared."""
 
 
 def pushes(fit: Fit) -> bool:
-    """Whether the fitted model has the tail of some trial push, where the trial does not let it go slack.
+    """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack.
 
     Parameters
     ----------
@@ -79,9 +80,9 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
     measured_Pa = None if trace is None else np.interp(trial.time_s[moving], *trace)
     position_m = trial.predicted_position_m[moving] - trial.origin_m
     velocity_m_s = trial.predicted_velocity_m_s[moving]
-    pressed = replace(trial.trial, pressure_Pa=trial.trial.pressure_Pa * (1 + trial.pressure_deviation))
+    fitted_trial = replace(trial.trial, pressure_Pa=trial.trial.pressure_Pa * (1 + trial.pressure_deviation))
     try:
-        terms = evaluate(fit.model, pressed, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
+        terms = evaluate(fit.model, fitted_trial, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
     except EffectError:
         return False
     ratio = trial.trial.travel_ratio
@@ -91,45 +92,43 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through.
+    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails.
 
-    A fit that has bent its trials to do without the rule may have bent them until no tail pushes. So where they scatter
-    much the rule is also tried from other exponents, with nothing of the deviations, on one trial of every condition
-    first: where it fits those far worse (REFUTED_DEVIANCE_PER_POINT), nothing is fitted to all trials.
+    Trial effects may have absorbed the misfit until no tail pushes. Where trials scatter much, the rule is therefore
+    also tried from other exponents, without the fitted deviations, on one trial of every condition first. If it fits
+    these far worse (REFUTED_DEVIANCE_PER_POINT), no fit is made to all trials.
 
-    The model is compiled alone: with all candidates and tails that may go slack that takes the better part of a minute,
-    for a rule that is mostly refuted.
+    The model is compiled without the candidates: together with tails that may go slack they take the better part of a
+    minute to compile, for a rule that is mostly refuted.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit of the model.
 
     Returns
     -------
     LikelihoodRatio or None
     """
     taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
-    bent = taut and has_excess_scatter(fit)
-    if not bent and not pushes(fit):
+    scattered = taut and has_excess_scatter(fit)
+    if not scattered and not pushes(fit):
         return None
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
     slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
-    climb = None
-    if bent:
-        slope = SubsetFitter(slack)
-        climb = best_subset_fit(slope, exponent_starts(slack), math.inf)
-        if (
-            climb is not None
-            and climb.deviance > SubsetFitter(fit).null_deviance() + REFUTED_DEVIANCE_PER_POINT * slope.n_points
-        ):
+    subset_fit = None
+    if scattered:
+        fitter = SubsetFitter(slack)
+        subset_fit = best_subset_fit(fitter, exponent_starts(slack), math.inf)
+        allowed_rise = REFUTED_DEVIANCE_PER_POINT * fitter.n_points
+        if subset_fit is not None and subset_fit.deviance > SubsetFitter(fit).null_deviance() + allowed_rise:
             return None
     fits = []
     with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
         fits.append(refit(slack, thorough=False))
-    if climb is not None:
-        fits += [other for other in (full_fit(slack, climb, afresh=True),) if other is not None]
+    if subset_fit is not None:
+        fits += [other for other in (full_fit(slack, subset_fit, reset=True),) if other is not None]
     if not fits:
         return None
     after = max(fits, key=lambda known: known.log_likelihood)

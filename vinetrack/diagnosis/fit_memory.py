@@ -1,8 +1,8 @@
-"""Memory of a search over hypotheses about many trials: curves of fits that are out of the race are let go.
+"""Memory of a search over hypotheses about many trials: curves of fits that no longer compete are dropped.
 
-A fit of a thousand trials of 550 frames holds some sixty megabytes of curves, what it leaves held against every
-candidate 700; a search fits dozens. Numbers, likelihood and state of a fit always stay, from which its curves are made
-again where a later step asks for them.
+The curves of a fit to a thousand trials of 550 frames take some sixty megabytes, its misfit tests 700, and a search
+makes dozens of fits. Numbers, likelihood and state of a fit always stay; its curves are computed again from them where
+a later step needs them.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import Predictor
 
 MANY_POINTS = 150_000
-"""Points of all trials from which anything is let go. Chosen for memory: 300 trials of 500 frames, of which a fit takes
-16 MB; at half smaller campaigns spend time on curves made again, at twice a search over them takes 2 GB. It decides no
-number or likelihood of a fit; derivatives made again come of other steps, within the error of the first."""
+"""Points of all trials from which curves are dropped. Chosen for memory: 300 trials of 500 frames, of which a fit takes
+16 MB; at half smaller campaigns spend time on computing curves again, at twice a search over them takes 2 GB. It
+affects no number or likelihood of a fit; derivatives computed again use other steps, within the error of the first."""
 
 MAX_WHOLE_FITS, MAX_WHOLE_TESTS = 8, 1
-"""Fits, the likeliest of a search, and questioned fits, the last asked, that stay whole. Chosen for memory: what steps
-go on from is among the best three; of fits at half curves are made again now and then; each questioned fit more holds
-as much as ten fits."""
+"""Fits, the likeliest of a search, and misfit tests, the last made, that are kept whole. Chosen for memory: later steps
+go on from the best three; with half the fits, curves are computed again now and then; each further set of misfit tests
+takes as much as ten fits."""
 
 Key = TypeVar("Key")
 
 
-def holds_many(fit: Fit) -> bool:
-    """Whether a fit has so many points that fits of hypotheses beside it cannot all be held whole.
+def is_large(fit: Fit) -> bool:
+    """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def holds_many(fit: Fit) -> bool:
     return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > MANY_POINTS
 
 
-def let_go(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
-    """Let go of the curves of hypotheses that cannot come into an answer set any more.
+def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
+    """Drop the curves of hypotheses that can no longer enter an answer set.
 
     Parameters
     ----------
@@ -54,13 +54,13 @@ def let_go(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
     ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
     for key, hypothesis in ranked[MAX_WHOLE_FITS:]:
         fit = hypothesis.fit
-        behind = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
-        if fit.trials and behind > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION and holds_many(fit):
+        deviance_excess = 2 * (ranked[0][1].fit.log_likelihood - fit.log_likelihood)
+        if fit.trials and deviance_excess > ANSWER_SET_DELTA_CHI2 * MAX_INFLATION and is_large(fit):
             fitted[key] = replace(hypothesis, fit=without_curves(fit))
 
 
 def without_curves(fit: Fit) -> Fit:
-    """A fit without its curves: its numbers, its state and what it leaves of each trial.
+    """Return a fit without its curves: its numbers, its state and the residuals of each trial.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def without_curves(fit: Fit) -> Fit:
 
 
 def with_curves(fit: Fit) -> Fit:
-    """The fit, its curves made again where they were let go.
+    """Return a fit with its curves, computed again where they were dropped.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def with_curves(fit: Fit) -> Fit:
     Raises
     ------
     SimulationError
-        If the model cannot be followed.
+        If the simulation of the model fails.
     """
     if fit.trials:
         return fit
@@ -97,7 +97,7 @@ def with_curves(fit: Fit) -> Fit:
     predictor = Predictor(former.layout, former.data, former.host)
     predictor.steps, predictor.pressure_step = former.steps.copy(), former.pressure_step.copy()
     columns = predictor.linearise(state.theta, state.trial_effects)
-    # The products are those of the fit, in which columns came of other steps.
+    # Cross products stay those of the fit, whose columns were computed with other steps.
     solution = replace(fit.solution, columns=tuple(columns))
     trials = assemble(former, solution, fit.left_out, fit.options, profile=False).trials
     return replace(fit, trials=trials, solution=solution)

@@ -9,8 +9,8 @@ import pytest
 from hidden_truth import grown
 
 import vinetrack as vt
-from vinetrack.diagnosis import held_fits
-from vinetrack.diagnosis.held_fits import let_go, with_curves, without_curves
+from vinetrack.diagnosis import fit_memory
+from vinetrack.diagnosis.fit_memory import drop_curves, with_curves, without_curves
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
@@ -47,15 +47,15 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
 def test_of_many_trials_only_hypotheses_that_may_still_be_kept_hold_their_curves(
     whole: Fit, points: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(held_fits, "MANY_POINTS", points)
-    monkeypatch.setattr(held_fits, "MAX_WHOLE_FITS", 2)
+    monkeypatch.setattr(fit_memory, "MANY_POINTS", points)
+    monkeypatch.setattr(fit_memory, "MAX_WHOLE_FITS", 2)
     effect = find_effect("tail_friction")
     behind = {"best": 0.0, "second": 500.0, "third": 600.0, "may be kept": 0.4 * ANSWER_SET_DELTA_CHI2 * MAX_INFLATION}
     hypotheses = {
         name: likelihood_ratio(whole, (effect,), replace(whole, log_likelihood=whole.log_likelihood - fall))
         for name, fall in behind.items()
     }
-    let_go(hypotheses)
+    drop_curves(hypotheses)
     light = {name for name, hypothesis in hypotheses.items() if not hypothesis.fit.trials}
     assert light == (set() if points else {"second", "third"})
     assert hypotheses["third"].delta_chi2 == pytest.approx(-1200.0)
