@@ -16,7 +16,7 @@ from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.setup_page.page_server import start_server
-from vinetrack.video.curved_axis import CurvedAxis, axis_of_entry
+from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry
 
 pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
 
@@ -167,7 +167,7 @@ def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_
     person.chrome.mouse("release", *target)
     person.press("#save")
     person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
-    given = axis_of_entry(read_yaml(clips / "experiment.yaml").content["axis"])
+    given = axis_from_entry(read_yaml(clips / "experiment.yaml").content["axis"])
     assert isinstance(given, CurvedAxis)
     assert given.via_px == (pytest.approx((250, 120), abs=1.0),)
     drawn = str(person.chrome.run("document.querySelector('#over polyline.axis-line').getAttribute('points')"))

@@ -13,7 +13,7 @@ from bent_scene import BENDS, BentPlan, BentScene, bent_scene
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import PlaneCalibration
-from vinetrack.video.curved_axis import CurvedAxis, axis_entry, axis_of_entry, axis_through, curve_complaint
+from vinetrack.video.curved_axis import CurvedAxis, axis_entry, axis_from_entry, axis_through, curve_problem
 from vinetrack.video.curved_strip import cut_along, straightened
 from vinetrack.video.frames import Frames, Recording, RecordingError
 from vinetrack.video.plane_map import PlaneMap
@@ -37,7 +37,7 @@ def test_two_points_are_the_straight_axis() -> None:
     axis = axis_through([(10.0, 30.0), (100.0, 70.0)], 12.0)
     assert type(axis) is Axis
     assert axis == Axis((10.0, 30.0), (100.0, 70.0), 12.0)
-    assert axis_of_entry(axis_entry(axis) | {"width_px": 12.0}) == axis
+    assert axis_from_entry(axis_entry(axis) | {"width_px": 12.0}) == axis
     assert set(axis_entry(axis)) == {"from_px", "to_px"}
 
 
@@ -72,7 +72,7 @@ def test_a_curve_does_not_overshoot_between_uneven_points() -> None:
 
 def test_a_curve_survives_being_written() -> None:
     axis = replace(quarter(), width_px=14.0)
-    assert axis_of_entry(axis_entry(axis) | {"width_px": 14.0}) == axis
+    assert axis_from_entry(axis_entry(axis) | {"width_px": 14.0}) == axis
     assert axis.moved(3.0, -2.0).via_px[0] == (axis.via_px[0][0] + 3.0, axis.via_px[0][1] - 2.0)
 
 
@@ -80,12 +80,12 @@ def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> Non
     with pytest.raises(RecordingError, match="less than 2 pixels apart; leave out"):
         axis_through([(10.0, 10.0), (10.5, 10.0), (90.0, 40.0)])
     sharp = axis_through([(20.0, 20.0), (60.0, 20.0), (60.0, 50.0)])
-    complaint = curve_complaint(sharp, 40.0, (100, 100))
+    complaint = curve_problem(sharp, 40.0, (100, 100))
     assert complaint is not None
     assert "too sharply for a strip of 40 px" in complaint[0]
-    assert curve_complaint(sharp, math.nan, (100, 100)) is None
-    assert curve_complaint(Axis((0.0, 0.0), (500.0, 0.0)), 10.0, (100, 100)) is None
-    outside = curve_complaint(quarter(), 5.0, (310, 400))
+    assert curve_problem(sharp, math.nan, (100, 100)) is None
+    assert curve_problem(Axis((0.0, 0.0), (500.0, 0.0)), 10.0, (100, 100)) is None
+    outside = curve_problem(quarter(), 5.0, (310, 400))
     assert outside is not None
     assert outside[0] == "leaves the picture, 310 × 400 pixels"
 

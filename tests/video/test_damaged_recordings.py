@@ -100,7 +100,7 @@ def test_sound_frames_of_a_damaged_recording_are_tracked_right_and_no_others(cli
     assert all("rejected" in flag for flag in track.flag[62:])
     assert not np.isfinite(track.edge_px[62:]).any()
     assert np.abs(clip.errors_m(track)).max() < 0.5e-3
-    assert any("0 to 61: damaged ones" in note for note in track.notes)
+    assert any("0 to 61: damaged frames" in note for note in track.notes)
 
 
 def test_sound_frames_beyond_the_damage_do_not_count(clip: Clip, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_repair import BANDS, LENGTH_PART, dwell_error_px
+from vinetrack.video.edge_repair import BANDS, BLUR_SIGMA_PART, dwell_error_px
 from vinetrack.video.frames import Frames, Recording, Region
 from vinetrack.video.track import Tracking, track_frames
 
@@ -182,7 +182,7 @@ def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float,
     instants = middle[:, None] + exposure * np.linspace(-0.5, 0.5, 2001)
     place = 20.0 * np.minimum(sense * (instants - 20.0), sense * stop).mean(axis=1)
     edge = 20.0 * np.minimum(sense * (middle - 20.0), sense * stop)
-    unsure_px = LENGTH_PART * exposure / 4 * np.abs(np.diff(np.pad(edge, 1, mode="edge"), 2))
+    unsure_px = BLUR_SIGMA_PART * exposure / 4 * np.abs(np.diff(np.pad(edge, 1, mode="edge"), 2))
     assert dwell_error_px(edge, exposure)[2:-2] == pytest.approx(np.hypot(edge - place, unsure_px)[2:-2], abs=0.01)
 
 

@@ -11,22 +11,22 @@ from vinetrack.video.point_quality import PointQuality
 EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
 
 
-def verdict(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
+def quality(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
     slot = np.arange(EDGE_PX.size)
-    unseen = np.zeros(slot.size, dtype=bool)
+    without_edge = np.zeros(slot.size, dtype=bool)
     flag = np.full(slot.size, "", dtype="<U64")
-    return PointQuality(flag, slot, (), first_moving, last_moving, None, unseen, np.zeros(slot.size))
+    return PointQuality(flag, slot, (), first_moving, last_moving, None, without_edge, np.zeros(slot.size))
 
 
 @pytest.mark.parametrize(("length_px", "grown"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
 def test_travel_is_held_against_the_length(length_px: float, grown: bool) -> None:
-    assert is_grown(EDGE_PX, verdict(), length_px) is grown
+    assert is_grown(EDGE_PX, quality(), length_px) is grown
 
 
-@pytest.mark.parametrize("judged", [verdict(first_moving=0), verdict(last_moving=EDGE_PX.size - 1), verdict(-1, -1)])
+@pytest.mark.parametrize("judged", [quality(first_moving=0), quality(last_moving=EDGE_PX.size - 1), quality(-1, -1)])
 def test_without_rest_or_end_nobody_knows(judged: PointQuality) -> None:
     assert not is_grown(EDGE_PX, judged, 400.0)
 
 
 def test_without_a_length_or_scale_nobody_knows() -> None:
-    assert not is_grown(EDGE_PX, verdict(), np.nan)
+    assert not is_grown(EDGE_PX, quality(), np.nan)

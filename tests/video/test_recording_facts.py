@@ -56,7 +56,7 @@ def test_diameter_and_length_in_each_others_place_are_named() -> None:
     problems = size_problems(swapped, FACTS)
     assert [problem.column for problem in problems] == ["diameter_mm", "length_mm"]
     assert all(problem.severity == "error" for problem in problems)
-    assert all("in each other's place" in problem.remedy for problem in problems)
+    assert all("are swapped" in problem.remedy for problem in problems)
 
 
 def test_a_vine_that_stops_early_is_no_slip() -> None:

@@ -125,9 +125,9 @@ def view_of(results: Results, trial: Trial) -> RecordingView | str:
 
 
 def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingView:
-    from vinetrack.video.curved_axis import axis_of_entry
+    from vinetrack.video.curved_axis import axis_from_entry
 
-    line = axis_of_entry(axis)
+    line = axis_from_entry(axis)
     width = axis.get("width_px")
     assert trial.video is not None
     return RecordingView(

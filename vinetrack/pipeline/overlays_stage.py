@@ -248,7 +248,7 @@ def _pictures(
     settings: OverlaySettings,
 ) -> Iterator[NDArray[np.uint8]]:
     from vinetrack.figures.overlay import ClipView
-    from vinetrack.video.curved_axis import axis_of_entry
+    from vinetrack.video.curved_axis import axis_from_entry
     from vinetrack.video.frames import inspect_recording
 
     assert trial.video is not None
@@ -257,7 +257,7 @@ def _pictures(
     line = analysed.get("axis")
     if line is None:
         raise ResultsError(f"{results.analysed(trial.name)} does not say where the axis is: run snakemake again")
-    axis = axis_of_entry(line)
+    axis = axis_from_entry(line)
     mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
     tube_px = 1e3 * trial.diameter_m / mm_per_px
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(recording.width, recording.height)

@@ -1,8 +1,9 @@
-"""The growth axis: a line in the picture, given by the user or found from the motion itself.
+"""The growth axis: a line in the picture, given by the user or found from the motion.
 
-Nothing is assumed about where the vine enters, how bright it is, or whether it rests at first: a pixel that a
-growing vine covers changes once, and the moments of change grow along one line. Every line of a coarse fan is asked
-how much change a monotone path along it collects; the best is refined by the pixels that agree with it.
+A pixel that a growing vine covers changes once, and the times of change increase along one line. Nothing is assumed
+about where the vine enters, how bright it is, or whether it rests at first. For each line of a coarse fan, the change
+collected by a monotone path along it is computed by dynamic programming; the best line is refined on the pixels that
+change when the path passes them.
 """
 
 from __future__ import annotations
@@ -21,20 +22,23 @@ from vinetrack.video.kymograph import fan_gains, passing_times
 from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 LEAST_FRONT_SHARE = 0.45
-"""Share of all change that one front explains where nothing else of weight goes on. Chosen: a swinging door takes a
-fifth; by reasoning, at half it is taken for the axis, at twice payloads make a recording disorderly."""
+"""Least share of all change that one front explains where nothing else of weight moves. Chosen: a swinging door takes a
+fifth; by reasoning, at half a door is taken for the axis, at twice payloads make a recording disorderly."""
 MOST_TURN_DEG = 8.0
-"""Chosen: how far a given axis is turned onto the motion. One drawn by hand over some hundred pixels errs by a degree
-or two; with half of it an axis 5 degrees off stays off, with twice of it a wide strip lets in what crosses it."""
-PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Parts of a recording, from its beginning, that may be orderly. Chosen: steps of a quarter; more cost time alone."""
-LEAST_ROUNDS, MOST_ROUNDS = 3, 20
-"""Rounds in which a line is refined by the pixels that agree with it. Chosen: a line moves less than a pixel after the
-third; the band widens by a seventh each, from 3 % of the picture's diagonal to the fifth that it may be in 15. With at
-most half of them wide tubes are seen in part, with twice nothing changes."""
-WIDENS = 1.05
-"""Growth of that band in a round, from which another follows. Chosen: between none and the seventh by which it widens
-within a tube. By reasoning: at twice the growth wide tubes are seen in part, at half rounds are spent on noise."""
+"""Largest angle by which a given axis is turned onto the motion. Chosen: one drawn by hand over some hundred pixels
+errs by a degree or two; with half, an axis 5 degrees off stays off; with twice, a wide strip lets in what crosses
+it."""
+BEGINNINGS = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+"""Fractions of a recording, from its start, that may be orderly where the whole is not. Chosen: steps of a quarter;
+more cost time alone."""
+FEWEST_REFINEMENTS, MOST_REFINEMENTS = 3, 20
+"""Fewest and most times that a line is refined on the pixels that agree with it. Chosen: a line moves less than a pixel
+after the third; the band widens by a seventh each time, from 3 % of the picture's diagonal to the fifth that it may be
+in 15. With at most half of them wide tubes are seen in part, with twice nothing changes."""
+BAND_GROWTH = 1.05
+"""Growth of that band in one refinement above which another follows. Chosen: between none and the seventh by which it
+widens within a tube. By reasoning: at twice the growth wide tubes are seen in part, at half refinements are spent on
+noise."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Axis:
 
     @property
     def length_px(self) -> float:
-        """Distance between its ends."""
+        """Distance between the ends."""
         return float(np.hypot(self.to_px[0] - self.from_px[0], self.to_px[1] - self.from_px[1]))
 
     @property
@@ -92,7 +96,7 @@ class Axis:
         return start + along[..., None] * self.direction + across[..., None] * self.normal
 
     def moved(self, dx_px: float, dy_px: float) -> Axis:
-        """Return the same axis in a picture whose origin is elsewhere.
+        """Shift the axis into a picture whose origin is elsewhere.
 
         Parameters
         ----------
@@ -107,16 +111,16 @@ class Axis:
 
 
 FrontShare = Callable[[Axis], float]
-"""How much of what changes along an axis is a front that passes once; see `front_share`."""
+"""Function from an axis to its share of change that is a front passing once; see `front_share`."""
 
 
 def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
-    """Find the axis of growth from the motion itself.
+    """Find the growth axis from the motion.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
-    grows : whether it is a tube that stays where it has grown, and not a body that passes.
+    grows : True for a tube, which stays where it has grown; False for a body, which passes.
 
     Returns
     -------
@@ -127,33 +131,38 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
     RecordingError
         Where nothing moves, or what moves follows no line.
     """
-    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
-    small = seen.frames
+    small_pictures = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    small = small_pictures.frames
     if len(small) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
-    best = _line_of(small, seen.grown) if grows else _NO_LINE
+    best = _line_through(small, small_pictures.grown) if grows else _NO_LINE
     if best.collected <= 0:
-        best = _line_of(small, seen.changed, insist=True)
-    if best.order < LEAST_FRONT_SHARE:
-        # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
-        stays = grows and seen.grown is not seen.changed
-        for part in PREFIXES:
-            count = max(3, int(part * len(small)))
-            shorter = _line_of(small, _until(part, seen.grown) if stays else changed_pixels(small, count), patient=True)
-            worth = shorter.order * shorter.collected
-            if shorter.order >= LEAST_FRONT_SHARE and (
-                best.order < LEAST_FRONT_SHARE or worth > best.order * best.collected
+        best = _line_through(small, small_pictures.changed, insist=True)
+    if best.front_share < LEAST_FRONT_SHARE:
+        # The vine meets a wall, bends or sweeps: the axis is that of the longest orderly beginning.
+        use_lasting = grows and small_pictures.grown is not small_pictures.changed
+        for fraction in BEGINNINGS:
+            count = max(3, int(fraction * len(small)))
+            shorter = _line_through(
+                small,
+                _pixels_until(fraction, small_pictures.grown) if use_lasting else changed_pixels(small, count),
+                early_first=True,
+            )
+            collected_in_order = shorter.front_share * shorter.collected
+            if shorter.front_share >= LEAST_FRONT_SHARE and (
+                best.front_share < LEAST_FRONT_SHARE or collected_in_order > best.front_share * best.collected
             ):
                 best = shorter
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
-    return _to_picture(best, seen.factor, seen.shape)
+    return _to_picture(best, small_pictures.factor, small_pictures.shape)
 
 
 def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
-    """How much of what grows along `axis` is a front that passes once.
+    """Share of the change along an axis that is one front passing once.
 
-    Where hardly any of what changes along it stays (LEAST_GROWN), all that changes there is asked instead.
+    Only pixels whose change lasts count (`SmallPictures.grown`), or all that change where hardly any of that lasts
+    (LEAST_GROWN).
 
     Parameters
     ----------
@@ -162,44 +171,44 @@ def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
 
     Returns
     -------
-    its share, 0 to 1: less than LEAST_FRONT_SHARE where the vine bends or sweeps away.
+    0 to 1; less than LEAST_FRONT_SHARE where the vine bends or sweeps away.
 
     Raises
     ------
     RecordingError
         Where nothing moves along the axis.
     """
-    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
-    scaled = _shrunk(axis, seen.factor)
+    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    scaled = _in_small_pictures(axis, small.factor)
     angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
-    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*seen.frames.shape[1:])))
-    line, grown = _beside(seen.changed, scaled, band), _beside(seen.grown, scaled, band)
-    n_times = seen.changed[-1]
-    if len(line[0]) < 12:
+    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*small.frames.shape[1:])))
+    near, near_lasting = _pixels_near(small.changed, scaled, band), _pixels_near(small.grown, scaled, band)
+    n_times = small.changed[-1]
+    if len(near[0]) < 12:
         raise RecordingError("nothing moves along the axis")
-    if len(grown[0]) >= max(12, LEAST_GROWN * len(line[0])):
-        line = grown
-    agree, _, _ = pixels_on_front(*line, n_times, angle, np.array(scaled.from_px), band)
-    return float(line[3][agree].sum() / line[3].sum())
+    if len(near_lasting[0]) >= max(12, LEAST_GROWN * len(near[0])):
+        near = near_lasting
+    agree, _, _ = pixels_on_front(*near, n_times, angle, np.array(scaled.from_px), band)
+    return float(near[3][agree].sum() / near[3].sum())
 
 
-def _beside(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Place, time and worth of those pixels that lie nearer to an axis than `band`."""
+def _pixels_near(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Place, time and weight of the pixels nearer to an axis than `band`."""
     x, y, time, weight, _ = pixels
-    near = np.abs((np.column_stack([x, y]) - axis.from_px) @ axis.normal) < band
-    return x[near], y[near], time[near], weight[near]
+    inside = np.abs((np.column_stack([x, y]) - axis.from_px) @ axis.normal) < band
+    return x[inside], y[inside], time[inside], weight[inside]
 
 
 def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
-    """A given axis moved and turned onto the line of what moves within its width, and as wide as that.
+    """Move and turn a given axis onto the line of what moves within its width, and make it as wide as that.
 
-    It keeps its ends' places along itself: only what lies across is corrected, by up to half of `given.width_px` and
-    MOST_TURN_DEG. Of several bodies within the width the one that collects more change, and lies nearer, is taken.
+    The ends keep their places along the axis: only the position across is corrected, by up to half of `given.width_px`
+    and MOST_TURN_DEG. Of several bodies within the width, the one that collects more change and lies nearer is taken.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
-    given : axis in the picture, its width that of the strip to look in, px.
+    given : axis in the picture, with the width of the strip to search in, px.
 
     Returns
     -------
@@ -210,18 +219,18 @@ def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
     RecordingError
         Where nothing moves within the width.
     """
-    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
-    scaled, factor = _shrunk(given, seen.factor), seen.factor
-    x, y, time, weight, n_times = seen.changed
+    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    scaled, factor = _in_small_pictures(given, small.factor), small.factor
+    x, y, time, weight, n_times = small.changed
     reach = max(0.5 * scaled.width_px, 3.0)
-    offset = np.column_stack([x, y]) - scaled.from_px
-    across = offset @ scaled.normal
-    near = (np.abs(across) < reach) & (
-        np.abs(offset @ scaled.direction - scaled.length_px / 2) < 0.6 * scaled.length_px
+    from_start = np.column_stack([x, y]) - scaled.from_px
+    across = from_start @ scaled.normal
+    inside = (np.abs(across) < reach) & (
+        np.abs(from_start @ scaled.direction - scaled.length_px / 2) < 0.6 * scaled.length_px
     )
-    if near.sum() < 12:
+    if inside.sum() < 12:
         raise RecordingError("nothing moves along the axis")
-    pixels = x[near], y[near], time[near], weight[near], n_times
+    pixels = x[inside], y[inside], time[inside], weight[inside], n_times
     line = _line_near(*pixels, scaled, reach)
     if line is None:
         return given
@@ -237,45 +246,47 @@ def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
 
 @dataclass(frozen=True)
 class _Line:
-    """A line in the small pictures and how much change it collects: `order` is its share of all change."""
+    """A line in the small pictures and how much change it collects; `front_share` is its share of all change."""
 
     angle: float
     middle: Floats
     half: float
     ends: tuple[float, float]
     collected: float
-    order: float
+    front_share: float
 
 
 _NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
 
 
-def _shrunk(axis: Axis, factor: float) -> Axis:
-    """The axis in a picture that is smaller by a factor."""
+def _in_small_pictures(axis: Axis, factor: float) -> Axis:
+    """The axis in pictures that are smaller by a factor."""
     (a, b), (c, d) = axis.from_px, axis.to_px
     ends = [((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5) for x, y in ((a, b), (c, d))]
     return Axis(ends[0], ends[1], axis.width_px / factor)
 
 
-def _until(part: float, pixels: Pixels) -> Pixels:
-    """Those of some pixels that change in a part of the time, from its beginning."""
+def _pixels_until(part: float, pixels: Pixels) -> Pixels:
+    """Those pixels that change within a fraction of the recording, from its start."""
     x, y, time, weight, n_times = pixels
     early = time < part * n_times
     return x[early], y[early], time[early], weight[early], n_times
 
 
-def _line_of(small: NDArray[np.float32], changed: Pixels, patient: bool = False, insist: bool = False) -> _Line:
-    """The best line through pixels that change; where none is, an empty one, or an error where one is insisted on."""
+def _line_through(
+    small: NDArray[np.float32], changed: Pixels, early_first: bool = False, insist: bool = False
+) -> _Line:
+    """The best line through pixels that change; without one an empty line, or an error where `insist`."""
     x, y, time, weight, n_times = changed
     if len(x) < 12:
         return _NO_LINE
     diagonal = float(np.hypot(*small.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
-    # Of a vine that bends and sweeps what comes first counts most; else a door, which swings first, would count too.
-    early = weight * (1 - 0.8 * time / n_times) if patient else weight
+    # Of a vine that bends and sweeps, early change counts most; elsewhere a door, which swings first, would too.
+    discounted = weight * (1 - 0.8 * time / n_times) if early_first else weight
     try:
-        angle, middle = _best_line(x, y, time, early, n_times, band, diagonal)
-        return _converged(changed, angle, middle, band, 0.2 * diagonal)
+        angle, middle = _best_line(x, y, time, discounted, n_times, band, diagonal)
+        return _refined_line(changed, angle, middle, band, 0.2 * diagonal)
     except RecordingError:
         if insist:
             raise
@@ -283,34 +294,34 @@ def _line_of(small: NDArray[np.float32], changed: Pixels, patient: bool = False,
 
 
 def _line_near(
-    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, given: Axis, reach: float
+    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, given: Axis, half_width: float
 ) -> _Line | None:
-    """The line near a given one along which most change is collected in order, refined; None where none is.
+    """Refine the line near a given one along which most change is collected in order; None where there is none.
 
-    All in the small pictures. Lines that leave the middle of the given width count less, to a half at its border.
+    All in the small pictures. Lines that leave the middle of the given width count less, down to a half at its border.
     """
-    band = float(np.clip(0.25 * reach, 2.0, 6.0))
+    band = float(np.clip(0.25 * half_width, 2.0, 6.0))
     start = float(np.arctan2(given.direction[1], given.direction[0]))
     middle = np.asarray(given.points(np.array(given.length_px / 2)))
     length = int(2 * given.length_px) + 4
-    bins = int(np.ceil(2 * reach / band)) + 3
-    best, angle, point = 0.0, start, middle
+    bins = int(np.ceil(2 * half_width / band)) + 3
+    best_value, angle, point = 0.0, start, middle
     for turn in np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0)):
         unit = np.array([np.cos(start + turn), np.sin(start + turn)])
         side = np.array([-unit[1], unit[0]])
-        place = np.column_stack([x, y]) - middle
-        along, across = place @ unit + length / 2, (place @ side + reach) / band
+        relative = np.column_stack([x, y]) - middle
+        along, across = relative @ unit + length / 2, (relative @ side + half_width) / band
         inside = (across >= 0) & (across < bins) & (along >= 0) & (along < length)
-        gathered = fan_gains(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
-        away = (np.arange(gathered.size) + 1) * band - reach
-        worth = gathered * (1 - 0.5 * np.clip(away / reach, -1, 1) ** 2)
-        i = int(np.argmax(worth))
-        if worth[i] > best:
-            best, angle, point = float(worth[i]), start + float(turn), middle + away[i] * side
-    if best <= 0:
+        gains = fan_gains(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
+        offset = (np.arange(gains.size) + 1) * band - half_width
+        value = gains * (1 - 0.5 * np.clip(offset / half_width, -1, 1) ** 2)
+        i = int(np.argmax(value))
+        if value[i] > best_value:
+            best_value, angle, point = float(value[i]), start + float(turn), middle + offset[i] * side
+    if best_value <= 0:
         return None
     try:
-        return _converged((x, y, time, weight, n_times), angle, point, 2 * band, reach)
+        return _refined_line((x, y, time, weight, n_times), angle, point, 2 * band, half_width)
     except RecordingError:
         return None
 
@@ -318,93 +329,99 @@ def _line_near(
 def _best_line(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, band: float, diagonal: float
 ) -> tuple[float, Floats]:
-    """Direction (rad, x towards y) and a point of the line along which most change is collected in order."""
+    """Direction (rad, from x towards y) and a point of the line along which most change is collected in order."""
     middle = np.array([x.mean(), y.mean()])
     bins = int(np.ceil(2 * diagonal / band)) + 3
-    best, chosen = -1.0, (0.0, middle)
+    best_gain, best_line = -1.0, (0.0, middle)
     for angle in np.radians(np.arange(0, 360, 6.0)):
         along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
         across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
-        gathered = fan_gains(
+        gains = fan_gains(
             along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times
         )
-        i = int(np.argmax(gathered))
-        if gathered[i] > best:
+        i = int(np.argmax(gains))
+        if gains[i] > best_gain:
             offset = (i + 1) * band - diagonal
-            best = float(gathered[i])
-            chosen = (float(angle), middle + offset * np.array([-np.sin(angle), np.cos(angle)]))
-    return chosen
+            best_gain = float(gains[i])
+            best_line = (float(angle), middle + offset * np.array([-np.sin(angle), np.cos(angle)]))
+    return best_line
 
 
 def pixels_on_front(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
-    """Find the pixels that change when the best ordered path along a line passes them.
+    """Find the pixels that change when the best monotone path along a line passes them.
 
     Parameters
     ----------
     x, y : places of pixels that change, shape (n_pixels,), px.
-    time, weight : when, counted in pictures, and how much; shape (n_pixels,).
-    n_times : pictures.
+    time, weight : time of change, counted in pictures, and its weight; shape (n_pixels,).
+    n_times : number of pictures.
     angle, middle : direction of the line, rad, and a point on it, px.
     band : distance from the line within which pixels count, px.
 
     Returns
     -------
-    which agree, shape (n_pixels,), and the places of all along and across the line, px.
+    mask of the pixels on the front, shape (n_pixels,), and the places of all along and across the line, px.
     """
     along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
     across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
-    place = ((along - float(along.min())) / 2).astype(int)
-    near = np.abs(across) < band
-    table = np.zeros((n_times, int(place.max()) + 1))
-    np.add.at(table, (time[near].astype(int), place[near]), weight[near])
-    passed = passing_times(table)
-    agree = near & (np.abs(time - passed[place]) <= order_tolerance(n_times))
-    return agree, along, across
+    bin_index = ((along - float(along.min())) / 2).astype(int)
+    inside = np.abs(across) < band
+    table = np.zeros((n_times, int(bin_index.max()) + 1))
+    np.add.at(table, (time[inside].astype(int), bin_index[inside]), weight[inside])
+    passing_time = passing_times(table)
+    on_front = inside & (np.abs(time - passing_time[bin_index]) <= order_tolerance(n_times))
+    return on_front, along, across
 
 
-def _converged(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
-    """The line refined until its band, at most `most_band` wide to either side, no longer widens."""
-    for round_ in range(1, MOST_ROUNDS + 1):
-        angle, middle, half, ends, collected = _refine(*pixels, angle, middle, band)
+def _refined_line(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
+    """Refine a line until its band no longer widens; the band reaches at most `most_band` to either side."""
+    for round_ in range(1, MOST_REFINEMENTS + 1):
+        angle, middle, half, ends, collected = _refine_once(*pixels, angle, middle, band)
         narrower, band = band, float(np.clip(1.2 * half, 2.0, most_band))
-        if round_ >= LEAST_ROUNDS and band < WIDENS * narrower:
+        if round_ >= FEWEST_REFINEMENTS and band < BAND_GROWTH * narrower:
             break
     return _Line(angle, middle, half, ends, collected, collected / float(pixels[3].sum()))
 
 
-def _refine(
+def _refine_once(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[float, Floats, float, tuple[float, float], float]:
-    """Line through the pixels that agree with a path: direction, point, half width, ends along it, their worth."""
+    """Principal axis of the pixels on the front: direction, point, half width, ends along it, their total weight."""
     along_unit = np.array([np.cos(angle), np.sin(angle)])
-    agree, _, _ = pixels_on_front(x, y, time, weight, n_times, angle, middle, band)
-    if agree.sum() < 8:
+    on_front, _, _ = pixels_on_front(x, y, time, weight, n_times, angle, middle, band)
+    if on_front.sum() < 8:
         raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
-    w = weight[agree]
-    points = np.column_stack([x, y])[agree]
-    centre = np.average(points, axis=0, weights=w)
-    spread = np.cov((points - centre).T, aweights=w)
-    values, vectors = np.linalg.eigh(spread)
-    main = vectors[:, 1] * np.sign(vectors[:, 1] @ along_unit)
-    if values[1] < 2.0 * values[0] or main @ along_unit < 0.8:
-        main = along_unit
-    side = np.array([-main[1], main[0]])
+    on_front_weight = weight[on_front]
+    points = np.column_stack([x, y])[on_front]
+    centre = np.average(points, axis=0, weights=on_front_weight)
+    covariance = np.cov((points - centre).T, aweights=on_front_weight)
+    values, vectors = np.linalg.eigh(covariance)
+    principal = vectors[:, 1] * np.sign(vectors[:, 1] @ along_unit)
+    if values[1] < 2.0 * values[0] or principal @ along_unit < 0.8:
+        principal = along_unit
+    side = np.array([-principal[1], principal[0]])
     lateral = (points - centre) @ side
-    shift = float(np.median(np.repeat(lateral, np.maximum(1, w.astype(int)))))
+    shift = float(np.median(np.repeat(lateral, np.maximum(1, on_front_weight.astype(int)))))
     half = float(np.quantile(np.abs(lateral - shift), 0.95)) + 0.5
-    s = (points - centre) @ main
-    ends = float(np.quantile(s, 0.002)), float(np.quantile(s, 0.998))
-    return float(np.arctan2(main[1], main[0])), centre + shift * side, half, ends, float(w.sum())
+    along = (points - centre) @ principal
+    ends = float(np.quantile(along, 0.002)), float(np.quantile(along, 0.998))
+    return (
+        float(np.arctan2(principal[1], principal[0])),
+        centre + shift * side,
+        half,
+        ends,
+        float(on_front_weight.sum()),
+    )
 
 
 def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
-    """Back to full pixels, with room behind, and ahead as far as the picture goes."""
+    """Convert a line to full pixels, with a margin behind it, and extended ahead to the border of the picture."""
     along, (height, width) = np.array([np.cos(line.angle), np.sin(line.angle)]), shape
-    room = 6.0 * line.half + 12.0
+    margin = 6.0 * line.half + 12.0
     centre = (line.middle + 0.5) * factor - 0.5
-    start, stop = (line.ends[0] - room) * factor, np.inf
+    start, stop = (line.ends[0] - margin) * factor, np.inf
     low, high = -np.inf, np.inf
     for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
         if abs(unit) > 1e-6:

@@ -1,4 +1,4 @@
-"""Whether the growth axes of recordings agree: what one camera films grows along one line of its picture."""
+"""Whether the growth axes of recordings agree: vines filmed by one camera grow along one line of its picture."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from vinetrack.core.records import Trial
 
 ASKEW_DEG = 10.0
-"""Angle between a recording's axis and that of most others from which it is named. Chosen: axes that are found err by a
-degree or two, and a door that swings before a tip turns them by 30 or more. At half axes of short growth are named; at
-twice one that leads past the tube's far end is not."""
+"""Angle between a recording's axis and that of most others above which the recording is named. Chosen: axes found from
+the motion err by a degree or two, and a door that swings in front of a tip turns them by 30 or more. At half, axes of
+short growth are named; at twice, one that leads past the tube's far end is not."""
 FEWEST_ALIKE = 3
-"""Recordings whose axes agree, from which the others are judged. Chosen: two may agree by chance. By reasoning: with
-two a pair of wrong ones accuses a right one, with six small campaigns are never judged."""
+"""Fewest recordings whose axes agree from which the others are judged. Chosen: two may agree by chance. By reasoning:
+with two, a pair of wrong ones accuses a right one; with six, small campaigns are never judged."""
 
 
 def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
@@ -34,15 +34,15 @@ def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) 
 
 
 def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
-    """Recordings whose axis is not that of most others, where most agree.
+    """Recordings whose axis differs from that of most others, where most agree.
 
     Parameters
     ----------
-    slopes_deg : direction of each recording's axis by its name, as `slope_deg` gives it.
+    slopes_deg : direction of the axis by name of recording, from `slope_deg`.
 
     Returns
     -------
-    their names, and how many recordings agree; no names where fewer than FEWEST_ALIKE, or not most, do.
+    their names, and how many recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
     """
     straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
     agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
@@ -55,16 +55,16 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
 def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:
     """Trials whose axis was found askew to that of most others that grow at the same angle.
 
-    Bodies that fly free and trials whose axis was given are not compared.
+    Bodies that fly free and trials with a given axis are not compared.
 
     Parameters
     ----------
-    slopes_deg : direction of the axis by a trial's name, as `slope_deg` gives it, of those that have one.
+    slopes_deg : direction of the axis by name of trial, from `slope_deg`, of those that have one.
     trials : of the experiment.
 
     Returns
     -------
-    names, and how many agree against them, for every growth angle at which any is askew.
+    names, and how many others agree, for every growth angle at which any is askew.
     """
     by_angle: dict[float, dict[str, float]] = {}
     for trial in trials:

@@ -1,6 +1,6 @@
-"""A printed board of which nothing is known: its kind, squares and dictionary, read off a picture.
+"""Recognise an unknown printed board in a picture: its kind, its squares and its dictionary.
 
-Sizes in millimetres cannot be seen; the share of a square that its marker takes can.
+Sizes in millimetres cannot be seen; the ratio of a marker to its square can.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from vinetrack.video.target_corners import (
 )
 
 FEWEST_MARKERS = 6
-"""Markers by which a board is told from chance. Chosen: of OpenCV's families one word in some hundreds is met by chance
-in a cluttered picture; with half, clutter may pass; with twice, a board half hidden is missed."""
-IN_PLACE = 0.8
-"""Share of the markers that must lie where a board has them. Chosen: as `charuco_corners` asks; at half a wrong
+"""Fewest markers that distinguish a board from chance. Chosen: of OpenCV's families one word in some hundreds is met by
+chance in a cluttered picture; with half, clutter may pass; with twice, a board half hidden is missed."""
+LEAST_AGREEMENT = 0.8
+"""Least share of the markers that must lie where a board has them. Chosen as in `charuco_corners`; at half a wrong
 layout of the same count may pass, twice cannot be."""
 MOST_SQUARES = 40
-"""Squares along a side at most; chosen: boards of more have markers of a few pixels. At half a long ruler of squares is
+"""Most squares along a side. Chosen: boards of more have markers of a few pixels. At half a long ruler of squares is
 missed; twice doubles the search."""
-HIDDEN = 2
-"""Markers at the end of a board that may be hidden; chosen: one row of a small board."""
+HIDDEN_MARKERS = 2
+"""Markers at the end of a board that may be hidden. Chosen: one row of a small board."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class BoardSeen:
 
 
 def find_board(picture: NDArray[Any]) -> BoardSeen | None:
-    """The printed board in a picture.
+    """Find the printed board in a picture.
 
     Parameters
     ----------
@@ -70,31 +70,32 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
 
 def _charuco(corners: Any, ids: NDArray[np.int32], family: str) -> BoardSeen | None:
     """The layout on which most markers lie in place; None where no layout has enough of them."""
-    best, chosen = 0.0, None
+    best_share, best_board = 0.0, None
     for squares in _layouts(int(ids.max()) + 1):
-        # Any share below 1 will do: middles of markers tell the layout, and their size is then measured.
+        # Any marker size below 1 will do: the layout follows from the markers' centres, and their size is measured.
         board = Charuco(kind="charuco", image="", squares=squares, square_mm=1.0, marker_mm=0.7, dictionary=family)
         share, marker = marker_agreement(corners, ids, board, _largest(family))
-        if share > best:
+        if share > best_share:
             dictionary = _smallest(family, squares[0] * squares[1] // 2)
-            best, chosen = share, BoardSeen("charuco", squares, dictionary, marker, len(ids))
-    return chosen if best >= IN_PLACE else None
+            best_share, best_board = share, BoardSeen("charuco", squares, dictionary, marker, len(ids))
+    return best_board if best_share >= LEAST_AGREEMENT else None
 
 
 def _layouts(n_markers: int) -> Iterator[tuple[int, int]]:
-    """Squares across and down of boards with so many markers, or a few more."""
+    """Squares across and down of the boards with this many markers, or a few more."""
     for across in range(2, MOST_SQUARES + 1):
         for down in range(2, MOST_SQUARES + 1):
-            if n_markers <= across * down // 2 <= n_markers + HIDDEN:
+            if n_markers <= across * down // 2 <= n_markers + HIDDEN_MARKERS:
                 yield across, down
 
 
 def _largest(family: str) -> str:
+    """The largest dictionary of a family."""
     return f"{family}_{DICTIONARY_SIZES[-1]}" if family[-2] == "X" else family
 
 
 def _smallest(family: str, n_markers: int) -> str:
-    """The smallest dictionary of a family that has words for a board."""
+    """The smallest dictionary of a family that has enough words for a board."""
     if family[-2] != "X":
         return family
     return f"{family}_{next((size for size in DICTIONARY_SIZES if size >= n_markers), DICTIONARY_SIZES[-1])}"

@@ -1,9 +1,10 @@
-"""A finite body that moves as a whole (travel ratio 1), registered against itself along the axis.
+"""Track a body that moves as a whole (travel ratio 1) by registering it against itself along the axis.
 
-It leaves background behind it, perhaps dark on dark, so there is no film to compare with: a template is cut where the
-body is best seen, found again in every frame by correlation, refined by robust least squares with gain and level
-free, and replaced by the mean of what was found. Each pixel of the template counts by how little it varies from frame
-to frame: the body's own marks much, background that shows beside it little. The reported point is fixed on the body.
+The body leaves background behind it, perhaps dark on dark, so that there is no film to compare with. A template is cut
+where the body is most clearly visible, found in every frame by correlation, refined by robust least squares with gain
+and level free, and replaced by the median of the patches found. Each pixel of the template is weighted by the inverse
+of its variance from frame to frame: the body's own marks count much, background visible beside it little. The reported
+point is fixed on the body.
 """
 
 from __future__ import annotations
@@ -16,55 +17,58 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.strip import Strip
 
-SEARCH_ROWS = 8
-"""Rows across by which the body may stray from the axis, from frame to frame of the search. Chosen: a body that strays
-by 8 px in a frame leaves the strip soon. By reasoning: at half, tumbling bodies are lost; at twice the search takes
-twice the time."""
-SEARCH_PX = 14
+SEARCH_ACROSS_PX = 8
+"""Distance across the axis by which the body may deviate in the search. Chosen: a body that moves 8 px across in a
+frame leaves the strip soon. By reasoning: at half, tumbling bodies are lost; at twice the search takes twice the
+time."""
+SEARCH_ALONG_PX = 14
 """Distance along the axis searched about the expected place. Chosen: speeds change by less than 14 px a frame between
-frames. By reasoning: at half, sudden stops are lost; at twice a neighbour that looks alike may be taken."""
-STEPS = 8
-"""Gauss–Newton steps of a registration at most. Chosen: they converge quadratically from within a pixel; more cost
-time alone."""
+frames. By reasoning: at half, sudden stops are lost; at twice, a similar neighbour may be taken."""
+MOST_STEPS = 8
+"""Most Gauss-Newton steps of a registration. Chosen: they converge quadratically from within a pixel; more cost time
+alone."""
 
-REFINEMENTS = 3
-"""Times the template is replaced by the mean of what was found. Chosen: each takes out most of the noise of the one
-before; more cost time alone."""
+TEMPLATE_UPDATES = 3
+"""Times that the template is replaced by the median of the patches found. Chosen: each removes most of the noise of the
+one before; more cost time alone."""
 
 MISPLACED_PX = 0.5
-"""Misplacement that the weights of the template forgive. Chosen: the error of a first, coarse place. By reasoning: at
+"""Misplacement that the weights of the template allow for. Chosen: the error of a first, coarse place. By reasoning: at
 half, edges of the body count too little; at twice, background beside it counts too much."""
 POOR_MATCH = 0.6
-"""Correlation with the template under which a point is doubtful. Chosen above LOST_MATCH: two thirds of what varies is
+"""Correlation with the template below which a point is doubtful. Chosen above LOST_MATCH: two thirds of the variance is
 then unexplained (1 − 0.6²). By reasoning: below LOST_MATCH no point is ever doubtful; nearer to 1 every blurred one
 is."""
 LOST_MATCH = 0.4
-"""Chosen: correlation under which what was found is not the body. A body cut in half by the picture's edge keeps about
-0.5; with 0.2 textures of the background pass for a body, with 0.6 nothing is ever doubtful."""
-ABSENT = 0.7
-"""Chosen: where the background leaves less than this part of what the template leaves, the body is not there. At 1
-noise decides where body and background are alike; at half of it a body that left counts until its place is quiet."""
+"""Correlation below which the patch found is not the body. Chosen: a body cut in half by the picture's edge keeps about
+0.5; at 0.2 textures of the background pass for a body, at 0.6 nothing is ever doubtful."""
+ABSENT_RATIO = 0.7
+"""Ratio of the background's residual to the template's below which the body is absent. Chosen: at 1 noise decides where
+body and background are alike; at half, a body that has left counts until its place is quiet."""
 BACK_PX, BACK_SIGMA = 3.0, 6.0
-"""Chosen: a body this far behind where it was has turned back. A registration errs by 0.1 px; twice of it lets a bounce
-run on for some frames, half of it makes an end of one bad frame."""
-BACK_COST = 0.05
-"""Chosen: a step back on the coarse way costs this a pixel, in units of the score of a frame in which the body is seen:
-a bounce of 100 px pays within five frames, a hop back to a hand that let go does not."""
+"""Distance behind its furthest place at which a body has turned back, in px and in standard errors. Chosen: a
+registration errs by 0.1 px; at twice a bounce goes unnoticed for some frames, at half one bad frame ends the track."""
+BACK_COST_PER_PX = 0.05
+"""Cost of a step back on the coarse path, for each pixel, in units of the score of a frame in which the body is
+visible. Chosen: a bounce of 100 px pays within five frames, a hop back to a hand that let go does not."""
 
-HOPS_PX, HOPS_STEPS, FEWEST_HOPS = 3.0, 0.5, 5
-"""Roughness, as the standard deviation of single places, in px and in steps of a frame, from which what is followed is
-not one body; and the fourth differences from which that is told. Chosen: a registration errs by 0.1 px, and what hops
-between bodies by their distance. By reasoning: at half motion that sticks and slips at random is refused; at twice
-bodies hardly further apart than they are long are followed in turns."""
+HOP_NOISE_PX, HOP_NOISE_STEPS, FEWEST_DIFFERENCES = 3.0, 0.5, 5
+"""Roughness, as the standard deviation of single places, in px and in steps of a frame, above which what is followed is
+not one body; and the fewest fourth differences from which it is estimated. Chosen: a registration errs by 0.1 px, and
+hops between bodies by their distance. By reasoning: at half, motion that sticks and slips at random is refused; at
+twice, bodies hardly further apart than they are long are followed in turns."""
 
-BESIDE_PX = 2.0
+MARGIN_PX = 2.0
 """Distance beside the body's width at which a row counts half. Chosen: blur and an axis a little off. By reasoning: at
-half sides of tumbling bodies are cut off, at twice a neighbour 10 px beside is part of the body."""
+half, sides of tumbling bodies are cut off; at twice, a neighbour 10 px beside is part of the body."""
 
 
 @dataclass(frozen=True)
 class BodyEnd:
-    """Last frame of a body's way along the strip, where the recording goes on; `turns_back` or is not seen again."""
+    """Last frame of a body's motion along the strip, where the recording goes on.
+
+    The body `turns_back` there, or is not seen again.
+    """
 
     last_frame: int
     turns_back: bool
@@ -72,13 +76,13 @@ class BodyEnd:
 
 @dataclass(frozen=True)
 class BodyFit:
-    """Position of the body along the strip, arrays of shape (n_frames,).
+    """Position of the body along the strip; arrays of shape (n_frames,).
 
-    `position_px` is the column of the template's middle at mid-exposure, `across_px` its place across, `sigma_px` the
-    random error along, `match` the correlation with the template, `unsure` where that is poor or the body is cut by
-    the strip's end. `unseen` marks frames in which the body is not seen, or that come after the end of its motion along
-    the strip, which `end` tells; None where it lasts as long as the recording. `half_px` is half the length of the
-    template.
+    `position_px` is the column of the template's centre at mid-exposure, `across_px` its place across, `sigma_px` the
+    random error along, `match` the correlation with the template. `unsure` marks frames where that is poor or the body
+    is cut by the strip's end; `unseen` marks frames in which the body is not visible, or that come after the end of its
+    motion along the strip. `end` says how that ended, None where it lasts as long as the recording. `half_px` is half
+    the length of the template.
     """
 
     position_px: Floats
@@ -111,26 +115,26 @@ def track_body(strip: Strip) -> BodyFit:
 
     pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     pictures += strip.offset[:, None, None].astype(np.float32)
-    path, half, background = _coarse_path(pictures, strip.noise, _body_rows(pictures.shape[1], strip.axis.width_px))
+    path, half, background = _coarse_path(pictures, strip.noise, _row_weights(pictures.shape[1], strip.axis.width_px))
     if np.isfinite(strip.axis.width_px):
-        # A body is about as long as it is wide, a glint on it is not.
+        # A body is about as long as it is wide; a glint on it is shorter.
         half = max(half, round(0.75 * strip.axis.width_px))
     if np.ptp(path) < 3:
         raise RecordingError("nothing moves along the axis")
-    seed = _best_seen(path, half, pictures.shape[2])
-    template = _cut(pictures[seed], path[seed], 0.0, half)
-    body_rows = _body_rows(template.shape[0], strip.axis.width_px)
+    template_frame = _template_frame(path, half, pictures.shape[2])
+    template = _patch(pictures[template_frame], path[template_frame], 0.0, half)
+    body_rows = _row_weights(template.shape[0], strip.axis.width_px)
     weight = np.ones_like(template) * body_rows
     place = np.column_stack([path, np.zeros(len(path))])
-    for turn in range(REFINEMENTS):
-        place, error, match = _find_all(pictures, template, weight, place, half, first=turn == 0)
-        template, weight = _mean_template(pictures, place, match, half, strip.noise)
+    for turn in range(TEMPLATE_UPDATES):
+        place, error, match = _register_all(pictures, template, weight, place, half, first=turn == 0)
+        template, weight = _median_template(pictures, place, match, half, strip.noise)
         weight = weight * body_rows
-    place, error, match = _find_all(pictures, template, weight, place, half, first=False)
+    place, error, match = _register_all(pictures, template, weight, place, half, first=False)
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
-    astray = np.abs(place[:, 1]) > SEARCH_ROWS - 0.5
-    unseen = (match < LOST_MATCH) | astray | _is_absent(pictures, background, template, weight, place, half)
-    end = _end_of_way(place[:, 0], error, match, unseen)
+    off_axis = np.abs(place[:, 1]) > SEARCH_ACROSS_PX - 0.5
+    unseen = (match < LOST_MATCH) | off_axis | _is_absent(pictures, background, template, weight, place, half)
+    end = _body_end(place[:, 0], error, match, unseen)
     if end is not None:
         unseen |= np.arange(len(unseen)) > end.last_frame
     if hops_between_bodies(place[:, 0], ~unseen):
@@ -142,7 +146,7 @@ def track_body(strip: Strip) -> BodyFit:
 
 
 def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
-    """Whether places scatter about any smooth motion by as much as they move on.
+    """Whether places scatter about any smooth motion by as much as they advance.
 
     Fourth differences cancel a cubic motion, and have 70 times the variance of single places.
 
@@ -158,84 +162,86 @@ def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
     if len(along) < 5:
         return False
     windows = np.lib.stride_tricks.sliding_window_view
-    whole = windows(seen & np.isfinite(along), 5).all(axis=1)
-    if whole.sum() < FEWEST_HOPS:
+    complete = windows(seen & np.isfinite(along), 5).all(axis=1)
+    if complete.sum() < FEWEST_DIFFERENCES:
         return False
-    pieces = windows(along, 5)[whole]
-    rough = 1.4826 * float(np.median(np.abs(pieces @ np.array([1.0, -4.0, 6.0, -4.0, 1.0])))) / np.sqrt(70)
-    return bool(rough > max(HOPS_PX, HOPS_STEPS * float(np.median(np.abs(np.diff(pieces, axis=1))))))
+    stretches = windows(along, 5)[complete]
+    noise = 1.4826 * float(np.median(np.abs(stretches @ np.array([1.0, -4.0, 6.0, -4.0, 1.0])))) / np.sqrt(70)
+    return bool(noise > max(HOP_NOISE_PX, HOP_NOISE_STEPS * float(np.median(np.abs(np.diff(stretches, axis=1))))))
 
 
 def _is_absent(
     pictures: NDArray[np.float32], background: NDArray[np.float32], template: NDArray[np.float32],
     weight: NDArray[np.float32], place: Floats, half: int,
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """Frames in which the background alone explains better than the body what is where the body was found."""
+    """Frames in which the background alone explains the patch better than the body does."""
     absent = np.zeros(len(pictures), dtype=bool)
     share = weight / float(weight.sum())
-    inner = template - float(np.sum(share * template))
-    power = float(np.sum(share * inner**2)) + 1e-9
+    body_pattern = template - float(np.sum(share * template))
+    power = float(np.sum(share * body_pattern**2)) + 1e-9
     for t, picture in enumerate(pictures):
-        patch = _cut(picture, place[t, 0], place[t, 1], half)
+        patch = _patch(picture, place[t, 0], place[t, 1], half)
         patch = patch - float(np.sum(share * patch))
-        bare = patch - _cut(background, place[t, 0], place[t, 1], half)
-        bare -= float(np.sum(share * bare))
-        gain = float(np.clip(np.sum(share * patch * inner) / power, 0.3, 3.0))
-        body = patch - gain * inner
-        absent[t] = np.sum(share * bare**2) < ABSENT * np.sum(share * body**2)
+        background_residual = patch - _patch(background, place[t, 0], place[t, 1], half)
+        background_residual -= float(np.sum(share * background_residual))
+        gain = float(np.clip(np.sum(share * patch * body_pattern) / power, 0.3, 3.0))
+        body_residual = patch - gain * body_pattern
+        absent[t] = np.sum(share * background_residual**2) < ABSENT_RATIO * np.sum(share * body_residual**2)
     return absent
 
 
-def _body_rows(rows: int, width_px: float) -> NDArray[np.float32]:
-    """Weight of each row of the template, shape (n_rows, 1): falling beyond the body, where a neighbour may move."""
+def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
+    """Weight of each row of the template, shape (n_rows, 1), falling outside the body, where a neighbour may move."""
     if not np.isfinite(width_px):
         return np.ones((rows, 1), dtype=np.float32)
-    beyond = np.abs(np.arange(rows) - (rows - 1) / 2) - width_px / 2
-    return (1 / (1 + (np.clip(beyond, 0, None) / BESIDE_PX) ** 2)).astype(np.float32)[:, None]
+    outside = np.abs(np.arange(rows) - (rows - 1) / 2) - width_px / 2
+    return (1 / (1 + (np.clip(outside, 0, None) / MARGIN_PX) ** 2)).astype(np.float32)[:, None]
 
 
-def _end_of_way(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
-    """Where the body's way along the strip ends, None where the recording ends first.
+def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
+    """Where the body's motion along the strip ends, None where the recording ends first.
 
     It ends where the body turns back (a bounce), and where it is not recognised again (it tips over, or is gone).
     """
-    known = np.flatnonzero(~unseen & (match >= POOR_MATCH))
-    if len(known) < 3:
+    recognised = np.flatnonzero(~unseen & (match >= POOR_MATCH))
+    if len(recognised) < 3:
         return None
-    y = along[known]
-    behind = np.maximum.accumulate(y) - y
-    back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[known], nan=0.0))
-    turned = np.flatnonzero(back[:-1] & back[1:])
+    position = along[recognised]
+    behind = np.maximum.accumulate(position) - position
+    is_back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[recognised], nan=0.0))
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     if len(turned):
-        return BodyEnd(int(known[int(np.argmax(y[: turned[0]]))]), turns_back=True)
-    last = int(known[-1])
+        return BodyEnd(int(recognised[int(np.argmax(position[: turned[0]]))]), turns_back=True)
+    last = int(recognised[-1])
     return BodyEnd(last, turns_back=False) if last < len(along) - 2 else None
 
 
 def _coarse_path(
     pictures: NDArray[np.float32], noise: float, rows: NDArray[np.float32]
 ) -> tuple[Floats, int, NDArray[np.float32]]:
-    """Middle of the body by frame, to a few pixels, half its length along the axis, and the strip without it.
+    """Centre of the body by frame, to a few pixels; half its length along the axis; and the background of the strip.
 
-    Background is the median over frames spread evenly over the changes: a body that rests for long does not become
-    part of it.
+    The background is the median over frames spread evenly over the changes, so that a body that rests for long does not
+    become part of it.
     """
     n = len(pictures)
     change = np.zeros(n)
     change[1:] = np.abs(np.diff(pictures[:, ::2, ::2], axis=0)).clip(max=40).mean(axis=(1, 2))
-    total = np.cumsum(np.clip(change - 1.2 * float(np.quantile(change, 0.1)), 0, None) + 1e-3)
-    picks = np.unique(np.searchsorted(total, np.linspace(total[0], total[-1], min(n, 41))).clip(0, n - 1))
-    background = np.median(pictures[picks], axis=0)
-    strange = (rows * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
-    half = _half_length(strange)
+    cumulative = np.cumsum(np.clip(change - 1.2 * float(np.quantile(change, 0.1)), 0, None) + 1e-3)
+    sampled = np.unique(
+        np.searchsorted(cumulative, np.linspace(cumulative[0], cumulative[-1], min(n, 41))).clip(0, n - 1)
+    )
+    background = np.median(pictures[sampled], axis=0)
+    foreground = (rows * np.clip(np.abs(pictures - background) - 3 * noise, 0, 60)).sum(axis=1)
+    half = _half_length(foreground)
     box = np.ones(2 * half + 1)
-    score = np.stack([np.convolve(row, box, mode="same") for row in strange])
-    return _onward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half, background
+    score = np.stack([np.convolve(row, box, mode="same") for row in foreground])
+    return _forward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half, background
 
 
-def _half_length(strange: NDArray[np.float32]) -> int:
-    """Half the length of what differs from the background: from the width of its autocorrelation along the axis."""
-    rows = strange[np.argsort(strange.sum(axis=1))[len(strange) // 2 :]]
+def _half_length(foreground: NDArray[np.float32]) -> int:
+    """Half the length of what differs from the background, from the width of its autocorrelation along the axis."""
+    rows = foreground[np.argsort(foreground.sum(axis=1))[len(foreground) // 2 :]]
     rows = rows - rows.mean(axis=1, keepdims=True)
     spectrum = np.abs(np.fft.rfft(rows, n=2 * rows.shape[1], axis=1)) ** 2
     correlation = np.fft.irfft(spectrum.mean(axis=0))[: rows.shape[1] // 3]
@@ -244,47 +250,47 @@ def _half_length(strange: NDArray[np.float32]) -> int:
     return int(np.clip(0.8 * width, 6, rows.shape[1] // 5))
 
 
-def _onward_path(score: Floats) -> Floats:
-    """Place by frame, shape (n_frames,), that collects most score; steps back cost BACK_COST a pixel."""
+def _forward_path(score: Floats) -> Floats:
+    """Place by frame, shape (n_frames,), that collects most score, by dynamic programming; steps back have a cost."""
     n, columns = score.shape
     best = np.zeros_like(score)
-    came = np.zeros(score.shape, dtype=int)
+    came_from = np.zeros(score.shape, dtype=int)
     best[0] = score[0]
-    cost = BACK_COST * np.arange(columns)
+    cost = BACK_COST_PER_PX * np.arange(columns)
     for t in range(1, n):
-        ahead, ahead_from = _running_best(best[t - 1])
-        behind, behind_from = _running_best((best[t - 1] - cost)[::-1])
+        ahead, ahead_from = _running_maximum(best[t - 1])
+        behind, behind_from = _running_maximum((best[t - 1] - cost)[::-1])
         behind, behind_from = behind[::-1] + cost, columns - 1 - behind_from[::-1]
-        came[t] = np.where(ahead >= behind, ahead_from, behind_from)
+        came_from[t] = np.where(ahead >= behind, ahead_from, behind_from)
         best[t] = np.maximum(ahead, behind) + score[t]
     path = np.zeros(n)
     place = int(np.argmax(best[-1]))
     for t in range(n - 1, -1, -1):
         path[t] = place
-        place = came[t, place]
+        place = came_from[t, place]
     return path
 
 
-def _running_best(values: Floats) -> tuple[Floats, NDArray[np.int_]]:
-    """Largest value up to each place, and where it stands."""
+def _running_maximum(values: Floats) -> tuple[Floats, NDArray[np.int_]]:
+    """Largest value up to each place, and its index."""
     running = np.maximum.accumulate(values)
-    new = np.concatenate([[True], values[1:] > running[:-1]])
-    return running, np.maximum.accumulate(np.where(new, np.arange(values.size), 0))
+    is_new = np.concatenate([[True], values[1:] > running[:-1]])
+    return running, np.maximum.accumulate(np.where(is_new, np.arange(values.size), 0))
 
 
-def _best_seen(path: Floats, half: int, columns: int) -> int:
-    """A frame in which the whole body is inside and on its way, near the middle of those."""
+def _template_frame(path: Floats, half: int, columns: int) -> int:
+    """A frame in which the whole body is inside and moving, near the middle of those."""
     whole = np.flatnonzero((path > 1.3 * half) & (path < columns - 1 - 1.3 * half))
     moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
     chosen = np.array(moving) if len(moving) else whole
     return int(chosen[len(chosen) // 2]) if len(chosen) else len(path) // 2
 
 
-def _cut(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:
-    """Patch of 2 half + 1 columns about (along, across), all rows but SEARCH_ROWS on each side, bicubic."""
+def _patch(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:
+    """Patch of 2 half + 1 columns about (along, across), all rows but SEARCH_ACROSS_PX on each side, bicubic."""
     import cv2
 
-    rows = picture.shape[0] - 2 * SEARCH_ROWS
+    rows = picture.shape[0] - 2 * SEARCH_ACROSS_PX
     length = 2 * half + 1
     centre = (float(along), (picture.shape[0] - 1) / 2 + float(across))
     matrix = np.array([[1.0, 0.0, centre[0] - half], [0.0, 1.0, centre[1] - (rows - 1) / 2]])
@@ -292,7 +298,7 @@ def _cut(picture: NDArray[np.float32], along: float, across: float, half: int) -
     return np.asarray(cv2.warpAffine(picture, matrix, (length, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _find_all(
+def _register_all(
     pictures: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32], place: Floats, half: int,
     first: bool,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
@@ -303,77 +309,80 @@ def _find_all(
         guess = place[t]
         if first:
             guess = _by_correlation(picture, template, place[t], half)
-        out[t], error[t], match[t] = _refine(picture, template, weight, slope_along, slope_across, guess, half)
+        out[t], error[t], match[t] = _register(picture, template, weight, slope_along, slope_across, guess, half)
     return out, error, match
 
 
 def _by_correlation(picture: NDArray[np.float32], template: NDArray[np.float32], guess: Floats, half: int) -> Floats:
-    """Whole-pixel place of the best correlation about `guess`."""
+    """Whole-pixel place of the best normalised correlation about `guess`."""
     import cv2
 
-    reach = SEARCH_PX + half // 2
+    reach = SEARCH_ALONG_PX + half // 2
     low = int(np.clip(guess[0] - half - reach, 0, max(picture.shape[1] - template.shape[1], 0)))
     high = int(np.clip(guess[0] + half + reach + 1, low + template.shape[1], picture.shape[1]))
     if high - low < template.shape[1]:
         return guess
     score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-    return np.array([low + column + half, row - SEARCH_ROWS], dtype=float)
+    return np.array([low + column + half, row - SEARCH_ACROSS_PX], dtype=float)
 
 
-def _refine(
+def _register(
     picture: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32],
     slope_along: NDArray[np.float32], slope_across: NDArray[np.float32], guess: Floats, half: int,
 ) -> tuple[Floats, float, float]:  # fmt: skip
-    """Gauss-Newton on place, gain and level, robust by 1/(1 + (r/3s)²); error along the axis and correlation."""
+    """Gauss-Newton on place, gain and level with Cauchy weights 1/(1 + (r/3s)²).
+
+    Returns the place, its error along the axis and the correlation.
+    """
     place = guess.astype(float).copy()
     design = np.stack([slope_along, slope_across, template, np.ones_like(template)]).reshape(4, -1).astype(float)
     flat = weight.ravel().astype(float)
     sigma, correlation = np.nan, 0.0
     robust = flat
-    for _ in range(STEPS):
-        patch = _cut(picture, place[0], place[1], half).ravel().astype(float)
+    for _ in range(MOST_STEPS):
+        patch = _patch(picture, place[0], place[1], half).ravel().astype(float)
         weighted = design * robust
         normal = weighted @ design.T + np.diag([1e-9, 1e-9, 1e-9, 1e-9])
         solution = np.linalg.solve(normal, weighted @ patch)
         residual = patch - solution @ design
-        size = 1.4826 * float(np.median(np.abs(residual * np.sqrt(flat)))) + 1e-6
-        robust = flat / (1 + residual**2 * flat / (9 * size**2))
+        scale_of_residuals = 1.4826 * float(np.median(np.abs(residual * np.sqrt(flat)))) + 1e-6
+        robust = flat / (1 + residual**2 * flat / (9 * scale_of_residuals**2))
         gain = max(float(solution[2]), 0.1)
         step = solution[:2] / gain
-        # patch(x) = gain · template(x + step): the body lies `step` behind the place looked at.
+        # patch(x) = gain · template(x + step): the body lies `step` behind the assumed place.
         place -= np.clip(step, -2, 2)
-        place[1] = np.clip(place[1], -SEARCH_ROWS, SEARCH_ROWS)
+        place[1] = np.clip(place[1], -SEARCH_ACROSS_PX, SEARCH_ACROSS_PX)
         if np.abs(step).max() < 2e-3:
             break
     inverse = np.linalg.pinv(normal)
-    spread = float(np.sum(robust * residual**2) / max(np.sum(robust > 0.2 * flat) - 4, 1))
-    sigma = float(np.sqrt(max(inverse[0, 0], 0.0) * spread)) / gain
+    variance = float(np.sum(robust * residual**2) / max(np.sum(robust > 0.2 * flat) - 4, 1))
+    sigma = float(np.sqrt(max(inverse[0, 0], 0.0) * variance)) / gain
     model = solution[2] * design[2] + solution[3]
-    centred, other = patch - np.average(patch, weights=flat), model - np.average(model, weights=flat)
-    power = np.sqrt(np.sum(flat * centred**2) * np.sum(flat * other**2))
-    correlation = float(np.sum(flat * centred * other) / power) if power > 0 else 0.0
+    patch_deviation, model_deviation = patch - np.average(patch, weights=flat), model - np.average(model, weights=flat)
+    power = np.sqrt(np.sum(flat * patch_deviation**2) * np.sum(flat * model_deviation**2))
+    correlation = float(np.sum(flat * patch_deviation * model_deviation) / power) if power > 0 else 0.0
     return place, sigma, correlation
 
 
-def _mean_template(
+def _median_template(
     pictures: NDArray[np.float32], place: Floats, match: Floats, half: int, noise: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Median of what was found, and each pixel's weight: the inverse of its variance from frame to frame."""
+    """Median of the patches found, and each pixel's weight: the inverse of its variance from frame to frame."""
     whole = (place[:, 0] > 1.1 * half) & (place[:, 0] < pictures.shape[2] - 1 - 1.1 * half)
     good = np.flatnonzero(whole & (match >= np.quantile(match, 0.3)))
     if len(good) < 3:
         good = np.argsort(match)[-3:]
     good = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), 60)).astype(int))]
-    stack = np.stack([_cut(pictures[t], place[t, 0], place[t, 1], half) for t in good])
+    stack = np.stack([_patch(pictures[t], place[t, 0], place[t, 1], half) for t in good])
     first = np.median(stack, axis=0)
-    inner = first - first.mean()
-    gains = np.einsum("tij,ij->t", stack, inner) / float(np.sum(inner**2) + 1e-9)
+    pattern = first - first.mean()
+    gains = np.einsum("tij,ij->t", stack, pattern) / float(np.sum(pattern**2) + 1e-9)
     stack = stack / np.clip(gains, 0.3, 3.0)[:, None, None]
     stack -= np.median(stack - first, axis=(1, 2), keepdims=True)
     template = np.median(stack, axis=0).astype(np.float32)
     scatter = (1.4826 * np.median(np.abs(stack - template), axis=0)) ** 2
-    # A glint varies as its slope times the misplacement: that is what it is there to tell, not a fault of its own.
+    # A glint varies by its slope times the misplacement: that is the signal of the registration, not noise.
     slope = np.sum(np.square(np.gradient(template)), axis=0)
     variance = np.maximum(scatter - MISPLACED_PX**2 * slope, 0.0) + 2 * noise**2
     return template, (1.0 / variance).astype(np.float32)

@@ -1,8 +1,8 @@
-"""The scale of a recording: metres a pixel in the plane of growth, its error, and where each pixel looks.
+"""Calibrate a recording: metres a pixel in the plane of growth, the error of that scale, and the place of each pixel.
 
 `calibrate` reads the settings: a ChArUco board or a checkerboard in a picture, a clip or the recording itself, held in
-the plane in which the vine grows; two points and the distance between them; or the scale itself. The scale's error is
-one number for a whole recording, common to all its points, and kept apart from the random error of each.
+the plane in which the vine grows; two points and the distance between them; or the scale itself. The error of the scale
+is one number for a whole recording, common to all its points, and kept apart from the random error of each.
 """
 
 from __future__ import annotations
@@ -25,44 +25,45 @@ from vinetrack.video.plane_map import PlaneMap, fit_planes
 from vinetrack.video.target_corners import CornersError, charuco_corners, checkerboard_corners
 
 CLICK_SIGMA_PX = 0.5
-"""A point picked by hand in a picture is off by about half a pixel. Chosen: a hand points to about a pixel. At half or
-twice the stated error of such a scale halves or doubles."""
+"""Standard error of a point picked by hand in a picture. Chosen: a hand points to about a pixel. At half or twice the
+stated error of such a scale halves or doubles."""
 CORNER_BIAS_PX = 0.02
-"""Corners at one end of a target may all be off this much the same way (uneven light, blur), however many there are.
-Chosen: a fiftieth of a pixel, the size of what light from one side leaves. At half or twice the least error of a scale
-halves or doubles."""
-STILL_PX = 0.5
-"""Corners that wander by more than this over a clip belong to a target that was moved. Chosen: ten times the noise of
-a corner, far below a motion meant as one. By reasoning: at half a shaken tripod counts as a moved target; at twice
-slowly moved targets are averaged."""
+"""Bias that the corners at one end of a target may share (uneven light, blur), however many there are. Chosen: a
+fiftieth of a pixel, the size of what light from one side leaves. At half or twice the least error of a scale halves or
+doubles."""
+STATIONARY_PX = 0.5
+"""Motion of the corners over a clip above which the target was moved. Chosen: ten times the noise of a corner, far
+below an intended motion. By reasoning: at half a shaken tripod counts as a moved target; at twice slowly moved targets
+are averaged."""
 LARGEST_REPROJECTION_PX = 2.0
-"""Mean distance of the corners from the model beyond which the board is another one. Chosen: a wrong count of squares
-puts corners whole squares away, noise a fraction of a pixel. Half or twice changes only what bent boards pass."""
+"""Root mean square distance of the corners from the model above which the board is another one. Chosen: a wrong count
+of squares puts corners whole squares away, noise a fraction of a pixel. Half or twice changes only what bent boards
+pass."""
 
-MOST_PICTURES = 10
-"""Pictures of a clip that are read. Chosen: the error of averaged corners falls with the root of their number, and
+MOST_PICTURES_READ = 10
+"""Most pictures of a clip that are read. Chosen: the error of averaged corners falls with the root of their number, and
 CORNER_BIAS_PX remains; time grows in proportion."""
 
 SEARCHED_FRAMES = 300
-"""A target in a recording is looked for in its first frames, while nothing hides it yet. Chosen: 0.3 s at 1000 frames
-a second; at twice a vine may already stand before the target."""
+"""First frames of a recording in which a target is looked for, while nothing hides it yet. Chosen: 0.3 s at 1000 frames
+a second; at twice a vine may already stand in front of the target."""
 
 
 CHORD_PX = 4.0
-"""Distance of the places between which a curve is summed in the plane. Derived: a chord of 4 px of a curve of 30 px
-radius is short by 4²/24·30² = 0.07 %, of 100 px by 0.007 %."""
+"""Length of the chords over which a curve is summed in the plane. Derived: a chord of 4 px of a curve of 30 px radius
+is short by 4²/24·30² = 0.07 %, of 100 px by 0.007 %."""
 
 
 class CalibrationError(ValueError):
-    """A calibration that cannot be had: what is wrong and what to do, in one sentence."""
+    """A calibration that cannot be made: what is wrong and what to do, in one sentence."""
 
 
 @dataclass(frozen=True)
 class AxisScale:
     """The calibration along one growth axis.
 
-    `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative standard error (NaN where nothing is known of
-    it); `position_m` turns points of the picture (x, y), shape (n, 2), into metres along the axis from its start.
+    `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative standard error (NaN where unknown);
+    `position_m` maps points of the picture (x, y), shape (n, 2), to metres along the axis from its start.
     """
 
     m_per_px: float
@@ -72,13 +73,13 @@ class AxisScale:
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """What a calibration found.
+    """The result of a calibration.
 
     `m_per_px` and `scale_rel_sigma` hold across the middle of `covered_px` (left, top, right, bottom: the target's
-    corners, or the whole picture without one), along the picture's longer side; ask `along` for a growth axis.
-    `reprojection_px` is the root mean square distance of corners from the fit (NaN without a target), `n_corners` and
-    `n_pictures` what it rests on, `own_rel_sigma` the error of scale that the plane's fit does not know of; `notes`
-    are sentences for a person.
+    corners, or the whole picture without one), along the picture's longer side; `along` gives them for a growth axis.
+    `reprojection_px` is the root mean square distance of the corners from the fit (NaN without a target); `n_corners`
+    and `n_pictures` are what it rests on; `own_rel_sigma` is an error of scale that the plane's fit does not include;
+    `notes` are sentences for a person.
     """
 
     kind: str
@@ -138,17 +139,17 @@ class PlaneCalibration:
         return AxisScale(m_per_px, rel_sigma, position_m)
 
     def along_path(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
-        """Return the scale along an axis that may be a curve: of the length along it in the plane, not of its chord.
+        """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord.
 
         Parameters
         ----------
         axis : in the picture, px.
-        off_px : standard error of where the curve lies beside the middle of what grows, px: beside a curve that turns
-            by an angle θ the way is longer or shorter by θ · `off_px`.
+        off_px : standard error of the curve's place across the tube, px: beside a curve that turns by an angle θ the
+            path is longer or shorter by θ · `off_px`.
 
         Returns
         -------
-        as `along` does; `position_m` takes the nearest place along the curve.
+        as `along`; `position_m` takes the nearest place along the curve.
         """
         if not isinstance(axis, CurvedAxis):
             return self.along(axis.from_px, axis.to_px)
@@ -177,7 +178,7 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
     Parameters
     ----------
     settings : the `calibration` of `experiment.yaml`.
-    folder : the experiment's folder, from which `image` counts.
+    folder : the experiment's folder, to which `image` is relative.
     width_px, height_px : size of the recordings; pictures of a target must have it too.
 
     Returns
@@ -187,18 +188,18 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
     Raises
     ------
     CalibrationError
-        In one sentence, where the target cannot be read or does not fit what the settings say of it.
+        In one sentence, where the target cannot be read or contradicts the settings.
     """
     if isinstance(settings, MmPerPx):
         plane = PlaneMap.from_scale(settings.mm_per_px / 1000, width_px, height_px)
         note = "the scale is the one given as mm_per_px; nothing is known of its error, nor of distortion and tilt"
-        return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, _whole(plane), (note,))
+        return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, _whole_picture(plane), (note,))
     if isinstance(settings, TwoPoints):
         return _from_two_points(settings, width_px, height_px)
     pictures = _target_pictures(folder / settings.image, settings.image)
-    seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
-    if seen != {(width_px, height_px)}:
-        sizes = " and ".join(f"{width} × {height}" for width, height in sorted(seen))
+    sizes_seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
+    if sizes_seen != {(width_px, height_px)}:
+        sizes = " and ".join(f"{width} × {height}" for width, height in sorted(sizes_seen))
         raise CalibrationError(
             f"{settings.image} is {sizes} pixels but the recordings are {width_px} × {height_px}; "
             "film the target with the camera's settings of the trials, without cropping or resizing"
@@ -209,8 +210,8 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
     """Calibrate from pictures of a target, grey levels of shape (height, width) each.
 
-    Of a target that stands still the corners are averaged; of one that is moved every picture gets its own plane but
-    all share the lens, and the first readable one shows the plane of growth.
+    The corners of a stationary target are averaged. Of a target that is moved every picture gets its own plane but all
+    share the lens, and the first readable one shows the plane of growth.
 
     Parameters
     ----------
@@ -237,48 +238,48 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
         raise CalibrationError(f"{board.image}: {complaints[0]}")
     height, width = pictures[0].shape
     notes = [f"{board.image}: the target is read in {len(views)} of {len(pictures)} pictures"] if complaints else []
-    moved_px = _wandering_px(views)
-    still = moved_px < STILL_PX
-    if not still:
+    moved_px = _target_motion_px(views)
+    stationary = moved_px < STATIONARY_PX
+    if not stationary:
         notes.append(
             f"{board.image}: the target moves by {moved_px:.1f} px; its first picture is taken for the plane of growth"
         )
-    fit = fit_planes([_averaged(views)] if still else views, width, height)
+    fit = fit_planes([_median_corners(views)] if stationary else views, width, height)
     if fit.reprojection_px > LARGEST_REPROJECTION_PX:
         raise CalibrationError(
             f"{board.image}: corners lie {fit.reprojection_px:.1f} px from where a flat board of {board.squares[0]} × "
             f"{board.squares[1]} squares has them; check `squares`, and that the board is flat"
         )
-    corners_px = _averaged(views)[0] if still else views[0][0]
-    notes += _cover_note(corners_px, width, height, board.image)
-    bias = CORNER_BIAS_PX * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
+    corners_px = _median_corners(views)[0] if stationary else views[0][0]
+    notes += _coverage_note(corners_px, width, height, board.image)
+    bias_rel = CORNER_BIAS_PX * math.sqrt(2) / float(np.ptp(corners_px, axis=0).max())
     covered = (*corners_px.min(axis=0), *corners_px.max(axis=0))
     return PlaneCalibration(
-        board.kind, fit.maps[0], fit.reprojection_px, len(corners_px), len(views), bias, covered, tuple(notes)
+        board.kind, fit.maps[0], fit.reprojection_px, len(corners_px), len(views), bias_rel, covered, tuple(notes)
     )
 
 
-def _whole(plane: PlaneMap) -> tuple[float, float, float, float]:
+def _whole_picture(plane: PlaneMap) -> tuple[float, float, float, float]:
     return 0.0, 0.0, plane.width_px - 1.0, plane.height_px - 1.0
 
 
 def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
-    """Up to MOST_PICTURES grey pictures, spread over the first SEARCHED_FRAMES frames of a picture, folder or clip.
+    """Up to MOST_PICTURES_READ grey pictures, spread over the first SEARCHED_FRAMES frames of a recording.
 
     Raises
     ------
     CalibrationError
-        In one sentence, where there is nothing to be read.
+        In one sentence, where nothing can be read.
     """
     try:
         recording = inspect_recording(path)
         declared = recording.declared_frames or SEARCHED_FRAMES
-        every = max(1, min(declared, SEARCHED_FRAMES) // MOST_PICTURES)
+        every = max(1, min(declared, SEARCHED_FRAMES) // MOST_PICTURES_READ)
         pictures = []
         for count, frame in enumerate(iterate_frames(recording)):
             if count % every == 0:
                 pictures.append(frame)
-            if len(pictures) == MOST_PICTURES or count >= SEARCHED_FRAMES:
+            if len(pictures) == MOST_PICTURES_READ or count >= SEARCHED_FRAMES:
                 break
     except RecordingError as error:
         raise CalibrationError(f"calibration: {error}") from error
@@ -288,47 +289,48 @@ def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
 
 
 def _from_two_points(settings: TwoPoints, width_px: int, height_px: int) -> PlaneCalibration:
-    """Scale from two points and the length between them; each point is off by CLICK_SIGMA_PX along the line."""
-    apart_px = math.dist(settings.from_px, settings.to_px)
-    plane = PlaneMap.from_scale(settings.length_mm / 1000 / apart_px, width_px, height_px)
-    rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / apart_px
+    """Scale from two points and the length between them; each point errs by CLICK_SIGMA_PX along the line."""
+    distance_px = math.dist(settings.from_px, settings.to_px)
+    plane = PlaneMap.from_scale(settings.length_mm / 1000 / distance_px, width_px, height_px)
+    rel_sigma = math.sqrt(2) * CLICK_SIGMA_PX / distance_px
     note = (
-        f"the scale rests on two points {apart_px:.0f} px apart, each good to {CLICK_SIGMA_PX} px, and on nothing else"
+        f"the scale rests on two points {distance_px:.0f} px apart, each good to {CLICK_SIGMA_PX} px, "
+        "and on nothing else"
     )
-    return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, _whole(plane), (note,))
+    return PlaneCalibration("two_points", plane, math.nan, 2, 1, rel_sigma, _whole_picture(plane), (note,))
 
 
-def _by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:
+def _corners_by_place(view: tuple[Floats, Floats]) -> dict[tuple[float, float], Floats]:
     """Corners of a view by their place on the target, in micrometres."""
     return {(round(x * 1e6), round(y * 1e6)): corner for corner, (x, y) in zip(view[0], view[1], strict=True)}
 
 
-def _wandering_px(views: Sequence[tuple[Floats, Floats]]) -> float:
-    """How far the target moves between views: the median, over corners, of the largest distance from the first view."""
-    first = _by_place(views[0])
+def _target_motion_px(views: Sequence[tuple[Floats, Floats]]) -> float:
+    """Motion of the target: the median, over corners, of the distance from the first view; the largest of all views."""
+    first = _corners_by_place(views[0])
     largest = 0.0
     for view in views[1:]:
-        places = _by_place(view)
-        both = [place for place in first if place in places]
-        if not both:
+        places = _corners_by_place(view)
+        shared = [place for place in first if place in places]
+        if not shared:
             return math.inf
-        away = [float(np.linalg.norm(first[place] - places[place])) for place in both]
-        largest = max(largest, float(np.median(away)))
+        distances = [float(np.linalg.norm(first[place] - places[place])) for place in shared]
+        largest = max(largest, float(np.median(distances)))
     return largest
 
 
-def _averaged(views: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Corners of a target that stands still: the median over the views that show each."""
+def _median_corners(views: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Corners of a stationary target: the median over the views that show each."""
     gathered: dict[tuple[float, float], list[Floats]] = {}
     for view in views:
-        for place, corner in _by_place(view).items():
+        for place, corner in _corners_by_place(view).items():
             gathered.setdefault(place, []).append(corner)
     corners = np.array([np.median(seen, axis=0) for seen in gathered.values()])
     return corners, np.array(list(gathered)) * 1e-6
 
 
-def _cover_note(corners_px: Floats, width: int, height: int, name: str) -> list[str]:
-    """Say so where the target spans less than half of the picture: scale and distortion beyond it are extrapolated."""
+def _coverage_note(corners_px: Floats, width: int, height: int, name: str) -> list[str]:
+    """Warn where the target spans less than half of the picture: beyond it scale and distortion are extrapolated."""
     longer = 0 if width >= height else 1
     share = float(np.ptp(corners_px[:, longer])) / max(width, height)
     if share >= 0.5:

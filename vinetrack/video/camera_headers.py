@@ -1,7 +1,7 @@
-"""What the files of high-speed cameras say of themselves: Phantom `.cine`, Photron `.mraw` with its `.cih` or `.cihx`.
+"""Read the headers of high-speed camera files: Phantom `.cine`, Photron `.mraw` with its `.cih` or `.cihx`.
 
-Rate and exposure are those of capture, which no ordinary film knows. What is not certain to be read right is refused by
-its name: compressed frames, depths and versions that are not known, colours that are interleaved.
+They state rate and exposure of capture, which no ordinary film does. What cannot be read with certainty is refused by
+name: compressed frames, unknown depths and versions, interleaved colours.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from vinetrack.video.capture_clock import SAME_RATE
 from vinetrack.video.frames import Recording, RecordingError
 from vinetrack.video.raw_frames import RawFrames
 
-MARK, RATE, SHUTTER_US, COLOUR_FILTER, REAL_BITS, SHUTTER_NS = 140, 768, 772, 808, 896, 1568
-"""Places in the settings of a cine, bytes from their beginning: the mark ST and behind it their length, frames a
+MARK_AT, RATE_AT, SHUTTER_US_AT, COLOUR_FILTER_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 768, 772, 808, 896, 1568
+"""Offsets in the settings of a cine, bytes from their beginning: the mark ST and behind it their length, frames a
 second, exposure in µs, code of the colour filter, bits of a pixel, exposure in ns. Source: vendor's document, as pycine
-0.3.2 has it; the settings grow at their end alone."""
+0.3.2 has it; newer versions extend the settings only at their end."""
 
-SETUP_BYTES = SHUTTER_NS + 4
-"""Bytes of the settings that are looked at. Derived: the last of those places and its four bytes."""
+SETUP_BYTES = SHUTTER_NS_AT + 4
+"""Bytes of the settings that are read. Derived: the last of those offsets and its four bytes."""
 
 CIHX_PLACES = {
     "Record Rate(fps)": "recordInfo/recordRate",
@@ -40,27 +40,28 @@ CIHX_PLACES = {
     "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
     "File Format": "imageFileInfo/fileFormat",
 }
-"""Where a `.cihx` says what a `.cih` says in a line. Source: files of Photron, as pyMRAW 0.33 reads them."""
+"""XML path in a `.cihx` of each line of a `.cih`. Source: files of Photron, as pyMRAW 0.33 reads them."""
 
 SIDE_FILES = (".cih", ".cihx")
 LONGEST_SIDE_FILE = 4_000_000
-"""Bytes. Chosen: those of Photron are some ten thousand, with a preview a million; at half or twice nothing changes."""
+"""Most bytes of a side file that are read. Chosen: those of Photron are some ten thousand, with a preview a million; at
+half or twice nothing changes."""
 
-PACKING = {0: None, 256: 10, 1024: 12}
+PACKED_BITS = {0: None, 256: 10, 1024: 12}
 """Bits of a packed pixel by `biCompression` of a cine; None: pixels fill whole bytes. Source: vendor's document."""
 
-BAYER = frozenset({1, 2, 3, 4, 5, 6})
+BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})
 """Codes of colour filters of 2 by 2 pixels in a cine. Source: vendor's document."""
 
-VARIES = 0.01
-"""Part by which exposures of frames may differ and count as one. Chosen; at half or twice only automatic exposure is
-told."""
+EXPOSURE_TOLERANCE = 0.01
+"""Relative difference within which the exposures of frames count as one. Chosen; at half or twice only automatic
+exposure is reported."""
 
 IMAGE_TIMES, IMAGE_EXPOSURES = 1002, 1003
 """Types of the tagged blocks of a cine. Source: vendor's document."""
 
 FRACTION_S = 2.0**-32
-"""Unit of times and exposures in a cine. Defined by its document: 32.32 fixed point."""
+"""Unit of times and exposures in a cine. Defined by the vendor's document: 32.32 fixed point."""
 
 
 def inspect_cine(path: Path) -> Recording:
@@ -104,7 +105,7 @@ def inspect_cine(path: Path) -> Recording:
         if isinstance(error, RecordingError):
             raise
         raise RecordingError(f"{name}: its header is damaged; copy it from the camera again") from None
-    depth = struct.unpack_from("<I", setup_bytes, REAL_BITS)[0]
+    depth = struct.unpack_from("<I", setup_bytes, REAL_BITS_AT)[0]
     depth = 12 if frames.stored_bits in (10, 12) else depth if 0 < depth <= frames.stored_bits else frames.stored_bits
     return Recording(
         path, "raw", frames.width, frames.height, int(depth), count, rate, exposure_s,
@@ -115,28 +116,28 @@ def inspect_cine(path: Path) -> Recording:
 def _cine_frames(
     path: Path, stream: BinaryIO, header: bytes, places: tuple[int, int, int], offsets: tuple[int, ...], size: int
 ) -> RawFrames:
-    """Where the frames lie and how they are packed; refuses what is not read."""
+    """Offsets of the frames and how they are packed; refuses what cannot be read."""
     name = path.name
     compression, bitmap, setup = places
     _, width, height, _, bits, packing = struct.unpack_from("<IiiHHI", header, bitmap)
-    mark, length = struct.unpack_from("<2sH", header, setup + MARK)
-    if mark != b"ST" or length < REAL_BITS + 4:
+    mark, length = struct.unpack_from("<2sH", header, setup + MARK_AT)
+    if mark != b"ST" or length < REAL_BITS_AT + 4:
         raise RecordingError(f"{name}: its camera's settings are missing or of an unknown kind; save it anew")
-    filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER)[0]
+    filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER_AT)[0]
     if compression == 1:
         raise RecordingError(f"{name}: a compressed cine (JPEG) is not read; save it uncompressed")
-    if compression not in (0, 2) or packing not in PACKING:
+    if compression not in (0, 2) or packing not in PACKED_BITS:
         raise RecordingError(
             f"{name}: a cine of compression {compression}, packing {packing} is not read; save it as raw cine"
         )
     if bits not in (8, 16):
         raise RecordingError(f"{name}: {bits} bits a pixel, colours interleaved, are not read; save it as raw cine")
-    if compression == 2 and (filters >> 8 or filters not in {0} | BAYER):
+    if compression == 2 and (filters >> 8 or filters not in {0} | BAYER_CODES):
         raise RecordingError(f"{name}: a sensor with colour filters of code {filters:#x} is not read; save it as AVI")
-    packed = PACKING[packing]
+    packed = PACKED_BITS[packing]
     frames = RawFrames(
         path, (), width, abs(height), packed or bits, bottom_up=packed is None and height > 0,
-        linearise=packed == 10, mosaic=compression == 2 and filters in BAYER,
+        linearise=packed == 10, mosaic=compression == 2 and filters in BAYER_CODES,
     )  # fmt: skip
     if width <= 0 or height == 0 or (width * abs(height) * frames.stored_bits) % 8:
         raise RecordingError(f"{name}: its header is damaged; copy it from the camera again")
@@ -147,12 +148,12 @@ def _cine_frames(
         stream.seek(at)
         annotation = struct.unpack("<I", stream.read(4))[0]
         stream.seek(at + annotation - 4)
-        told = stream.read(4)
-        if annotation < 8 or len(told) < 4:
+        size_field = stream.read(4)
+        if annotation < 8 or len(size_field) < 4:
             break
-        if struct.unpack("<I", told)[0] != frames.frame_bytes:
+        if struct.unpack("<I", size_field)[0] != frames.frame_bytes:
             raise RecordingError(
-                f"{name}: a frame takes {struct.unpack('<I', told)[0]} bytes where {width} x {abs(height)} px of "
+                f"{name}: a frame takes {struct.unpack('<I', size_field)[0]} bytes where {width} x {abs(height)} px of "
                 f"{frames.stored_bits} bits take {frames.frame_bytes}; it is not read"
             )
         starts.append(at + annotation)
@@ -160,9 +161,9 @@ def _cine_frames(
 
 
 def _tagged_blocks(header: bytes, setup: int) -> dict[int, bytes]:
-    """Content of the blocks behind the settings, by type."""
+    """Content of the tagged blocks behind the settings, by type."""
     blocks: dict[int, bytes] = {}
-    at = setup + struct.unpack_from("<H", header, setup + MARK + 2)[0]
+    at = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0]
     while at + 8 <= len(header):
         length, kind, more = struct.unpack_from("<IHH", header, at)
         if length < 8 or at + length > len(header):
@@ -177,23 +178,23 @@ def _tagged_blocks(header: bytes, setup: int) -> dict[int, bytes]:
 def _cine_clock(
     name: str, setup: bytes, blocks: dict[int, bytes], count: int
 ) -> tuple[float | None, float | None, Floats | None, tuple[str, ...]]:
-    """Rate and exposure of capture, by the frames' own where the file holds them, else as the camera was set."""
+    """Rate and exposure of capture: from the stamps of the frames where they exist, else as the camera was set."""
     notes = []
-    length, rate = struct.unpack_from("<H", setup, MARK + 2)[0], float(struct.unpack_from("<I", setup, RATE)[0])
-    exposure_s = struct.unpack_from("<I", setup, SHUTTER_US)[0] * 1e-6
-    if length >= SHUTTER_NS + 4:
-        exposure_s = struct.unpack_from("<I", setup, SHUTTER_NS)[0] * 1e-9 or exposure_s
-    times_s, each = None, blocks.get(IMAGE_EXPOSURES, b"")
-    if len(each) >= 4 * count:
-        exposures_s = np.frombuffer(each, "<u4", count) * FRACTION_S
+    length, rate = struct.unpack_from("<H", setup, MARK_AT + 2)[0], float(struct.unpack_from("<I", setup, RATE_AT)[0])
+    exposure_s = struct.unpack_from("<I", setup, SHUTTER_US_AT)[0] * 1e-6
+    if length >= SHUTTER_NS_AT + 4:
+        exposure_s = struct.unpack_from("<I", setup, SHUTTER_NS_AT)[0] * 1e-9 or exposure_s
+    times_s, stored_exposures = None, blocks.get(IMAGE_EXPOSURES, b"")
+    if len(stored_exposures) >= 4 * count:
+        exposures_s = np.frombuffer(stored_exposures, "<u4", count) * FRACTION_S
         exposure_s = float(np.median(exposures_s)) or exposure_s
-        if np.ptp(exposures_s) > VARIES * exposure_s:
+        if np.ptp(exposures_s) > EXPOSURE_TOLERANCE * exposure_s:
             span = f"{1e6 * exposures_s.min():.4g} to {1e6 * exposures_s.max():.4g} µs"
             notes.append(f"{name}: the exposure changes from frame to frame, {span}: switch automatic exposure off")
     stamps = blocks.get(IMAGE_TIMES, b"")
     if len(stamps) >= 8 * count and count > 2:
         pairs = np.frombuffer(stamps, "<u4", 2 * count).reshape(-1, 2).astype(np.int64)
-        # The lowest two bits tell of synchronisation. Subtracted as whole numbers: a float has no room for both.
+        # The lowest two bits flag synchronisation. Integers are subtracted: a float cannot hold both words.
         ticks = ((pairs[:, 1] - pairs[0, 1]) << 32) + (pairs[:, 0] & ~3)
         times_s = (ticks - ticks[0]) * FRACTION_S
         period_s = float(np.median(np.diff(times_s)))
@@ -222,8 +223,8 @@ def inspect_mraw(path: Path) -> Recording:
     RecordingError
         Where one of the two files is missing, or of a kind that is not read.
     """
-    data = next((at for at in _beside(path, (".mraw",))), None)
-    side = path if path.suffix.lower() in SIDE_FILES else next(iter(_beside(path, SIDE_FILES)), None)
+    data = next((at for at in _siblings(path, (".mraw",))), None)
+    side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
         raise RecordingError(f"{path.name}: its .cih or .cihx is missing, which says what is in it; put it beside")
     facts = read_side_file(side)
@@ -249,7 +250,7 @@ def inspect_mraw(path: Path) -> Recording:
 
 @dataclass(frozen=True)
 class SideFile:
-    """What a Photron side file says: `rate` in frames a second of capture and `exposure_s`, None where not stated."""
+    """Content of a Photron side file: `rate` in frames a second of capture and `exposure_s`, None where not stated."""
 
     n_frames: int
     width: int
@@ -268,11 +269,11 @@ def read_side_file(path: Path) -> SideFile:
 
     Parameters
     ----------
-    path : of it.
+    path : of the side file.
 
     Returns
     -------
-    what it says.
+    its content.
 
     Raises
     ------
@@ -281,7 +282,7 @@ def read_side_file(path: Path) -> SideFile:
     """
     name = path.name
     try:
-        file_size(path)  # a pipe would be waited for
+        file_size(path)  # refuses a pipe, on which reading would wait
         with path.open("rb") as stream:
             data = stream.read(LONGEST_SIDE_FILE)
     except OSError as error:
@@ -298,7 +299,7 @@ def read_side_file(path: Path) -> SideFile:
     if step > 1:
         rate /= step
         notes.append(f"{name}: every {step:g}th frame was saved: {rate:g} frames a second of {rate * step:g}")
-    if not 0 < exposure_s * rate <= 1.0 + VARIES:
+    if not 0 < exposure_s * rate <= 1.0 + EXPOSURE_TOLERANCE:
         exposure_s = 0.0
     return SideFile(
         int(value("Total Frame")), int(value("Image Width")), int(value("Image Height")), int(value("Color Bit")),
@@ -308,7 +309,7 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count: int) -> SideFile | None:
-    """The side file of a TIFF stack, or of a folder of pictures, if there is one that tells of it.
+    """Find and read the side file of a TIFF stack or of a folder of pictures.
 
     Parameters
     ----------
@@ -319,36 +320,36 @@ def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count:
 
     Returns
     -------
-    what it says; None where there is none, several, or one of other pictures.
+    its content; None where there is none, several, or one that describes other pictures.
     """
     if pictures.is_dir():
-        there = [at for at in sorted(pictures.iterdir()) if at.suffix.lower() in SIDE_FILES]
+        side_files = [at for at in sorted(pictures.iterdir()) if at.suffix.lower() in SIDE_FILES]
     else:
-        there = _beside(pictures, SIDE_FILES)
-    if len({at.stem for at in there}) != 1:
+        side_files = _siblings(pictures, SIDE_FILES)
+    if len({at.stem for at in side_files}) != 1:
         return None
-    facts = read_side_file(there[0])
+    facts = read_side_file(side_files[0])
     formats = {"tif": "tiff", "jpg": "jpeg"}
-    told = formats.get(facts.file_format.lower(), facts.file_format.lower())
+    stated = formats.get(facts.file_format.lower(), facts.file_format.lower())
     same = (facts.width, facts.height) == size and facts.n_frames == count
-    return facts if same and told == formats.get(file_format, file_format) else None
+    return facts if same and stated == formats.get(file_format, file_format) else None
 
 
-def _beside(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files of that name with one of the endings, in any case of letters."""
+def _siblings(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files of the same name with one of the suffixes, in upper or lower case."""
     if not path.parent.is_dir():
         return []
     return sorted(at for at in path.parent.iterdir() if at.stem == path.stem and at.suffix.lower() in suffixes)
 
 
 def _cih_values(data: bytes) -> dict[str, str]:
-    """Lines of `key : value`."""
+    """Values of the lines `key : value`."""
     lines = (line.partition(":") for line in data.decode("utf-8", "replace").splitlines())
     return {key.strip(): text.strip() for key, colon, text in reversed(list(lines)) if colon}
 
 
 def _cihx_values(name: str, data: bytes) -> dict[str, str]:
-    """The same by the keys of a `.cih`, from the XML within a `.cihx`."""
+    """The same values, by the keys of a `.cih`, from the XML within a `.cihx`."""
     begin, end = data.find(b"<cih>"), data.rfind(b"</cih>")
     try:
         root = ElementTree.fromstring(data[begin : end + 6].decode("utf-8", "replace")) if begin >= 0 else None
@@ -360,7 +361,7 @@ def _cihx_values(name: str, data: bytes) -> dict[str, str]:
 
 
 def _as_number(text: str) -> float:
-    """The number at the beginning of a value, a fraction such as 1/20000 included; 0 where there is none."""
+    """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
     match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", text)
     try:
         return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0

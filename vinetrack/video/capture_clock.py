@@ -1,4 +1,4 @@
-"""Rate and exposure of capture: what the recording states, else what the sheet does; never the rate of playback."""
+"""Rate and exposure of capture: what the recording states, else the sheet; never the playback rate."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from vinetrack.core.records import Trial
 from vinetrack.video.frames import Recording, RecordingError
 
 SAME_RATE = 0.005
-"""Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
-playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
+"""Relative difference within which two rates are the same. Derived: 29.97 and 30 frames a second differ by 0.1 %,
+23.976 and 24 likewise; a rate of capture that is no playback rate but within 0.5 % of one is 30.1 for 30, which no
+camera offers."""
 
 SAME_EXPOSURE = 0.02
-"""Part by which exposures of sheet and recording may differ and be one. Chosen: cameras round to a microsecond of 50,
-sheets to two digits. By reasoning: at half some rounded ones are refused; at twice one of 96 µs for 100 passes, which
-moves no position."""
+"""Relative difference within which exposures of sheet and recording are the same. Chosen: cameras round to a
+microsecond of 50, sheets to two digits. By reasoning: at half some rounded ones are refused; at twice one of 96 µs for
+100 passes, which moves no position."""
 
 
 def capture_rate(trial: Trial, recording: Recording) -> float:
-    """Return the capture rate: the user's; that which the recording states where the sheet is blank.
+    """Return the capture rate: the recording's where it states one, else the sheet's.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
 
 
 def capture_exposure(trial: Trial, recording: Recording) -> float:
-    """Return the exposure of a frame: that which the recording states, else that of the sheet.
+    """Return the exposure of a frame: the recording's where it states one, else the sheet's.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""A growth axis that bends: a smooth curve through points of the picture, positions along it being its arc length.
+"""A growth axis that bends: a smooth curve through points of the picture, with positions as arc length along it.
 
 The curve is a natural cubic spline over the centripetal parameter (steps of the square root of the distance between
-neighbours; Lee 1989), which neither overshoots nor loops between points that are spaced unevenly. Beyond its ends it
-goes on straight.
+neighbours; Lee 1989), which neither overshoots nor loops between unevenly spaced points. Beyond its ends it continues
+straight.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
-FINENESS = 8
-"""Places a pixel at which the arc length is summed. Derived: a chord of 1/8 px is short of its arc by less than
-(1/8)²/24R², 1e-6 of it for radii above 30 px."""
-ROOM_INSIDE = 0.9
-"""Part of the least radius that a strip may reach inwards. Derived: at 1 its normals cross; at 0.9 a pixel there stands
-for a tenth of one. Half refuses sound curves."""
+SAMPLES_PER_PX = 8
+"""Samples per pixel over which the arc length is summed. Derived: a chord of 1/8 px is shorter than its arc by less
+than (1/8)²/24R², 1e-6 of it for radii above 30 px."""
+LARGEST_HALF_PER_RADIUS = 0.9
+"""Largest half width of a strip, as a part of the least radius. Derived: at 1 its normals cross; at 0.9 a pixel at the
+inner side covers a tenth of one on the axis. Half refuses sound curves."""
 
 
 @dataclass(frozen=True)
@@ -57,19 +57,19 @@ class CurvedAxis(Axis):
 
     @property
     def through_px(self) -> tuple[Point, ...]:
-        """All points that it goes through, in order."""
+        """All points that the curve passes through, in order."""
         return (self.from_px, *self.via_px, self.to_px)
 
     @cached_property
     def _table(self) -> tuple[CubicSpline, Floats, Floats]:
-        """The spline, and its parameter and arc length at many places."""
+        """The spline, and its parameter and arc length at the samples."""
         from scipy.interpolate import CubicSpline
 
         points = np.array(self.through_px)
         apart = np.hypot(*np.diff(points, axis=0).T)
         knots = np.concatenate([[0.0], np.cumsum(np.sqrt(apart))])
         spline = CubicSpline(knots, points, bc_type="natural")
-        counts = np.ceil(FINENESS * apart).astype(int) + 1
+        counts = np.ceil(SAMPLES_PER_PX * apart).astype(int) + 1
         parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
         parameter = np.concatenate([*parts, knots[-1:]])
         steps = np.hypot(*np.diff(spline(parameter), axis=0).T)
@@ -82,7 +82,7 @@ class CurvedAxis(Axis):
 
     @cached_property
     def least_radius_px(self) -> float:
-        """Radius where it bends most sharply; infinite of a straight line."""
+        """Radius where the curve bends most sharply; infinite for a straight line."""
         spline, parameter, _ = self._table
         first, second = spline(parameter, 1), spline(parameter, 2)
         speed = np.hypot(*first.T)
@@ -91,23 +91,23 @@ class CurvedAxis(Axis):
 
     @property
     def largest_half_px(self) -> float:
-        """Half the width of the widest strip along it whose normals do not cross."""
-        return ROOM_INSIDE * self.least_radius_px
+        """Half the width of the widest strip along the curve whose normals do not cross."""
+        return LARGEST_HALF_PER_RADIUS * self.least_radius_px
 
     @cached_property
     def _angles_rad(self) -> Floats:
-        """Its direction at many equal steps, without jumps, positive from x towards y."""
+        """Direction at many equal steps, unwrapped, positive from x towards y."""
         direction = self.direction_at(np.linspace(0.0, self.length_px, 400))
         return np.unwrap(np.arctan2(*direction.T[::-1]))
 
     @property
     def turn_rad(self) -> float:
-        """By how much its direction turns between its ends, positive from x towards y."""
+        """Angle by which the direction turns between the ends, positive from x towards y."""
         return float(self._angles_rad[-1] - self._angles_rad[0])
 
     @property
-    def bent_rad(self) -> float:
-        """By how much it turns in all, to either side."""
+    def total_turn_rad(self) -> float:
+        """Angle by which the direction turns in all, to either side."""
         return float(np.abs(np.diff(self._angles_rad)).sum())
 
     def direction_at(self, along_px: Floats) -> Floats:
@@ -146,7 +146,7 @@ class CurvedAxis(Axis):
         return np.asarray(on_curve + beyond[..., None] * unit + across[..., None] * normal)
 
     def nearest_px(self, picture_px: Floats) -> Floats:
-        """Arc length of the places on the curve nearest to points of the picture.
+        """Find the arc length of the places on the curve nearest to points of the picture.
 
         Parameters
         ----------
@@ -161,13 +161,13 @@ class CurvedAxis(Axis):
         spline, parameter, arc = self._table
         points = np.asarray(picture_px, dtype=float)
         _, nearest = KDTree(spline(parameter)).query(np.where(np.isfinite(points), points, 0.0))
-        # Between the places of the table, and beyond the ends, along the tangent.
+        # Between the samples of the table, and beyond the ends, along the tangent.
         along = arc[nearest]
         offset = points - spline(parameter[nearest])
         return np.asarray(along + np.sum(offset * self.direction_at(along), axis=-1))
 
     def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
-        """Return where points of the picture lie along and across the curve, by their nearest place on it.
+        """Find where points of the picture lie along and across the curve, by their nearest place on it.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class CurvedAxis(Axis):
         return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
 
     def moved(self, dx_px: float, dy_px: float) -> CurvedAxis:
-        """Return the same curve in a picture whose origin is elsewhere.
+        """Shift the curve into a picture whose origin is elsewhere.
 
         Parameters
         ----------
@@ -198,7 +198,7 @@ class CurvedAxis(Axis):
 
 
 def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
-    """The growth axis through points: a straight line through two, a smooth curve through more.
+    """Lay the growth axis through points: a straight line through two, a smooth curve through more.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float
 
 
 def length_along(path: Floats) -> Floats:
-    """Length along a path from its first place.
+    """Cumulative length along a path from its first point.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def length_along(path: Floats) -> Floats:
 
 
 def axis_entry(axis: Axis) -> dict[str, Any]:
-    """The axis as JSON holds it, without its width: `from_px`, `to_px`, and of a curve `via_px`.
+    """Convert an axis to a JSON mapping, without its width: `from_px`, `to_px`, and of a curve `via_px`.
 
     Parameters
     ----------
@@ -249,8 +249,8 @@ def axis_entry(axis: Axis) -> dict[str, Any]:
     return entry | ({"via_px": axis.via_px} if isinstance(axis, CurvedAxis) else {})
 
 
-def axis_of_entry(entry: Mapping[str, Any]) -> Axis:
-    """The axis that `axis_entry` wrote.
+def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
+    """Read an axis that `axis_entry` wrote.
 
     Parameters
     ----------
@@ -265,8 +265,8 @@ def axis_of_entry(entry: Mapping[str, Any]) -> Axis:
     return axis_through(through, float("nan") if width is None else float(width))
 
 
-def curve_complaint(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
-    """What is wrong with a curve in a picture, and the remedy; None where nothing is, or where it is a straight line.
+def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
+    """Say why a curve cannot be used in a picture, and the remedy; None where it can, or where it is a straight line.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def curve_complaint(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tup
 
     Returns
     -------
-    what it does, as the end of a sentence that begins with the axis, and what to do; or None.
+    the end of a sentence that begins with "the axis", and the remedy; or None.
     """
     if not isinstance(axis, CurvedAxis):
         return None

@@ -1,7 +1,8 @@
-"""The strip along an axis, straight or curved; along a curve the picture is laid straight by the curve's normals.
+"""Cut the strip along an axis, straight or curved; along a curve the picture is straightened by the curve's normals.
 
-What is laid straight is a picture like any other: its middle is a level axis, its columns are places a pixel of arc
-length apart, and all that works on straight strips works on it. The curve is then moved onto the middle of what grew.
+A straightened picture is a picture like any other: its middle is a level axis, its columns are one pixel of arc length
+apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of the tube
+that grew.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import SMALLEST_POINT_SPACING_PX
 from vinetrack.video.axis import Axis, FrontShare, front_share
-from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
+from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_problem
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.still_ground import picture_shake
@@ -25,24 +26,24 @@ if TYPE_CHECKING:
     from vinetrack.video.edge import Outline
 
 KNOT_PX = 40.0
-"""Distance of the knots of a curve moved onto the middle of a tube. Chosen: a tube bends over several of its widths,
-and its sides are told in stretches of 12 px at least. At half noise of the sides makes it wavy and too long, at twice
-bends of 100 px radius are cut short by their sagitta of 8 px."""
+"""Distance of the knots of a curve that is moved onto the middle of a tube. Chosen: a tube bends over several of its
+widths, and its sides are found in stretches of 12 px at least. At half, noise of the sides makes the curve wavy and too
+long; at twice, bends of 100 px radius are cut short by their sagitta of 8 px."""
 STRETCH_PX = 30.0
-"""Length of the stretches in which the tube's middle is told along a curve. Chosen a little shorter than KNOT_PX; half
-or twice hardly matters, as a smooth curve is laid through them."""
-SPAN = 1.0
-"""Stretches, as the standard deviation of a Gaussian, over which the tube's middle is averaged. Measured on bends of 90
-to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, as sharp bends are cut. Half was not tried."""
-SETTLED_PX = 0.3
-"""Greatest distance from the tube's middle at which a curve is left alone. Measured on drawn curves, seeds 1 to 4 of
+"""Length of the stretches in which the tube's middle is found along a curve. Chosen a little shorter than KNOT_PX; half
+or twice hardly matters, since a smooth curve is laid through them."""
+AVERAGING_STRETCHES = 1.0
+"""Standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged. Measured on bends of 90
+to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, since sharp bends are cut. Half was not tried."""
+CENTRED_PX = 0.3
+"""Largest distance from the tube's middle at which a curve is left unchanged. Measured on drawn curves, seeds 1 to 4 of
 `bent` of `benchmarks/tracking_accuracy.py`, with twice the rounds of a straight strip: SD of 0.13 px at sharp bends and
 0.09 along an S; 0.24 and 0.13 at 0.8 px and as many rounds as a straight strip. Half was not tried."""
 SLOW_PX_PER_RAD = 0.04
-"""Slow error of a position along a curve for each radian by which that turns: where the curve lies beside the tube's
-middle, the way along it is a little longer or shorter. Measured on clips 1 and 2 of `bent` of
-`benchmarks/tracking_accuracy.py`: with 0.06 errors beyond the noise were 0.56 times what was stated along drawn curves
-and 0.78 times along found ones. At half or twice the slow error of curves is so."""
+"""Slow error of a position along a curve, for each radian by which the curve turns: beside the tube's middle the path
+is a little longer or shorter. Measured on clips 1 and 2 of `bent` of `benchmarks/tracking_accuracy.py`: with 0.06
+errors beyond the noise were 0.56 times what was stated along drawn curves and 0.78 times along found ones. At half or
+twice the slow error of curves halves or doubles."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,14 @@ class StraightenedPictures:
 def straightened(
     luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None
 ) -> StraightenedPictures:
-    """Lay pictures straight along a curve, by bicubic interpolation.
+    """Straighten pictures along a curve by bicubic interpolation.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
-    half_px : what is wanted on either side, px; more is taken, for what stands still beside a strip, where the picture
-        and the curve's radius leave room for it.
+    half_px : rows wanted on either side, px; more are taken, for the still background beside a strip, where the picture
+        and the curve's radius leave room for them.
     shake_px : how far each picture moved right and down, which is undone; shape (n_frames, 2), px.
 
     Returns
@@ -72,27 +73,27 @@ def straightened(
     """
     import cv2
 
-    above, below = (_reach(axis, half_px, side, luma.shape[1:]) for side in (-1, 1))
+    above, below = (_rows_on_side(axis, half_px, side, luma.shape[1:]) for side in (-1, 1))
     n_along = int(np.floor(axis.length_px)) + 1
     rows = np.arange(-above, below + 1, dtype=float)
-    place = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
-    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+    source = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
+    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
     out = np.empty((len(luma), len(rows), n_along), luma.dtype)
-    moved = np.zeros((len(luma), 2)) if shake_px is None else shake_px
-    for frame, straight, (dx, dy) in zip(luma, out, moved.astype(np.float32), strict=True):
+    shake = np.zeros((len(luma), 2)) if shake_px is None else shake_px
+    for frame, straight, (dx, dy) in zip(luma, out, shake.astype(np.float32), strict=True):
         cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
     return StraightenedPictures(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
 
 
 def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
-    """Cut, level and steady the strip on both sides of an axis, straight or curved; see `strip.cut_strip`.
+    """Cut, level and stabilise the strip about an axis, straight or curved; see `strip.cut_strip`.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
     half_px : half the height of the strip, px; along a curve no more than its normals allow.
-    before : a strip along a neighbouring curve, which knows the camera's shake.
+    before : a strip along a neighbouring curve, whose camera shake is used again.
 
     Returns
     -------
@@ -108,7 +109,7 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
 
 
 def path_error_px(axis: Axis) -> float:
-    """Return the slow error that a path's own shape adds to positions along it.
+    """Return the slow error of positions along an axis that comes from its curvature.
 
     Parameters
     ----------
@@ -118,11 +119,11 @@ def path_error_px(axis: Axis) -> float:
     -------
     px; 0 along a straight line.
     """
-    return SLOW_PX_PER_RAD * axis.bent_rad if isinstance(axis, CurvedAxis) else 0.0
+    return SLOW_PX_PER_RAD * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
 
 
 def curve_note(axis: CurvedAxis) -> str:
-    """Say that the axis of growth was found to be a curve.
+    """Say that the growth axis was found to be a curve.
 
     Parameters
     ----------
@@ -133,13 +134,13 @@ def curve_note(axis: CurvedAxis) -> str:
     sentence, without an end.
     """
     return (
-        f"the vine bends by {np.degrees(axis.bent_rad):.0f}° in all, and positions are those along a curve that was"
-        " found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
+        f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
+        " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
     )
 
 
 def shake_along(strip: Strip, edge_px: Floats) -> Floats:
-    """Return how far along the axis, where the edge is, a shaken camera moved each picture.
+    """Return how far a shaken camera moved each picture along the axis, at the edge.
 
     Parameters
     ----------
@@ -152,12 +153,12 @@ def shake_along(strip: Strip, edge_px: Floats) -> Floats:
     """
     if not isinstance(strip.axis, CurvedAxis):
         return strip.shift_px[:, 0]
-    known = np.where(np.isfinite(edge_px), edge_px, 0.5 * strip.axis.length_px)
-    return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(known), axis=1))
+    place_px = np.where(np.isfinite(edge_px), edge_px, 0.5 * strip.axis.length_px)
+    return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(place_px), axis=1))
 
 
 def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
-    """How much of what changes along a curve is a front that passes once; see `axis.front_share`.
+    """Share of the change along a curve that is one front passing once; see `axis.front_share`.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
 
     Returns
     -------
-    its share, 0 to 1: little where what moves leaves the curve as well.
+    0 to 1; small where what moves leaves the curve.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
 
 
 def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare:
-    """How much of what changes along an axis is a front that passes once, as a function of the axis.
+    """Return the function from an axis to its front share, for straight and curved axes.
 
     Parameters
     ----------
@@ -187,7 +188,7 @@ def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare
 
     Returns
     -------
-    order : its share, 0 to 1, along a straight or curved axis; see `axis.front_share`.
+    function from an axis to its share, 0 to 1; see `axis.front_share`.
     """
     return lambda axis: front_share_on_curve(luma, axis) if isinstance(axis, CurvedAxis) else front_share(small, axis)
 
@@ -206,13 +207,13 @@ def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
     RecordingError
         In one sentence.
     """
-    complaint = curve_complaint(axis, half_px, (shape[1], shape[0]))
+    complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
     if complaint is not None:
         raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
 
 
 def outline_stretches(axis: Axis) -> int:
-    """Stretches in which the sides of a tube along a curve are told.
+    """Number of stretches in which the sides of a tube are found.
 
     Parameters
     ----------
@@ -220,17 +221,17 @@ def outline_stretches(axis: Axis) -> int:
 
     Returns
     -------
-    number: 12 along a straight line, no fewer along a curve.
+    12 along a straight line, at least as many along a curve.
     """
     return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
 
 
 def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
-    """A curve along the middle of the tube, and how far from the one before that lies.
+    """Move a curve onto the middle of the tube, and measure how far that lies from it.
 
     Parameters
     ----------
-    axis : the curve along which the tube's sides were told.
+    axis : the curve along which the tube's sides were found.
     sides : of the tube in the strip along it.
 
     Returns
@@ -239,28 +240,28 @@ def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float
     distance : greatest distance between the two, px.
     """
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
-    away = _averaged(sides.places_px, sides.middles_px, knots)
-    through = axis.points(knots, away)
-    kept = [
+    offsets = _local_lines(sides.places_px, sides.middles_px, knots)
+    through = axis.points(knots, offsets)
+    separate = [
         0,
         *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > SMALLEST_POINT_SPACING_PX),
     ]
     try:
-        curve = axis_through(through[kept], 2 * sides.half_px)
+        curve = axis_through(through[separate], 2 * sides.half_px)
     except RecordingError:
         return axis, 0.0
     if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
         return axis, 0.0
-    return curve, float(np.abs(away).max())
+    return curve, float(np.abs(offsets).max())
 
 
-def _averaged(places: Floats, middles: Floats, at: Floats) -> Floats:
-    """Middle of the tube at places along it: local straight lines, weighted by distance; level beyond its ends."""
+def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
+    """Middle of the tube at places along it, by Gaussian-weighted local lines; level beyond the outermost stretches."""
     spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
-    at = np.clip(at, places[0], places[-1])
-    out = np.empty(len(at))
-    for k, place in enumerate(at):
-        offset = (places - place) / (SPAN * spacing)
+    queries = np.clip(queries, places[0], places[-1])
+    out = np.empty(len(queries))
+    for k, place in enumerate(queries):
+        offset = (places - place) / (AVERAGING_STRETCHES * spacing)
         weight = np.exp(-0.5 * offset**2)
         design = np.column_stack([np.ones(len(places)), offset])
         moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
@@ -268,8 +269,8 @@ def _averaged(places: Floats, middles: Floats, at: Floats) -> Floats:
     return out
 
 
-def _reach(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
-    """Rows on one side: those wanted, and as many more as lie in the picture along the whole curve without crossing."""
+def _rows_on_side(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
+    """Rows on one side: those wanted, and as many more as stay in the picture along the whole curve, uncrossed."""
     wanted = int(np.ceil(half_px))
     most = min(wanted + GAP_PX + BAND_PX[1], int(axis.largest_half_px))
     along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)

@@ -1,7 +1,7 @@
-"""How much of a pixel an edge covers that is blurred by optics (Gaussian) and by its own motion (a box).
+"""Fraction of a pixel that is covered by an edge blurred by optics (Gaussian) and by its own motion (a box).
 
-Neighbouring columns lie a whole pixel apart, so that a row reads every 1/STEP-th entry of a table of covers, and the
-table is kept in that order: inner loops then run over neighbours in memory, without a branch.
+Neighbouring columns lie a whole pixel apart, so that a row reads every 1/STEP-th entry of a table of covers. The table
+is kept in that order: inner loops then run over neighbours in memory, without a branch.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ PHASES = round(1 / STEP)
 VECTOR = 8
 """Pixels that are computed at a time. Derived: 512 bits are eight doubles; smaller processors take a part of them."""
 BORROWED: dict[str, Any] = {"_nrt": False}
-"""Option of Numba for functions that allocate nothing: parts of arrays are used without counting references to them,
-which takes longer than a row of 20 px does. Measured: a fit of an edge takes 0.75 of the time."""
+"""Option of Numba for functions that allocate nothing: slices of arrays are used without reference counting, which
+takes longer than a row of 20 px does. Measured: a fit of an edge takes 0.75 of the time."""
 _Z = np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
 _NORMAL = np.array([[0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)] for z in _Z])
 MATHS = {"contract", "arcp", "nsz", "reassoc"}
-"""Freedom of the compiler: sums in another order, no care for the sign of zero. Chosen: NaN and infinity stay what they
-are."""
+"""Floating-point freedom of the compiler: reordered sums, no care for the sign of zero. Chosen: NaN and infinity keep
+their meaning."""
 
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
@@ -62,7 +62,7 @@ def cover_table(length: float, blur: float, half: float) -> np.ndarray:
     ----------
     length : of the motion blur, px.
     blur : standard deviation of the optical blur, px.
-    half : farthest distance from the edge that is asked for, px.
+    half : largest distance from the edge that is needed, px.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def cover_reach(length: float, blur: float) -> float:
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def phase(place: float) -> tuple[int, int, float, int]:
-    """Where to look for an edge in a table of covers.
+    """Split the place of an edge into the indices of a table of covers.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def phase(place: float) -> tuple[int, int, float, int]:
 
     Returns
     -------
-    its whole part, px; the entry j below the rest of it and the weight of the entry above; 1 where there is no rest.
+    the whole part, px; the entry j below the fraction; the weight of the entry above; 1 where there is no fraction.
     """
     whole = math.floor(place)
     fraction = (place - whole) / STEP

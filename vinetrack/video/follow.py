@@ -1,4 +1,4 @@
-"""Positions along the axis, frame by frame, from whichever way of following fits what moves: edge, body, or arrival."""
+"""Follow what moves along an axis, by frame: the edge of a tube, a body, or else the arrival of whatever comes."""
 
 from __future__ import annotations
 
@@ -20,27 +20,30 @@ if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
     from vinetrack.video.edge import EdgeFit
 
-APART_PX = 1.0
-"""Bands of the edge that disagree by more cannot all be its own. Chosen: 25 times FLOOR_PX. By reasoning: at half tips
-of crumpled film count as doubtful, at twice an edge half behind a door does not."""
-BRIGHT = 1.5
-"""Amplitude above which something else adds to the edge. Chosen about as far above 1 as PALE of `hidden_tip` lies
-below, in ratio. By reasoning: nearer 1 glints make points doubtful; at twice payloads before the edge pass."""
-ODD_RATIO, LEAST_MISFIT = 6.0, 0.3
-"""A frame that fits so many times worse than usual is doubtful, where usual is no less than this. Chosen: a compressed
-picture at rest leaves hardly any misfit. By reasoning: at half textured film makes points doubtful; at twice a hand
-before the tip does not."""
-VAGUE_PX, VAGUE_RATIO = 1.0, 5.0
-"""A point known worse than this, and so many times worse than usual, is doubtful. Chosen as APART_PX; the ratio spares
-recordings in which all points are vague. At half fast frames of blurred recordings are doubtful, at twice none is."""
+DISAGREEMENT_PX = 1.0
+"""Disagreement of bands above which some band follows something other than the edge. Chosen: 25 times FLOOR_PX. By
+reasoning: at half, tips of crumpled film count as doubtful; at twice, an edge half behind a door does not."""
+LARGEST_AMPLITUDE = 1.5
+"""Amplitude (relative contrast) above which something adds to the edge. Chosen about as far above 1, in ratio, as
+LEAST_AMPLITUDE of `hidden_tip` lies below. By reasoning: nearer 1, glints make points doubtful; at twice, payloads in
+front of the edge do not."""
+MISFIT_RATIO, LEAST_MISFIT = 6.0, 0.3
+"""A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful. Chosen: a
+compressed picture at rest leaves hardly any misfit. By reasoning: at half, textured film makes points doubtful; at
+twice, a hand in front of the tip does not."""
+UNCERTAIN_PX, UNCERTAIN_RATIO = 1.0, 5.0
+"""A point with a larger standard error, and one this many times the median, is doubtful. Chosen as DISAGREEMENT_PX; the
+ratio spares recordings in which all points are uncertain. At half, fast frames of blurred recordings are doubtful; at
+twice none is."""
 
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions along the axis by frame, px, from whichever way of following.
+    """Positions along the axis by frame, px, from any of the trackers.
 
-    `reach_px` is what must be seen ahead of one; `is_edge` is False where only the arrival of whatever comes along the
-    axis was followed, to about a pixel.
+    `reach_px` is how much of the strip must be visible ahead of a position; `is_edge` is False where only the arrival
+    of whatever comes along the axis was followed, to about a pixel. Further fields are those of `edge.EdgeFit` and
+    `body.BodyFit`.
     """
 
     edge_px: Floats
@@ -59,9 +62,9 @@ class Positions:
 
 
 def follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, order: FrontShare
+    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, front_share_of: FrontShare
 ) -> tuple[Strip, Positions]:
-    """Follow what moves along an axis: a body (travel ratio 1), the edge of a tube, or else whatever arrives.
+    """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
 
     Parameters
     ----------
@@ -69,7 +72,7 @@ def follow(
     trial : its travel ratio.
     axis : with the width of what moves along it, px.
     exposure_frames : exposure over frame period; NaN where unknown.
-    order : share of what changes along the axis that is a front passing once, see `axis.front_share`.
+    front_share_of : function from an axis to its `axis.front_share`.
 
     Returns
     -------
@@ -83,40 +86,45 @@ def follow(
     try:
         if trial.travel_ratio == 1:
             return _body(luma, axis, exposure_frames)
-        return _edge(luma, axis, exposure_frames, order) or _arrival(luma, axis, exposure_frames)
+        return _edge(luma, axis, exposure_frames, front_share_of) or _arrival(luma, axis, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
 
 
 def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
+    """Register a body against itself."""
     from vinetrack.video.body import track_body
 
     strip = cut_along(luma, axis, 0.75 * axis.width_px + 12)
     fit = track_body(strip)
-    place = np.where(fit.unseen, np.nan, fit.position_px)
-    return strip, Positions(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
+    position_px = np.where(fit.unseen, np.nan, fit.position_px)
+    return strip, Positions(
+        position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end
+    )  # fmt: skip
 
 
-def _edge(luma: NDArray[Any], axis: Axis, exposure_frames: float, order: FrontShare) -> tuple[Strip, Positions] | None:
-    """The edge of a tube; None where there is no tube along the axis."""
+def _edge(
+    luma: NDArray[Any], axis: Axis, exposure_frames: float, front_share_of: FrontShare
+) -> tuple[Strip, Positions] | None:
+    """Track the edge of a tube; None where there is no tube along the axis."""
     from vinetrack.video.edge import track_edge
     from vinetrack.video.tube_strip import tube_strip
 
-    about = tube_strip(luma, axis, order)
-    if about is None:
+    outlined = tube_strip(luma, axis, front_share_of)
+    if outlined is None:
         return None
-    strip, sides = about
-    front = track_edge(strip, exposure_frames, sides=sides)
-    reach = 3 * front.blur_px + 1
+    strip, tube = outlined
+    fit = track_edge(strip, exposure_frames, sides=tube)
+    reach = 3 * fit.blur_px + 1
     return strip, Positions(
-        front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
-        front.apart_sigma_px, front.bands_sigma_px, front.slow_px, width_px=(sides.width_px, sides.width_sigma_px),
-        seen_exposure=(front.seen_exposure_frames, front.fast_px_per_frame),
+        fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames, reach,
+        fit.apart_sigma_px, fit.bands_sigma_px, fit.slow_px, width_px=(tube.width_px, tube.width_sigma_px),
+        seen_exposure=(fit.seen_exposure_frames, fit.fast_px_per_frame),
     )  # fmt: skip
 
 
 def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
-    """Strip and positions of whatever comes along the axis, of no width or direction, to about a pixel."""
+    """Follow the arrival of whatever comes along the axis, of any width and direction, to about a pixel."""
     from vinetrack.video.kymograph import track_arrival
 
     strip = cut_along(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
@@ -126,11 +134,12 @@ def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[St
 
 
 def _unsure(fit: EdgeFit) -> Bools:
-    """Frames whose neighbourhood does not look like the edge elsewhere."""
-    from vinetrack.video.hidden_tip import PALE
+    """Frames in which the fit of the edge is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain."""
+    from vinetrack.video.hidden_tip import LEAST_AMPLITUDE
 
-    usual = float(np.nanmedian(fit.misfit))
-    odd = (fit.amplitude < PALE) | (fit.amplitude > BRIGHT) | (fit.misfit > ODD_RATIO * max(usual, LEAST_MISFIT))
-    odd |= (fit.apart_sigma_px > APART_PX) | fit.hidden
-    vague = fit.sigma_px > np.maximum(VAGUE_PX, VAGUE_RATIO * np.nanmedian(fit.sigma_px))
-    return np.asarray(odd | vague)
+    median_misfit = float(np.nanmedian(fit.misfit))
+    poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > LARGEST_AMPLITUDE)
+    poor = poor | (fit.misfit > MISFIT_RATIO * max(median_misfit, LEAST_MISFIT))
+    poor |= (fit.apart_sigma_px > DISAGREEMENT_PX) | fit.hidden
+    uncertain = fit.sigma_px > np.maximum(UNCERTAIN_PX, UNCERTAIN_RATIO * np.nanmedian(fit.sigma_px))
+    return np.asarray(poor | uncertain)

@@ -1,4 +1,4 @@
-"""Pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies."""
+"""Detect pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
-ODD_AMONG = 3
-"""First frames that may be odd. Chosen: cameras are known to write a wrong second frame and a corrupt first one."""
+ODD_FRAMES_WITHIN = 3
+"""Number of first frames that may be odd. Chosen: cameras are known to write a wrong second frame and a corrupt first
+one."""
 ODD_RATIO, ODD_GREY = 8.0, 6.0
-"""A frame is odd that differs from later ones by so many times what neighbours differ by, and by so many grey levels of
-255. Chosen: a release within the first frames changes part of the picture, by less. By reasoning: at half doors that
-swing in frame two reject it; at twice a frame of the same scene a second later passes."""
+"""A frame is odd where it differs from later ones by this many times what neighbours differ by, and by so many grey
+levels of 255. Chosen: a release within the first frames changes part of the picture, by less. By reasoning: at half,
+doors that swing in frame two reject it; at twice, a frame of the same scene a second later passes."""
 AROUND_PX = 40
-"""Columns on either side of the edge that are compared. Chosen: beyond the longest step. At half fast edges leave them;
-at twice what stands still outvotes the edge."""
-SEEN_STEP_PX = 2.0
-"""Step of a frame, over three of them, from which a copy is told from slow growth; half of it counts as motion. Chosen:
-edges err by tenths of a pixel. At half noise decides, at twice copies in slow growth stay."""
-STANDS, ALIKE = 0.1, 0.15
-"""A copy moves less than this part of a step, and its picture changes by less than this part of the usual. Chosen: a
-coder changes even a copy a little. At half compressed copies stay, at twice slow frames pass for copies."""
+"""Columns on either side of the edge that are compared. Chosen: beyond the longest step. At half, fast edges leave
+them; at twice, the still surroundings outweigh the edge."""
+CLEAR_STEP_PX = 2.0
+"""Mean step of three frames above which a copy can be told from slow growth; half of it counts as motion. Chosen: edges
+err by tenths of a pixel. At half, noise decides; at twice, copies in slow growth stay."""
+COPY_STEP_PART, COPY_CHANGE_PART = 0.1, 0.15
+"""A copy moves less than this part of a step, and its picture changes by less than this part of the median. Chosen: a
+coder changes even a copy a little. At half, compressed copies stay; at twice, slow frames pass for copies."""
 
 TORN_BLOCK_PX, TORN_RUN = 16, 12
-"""Side of the blocks that are compared, and how many of one row must leave what the frames before and after show.
-Derived: codecs write pictures in blocks of 16 px, row by row, and what is read wrongly goes on to the end of the row.
+"""Side of the blocks that are compared, and how many of one row must lie outside what the frames before and after show.
+Derived: codecs write pictures in blocks of 16 px, row by row, and a decoding error goes on to the end of the row.
 Measured (benchmarks/damaged_recordings.py, seed 20300): 9 at most where a door swings, 20 to 60 in torn frames."""
-TORN_GREY, TORN_USUAL = 4.0, 4.0
-"""Grey levels of 255 by which a block must leave them, beside so many times what it usually does. Chosen: the mean of a
-block has a noise of a quarter of a level; film that slides in a tube is uneven in every frame. At half noise of dark
-recordings counts, at twice faint tears pass."""
+TORN_GREY, TORN_RATIO = 4.0, 4.0
+"""Distance of a block outside them: so many grey levels of 255, and so many times its upper quartile. Chosen: the mean
+of a block has a noise of a quarter of a level; film that slides in a tube is uneven in every frame. At half, noise of
+dark recordings counts; at twice, faint tears pass."""
 
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
-    """Frames in which part of a row of blocks is unlike the frames before and after: read wrongly from a damaged file.
+    """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data.
 
-    A front that passes leaves a block between what it was and what it is; a tear lies beyond both.
+    A front that passes leaves a block between its values before and after; a tear lies outside both.
 
     Parameters
     ----------
@@ -55,24 +56,24 @@ def torn_frames(luma: NDArray[Any]) -> Bools:
     rows, columns = height // TORN_BLOCK_PX, width // TORN_BLOCK_PX
     if n < 6 or rows == 0 or columns < TORN_RUN:
         return np.zeros(n, dtype=bool)
-    cut = luma[:, : rows * TORN_BLOCK_PX, : columns * TORN_BLOCK_PX]
+    cropped = luma[:, : rows * TORN_BLOCK_PX, : columns * TORN_BLOCK_PX]
     grid = (rows, TORN_BLOCK_PX, columns, TORN_BLOCK_PX)
-    block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cut])
+    block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cropped])
     block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
     beyond = np.zeros_like(block)
     place = np.arange(n)
-    for gap in (1, 2):  # two torn frames in a row are seen by those around both
+    for gap in (1, 2):  # two torn frames in a row are compared with those around both
         before = np.where(place >= gap, place - gap, place + 2 * gap)
         after = np.where(place + gap < n, place + gap, place - 2 * gap)
         low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
         beyond = np.maximum(beyond, np.maximum(block - high, low - block))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
-    limit = TORN_GREY * unit + TORN_USUAL * np.quantile(beyond, 0.75, axis=0)
+    limit = TORN_GREY * unit + TORN_RATIO * np.quantile(beyond, 0.75, axis=0)
     return np.asarray((beyond > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
-    """Frames among the first few that resemble none after them: cameras are known to write such.
+    """Frames among the first few that resemble none after them; some cameras write such.
 
     Parameters
     ----------
@@ -90,18 +91,19 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
     def apart(a: int, b: int) -> float:
         return float(np.mean(np.abs(small[a] - small[b])))
 
-    usual = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
+    median_difference = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
-    far = max(ODD_RATIO * usual, ODD_GREY * unit)
-    for i in range(ODD_AMONG):
-        odd[i] = apart(i, 3) > far and apart(i, 4) > far
+    limit = max(ODD_RATIO * median_difference, ODD_GREY * unit)
+    for i in range(ODD_FRAMES_WITHIN):
+        odd[i] = apart(i, 3) > limit and apart(i, 4) > limit
     return odd
 
 
 def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
-    """Frames whose surroundings of the edge are those of the frame before.
+    """Frames in which the surroundings of the edge repeat those of the frame before.
 
-    Compared with what changes where the edge moves; and it must stand still between frames that show it moving on.
+    The change of the picture is compared with that where the edge moves, and the edge must stand still between frames
+    that show it moving on.
 
     Parameters
     ----------
@@ -122,11 +124,11 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
         pair = strip.values[i - 1 : i + 1, ::2, low : max(high, low + 1)].astype(np.float32)
         change[i] = float(np.mean(np.abs(pair[1] - pair[0]))) * float(strip.scale[i])
     moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > SEEN_STEP_PX / 2
-    usual = float(np.median(change[moving])) if moving.any() else np.inf
+    moving[1:] = np.diff(edge_px) > CLEAR_STEP_PX / 2
+    median_change = float(np.median(change[moving])) if moving.any() else np.inf
     repeated = np.zeros(n, dtype=bool)
     for i in range(2, n - 1):
-        usual_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        stands = abs(edge_px[i] - edge_px[i - 1]) < STANDS * usual_step
-        repeated[i] = usual_step > SEEN_STEP_PX and stands and change[i] < ALIKE * usual
+        mean_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
+        stands = abs(edge_px[i] - edge_px[i - 1]) < COPY_STEP_PART * mean_step
+        repeated[i] = mean_step > CLEAR_STEP_PX and stands and change[i] < COPY_CHANGE_PART * median_change
     return repeated

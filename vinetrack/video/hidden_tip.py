@@ -1,9 +1,9 @@
-"""What hides the tip where it starts: a door that stands or swings before it, the mouth of a launcher.
+"""Detect what hides the tip at the start: a door that stands or swings in front of it, or the mouth of a launcher.
 
-A door leaves: what it hid is told by pictures that resemble neither film nor background. A mouth stays, and its border
-with the background looks like a tip at rest while the tip moves behind it. That is told by what the tip leaves: behind
-a tip that was seen at rest the film goes on without a border, behind one that came out of something the straight
-border of that stays where the edge rested.
+A door leaves. While it hides the tip, the picture resembles neither film nor background, and the misfit shows it. A
+mouth stays: its border with the background looks like a tip at rest while the tip moves behind it. What the tip leaves
+behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a tip that
+came out of a mouth, the mouth's straight border stays where the edge rested.
 """
 
 from __future__ import annotations
@@ -18,76 +18,82 @@ from vinetrack.video.edge_repair import ASTRAY_PX
 from vinetrack.video.edge_state import CLEAR_PX, EdgeState, clear_of_start, moving_frames
 from vinetrack.video.strip import Strip
 
-HIDDEN = 3.2
-"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess.
-Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never has. By reasoning: at half textured
-backgrounds count as hidden; at twice payloads before the edge do not."""
-SURELY_HIDDEN = 1.12 * HIDDEN
-"""Misfit from which nothing of the tip is seen, whatever its contrast. Chosen: an eighth more than where it is a guess.
-By reasoning: nearer 1 every guess is given up; at twice of it doors of the film's brightness leave guesses."""
-UNUSUAL = 2.0
-"""Misfit over the usual one from which a frame differs from those clear of the start. Chosen. By reasoning: near 1
-every textured start counts, at twice dark doors before dark backgrounds do not."""
-PALE, PARTLY_PALE = 0.6, 0.75
-"""Amplitude, the contrast over that of the same pixels in other frames, below which too little of the edge is left, and
-below which part of it is. Chosen. They are not FAINTEST of `edge_repair` (0.5): below that a fit is sought again, while
-these judge what was found in the end. By reasoning: at half a door over two thirds of the tip passes; near 1 changing
-light does not."""
+HIDDEN_MISFIT = 3.2
+"""Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
+edge is a guess. Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never reaches. By reasoning:
+at half, textured backgrounds count as hidden; at twice, payloads in front of the edge do not."""
+COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
+"""Misfit above which nothing of the tip is visible, whatever its contrast. Chosen: an eighth more than HIDDEN_MISFIT.
+By reasoning: nearer 1 every guess is discarded; at twice, doors as bright as the film leave guesses."""
+UNUSUAL_MISFIT_RATIO = 2.0
+"""Ratio of the misfit to the median above which a frame differs from those clear of the start. Chosen. By reasoning:
+near 1 every textured start counts; at twice, dark doors in front of dark backgrounds do not."""
+LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
+"""Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
+visible, and below which part of it is hidden. Chosen. They differ from LEAST_FITTED_AMPLITUDE of `edge_repair` (0.5),
+below which a fit is repeated, while these judge the final fit. By reasoning: at half, a door over two thirds of the tip
+passes; near 1 changing light does not."""
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
-"""Error of an edge that is a guess, less than that of a fit gone astray, since the motion still bounds it; and where
-there is none: beyond LOST_SIGMA_PX of `point_quality`. Chosen; half or twice the first is the error of guesses."""
+"""Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it; and of a
+frame without an edge, above LOST_SIGMA_PX of `point_quality`. Chosen; half or twice the first is the stated error of
+guesses."""
 DOOR_COLUMNS, DOOR_FRAMES = (6, 10), 15
-"""Columns from the start at which a door is looked for, the fewest of them that tell, and frames before the motion in
-which it may swing. Chosen: clear of the tip's blur; at half of the frames slow doors are missed, at twice flicker
-counts."""
+"""First column after the start at which a door is looked for, the fewest columns that are conclusive, and the frames
+before the motion in which a door may swing. Chosen: clear of the tip's blur; with half the frames slow doors are
+missed, with twice flicker counts."""
 DOOR_PART, DOOR_GREY = 0.25, 4.0
-"""A column is changed by a door where its brightness varies by this part of the film's contrast and so many grey
-levels. Chosen. By reasoning: at half noise counts as a door, at twice dark doors on dark ground do not."""
+"""A door changes a column where its brightness varies by this part of the film's contrast and by so many grey levels.
+Chosen. By reasoning: at half, noise counts as a door; at twice, dark doors on dark ground do not."""
 
-FEWEST_AT_REST = 3
-"""Frames of rest from which a place is known. Chosen as in `point_quality`: two frames alike may be a slow start."""
+FEWEST_REST_FRAMES = 3
+"""Fewest frames of rest from which the resting place is known. Chosen as in `point_quality`: two equal frames may be a
+slow start."""
 MIDDLE_ROWS = 0.6
-"""Part of the strip's rows, about its middle, that are the tube's whatever its sides do. Chosen: the strip is 1.15
-times as high as the tube and 10 px more. By reasoning: at half few rows say whether the border is straight; with all of
-them the background beside the tube says it is not."""
-GAP_PX, SIDE_PX = 3, 6
-"""Columns left out on either side of a border, for its blur, and those taken beyond. Chosen: blurs reach 3 px; six
-columns average film's grain. At half of them grain decides, at twice a mouth near the strip's start is not seen."""
-FILM_PX = (20, 150)
-"""From and to how far beyond the border the film's own steps are taken. Chosen: clear of what is about the start, and a
-few diameters of film. Half or twice changes the largest of them by its scatter."""
-LOOKED_PX = 3
-"""How far from the place of rest a border is looked for. Chosen: the edge at rest errs by less."""
-STRAIGHT = 0.95
+"""Part of the strip's rows, about its middle, that belong to the tube whatever its sides do. Chosen: the strip is 1.15
+times as high as the tube and 10 px more. By reasoning: at half, few rows decide whether the border is straight; with
+all rows the background beside the tube makes it look ragged."""
+BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
+"""Columns left out on either side of a border, for its blur, and columns averaged beyond them. Chosen: blurs reach 3
+px; six columns average film's grain. At half, grain decides; at twice, a mouth near the strip's start is not seen."""
+FILM_RANGE_PX = (20, 150)
+"""Distances beyond the border between which the film's own steps are taken. Chosen: clear of what is about the start,
+and a few diameters of film. Half or twice changes the largest of them by its scatter."""
+SEARCH_PX = 3
+"""Distance from the resting place within which a border is looked for. Chosen: the edge at rest errs by less."""
+STRAIGHT_PART = 0.95
 """Part of the rows that must show the border with the same sign. Measured (tips seen at rest, laboratory and drawings
 of other code, seeds 20410-20466): 0.94 at most in 36 recordings; 1.00 at six mouths (seed 20511)."""
-STRONGEST = 2.0
-"""The border against the largest step between neighbouring columns of film further on. Measured on the same: 1.6 at
-most, and 2.6 at least at a mouth only 30 grey levels darker than the film."""
-LEAST_PART = 0.5
-"""The border against the film's contrast. Measured on the same: 0.36 at most, and 0.66 at least. By reasoning: at half,
-backgrounds with strong marks count as mouths; at twice, a mouth as bright as the film is not seen."""
-FRAMES_OUT = 5
-"""Frames after the tip has come out by which speed and acceleration there are judged. Chosen: three numbers of a
+BORDER_TO_FILM = 2.0
+"""Least ratio of the border to the largest step between neighbouring columns of film further on. Measured on the same:
+1.6 at most without a mouth, and 2.6 at least at a mouth only 30 grey levels darker than the film."""
+BORDER_TO_CONTRAST = 0.5
+"""Least ratio of the border to the film's contrast. Measured on the same: 0.36 at most without a mouth, 0.66 at least
+at one. By reasoning: at half, backgrounds with strong marks count as mouths; at twice, a mouth as bright as the film is
+not seen."""
+FRAMES_AFTER_EXIT = 5
+"""Frames after the tip has come out from which its speed and acceleration are estimated. Chosen: three numbers of a
 parabola, and two frames more."""
-LEAPS = 3.0
-"""Change of the step, in the largest of the next four, from which hidden frames are not of the motion that follows.
-Chosen: from rest steps grow evenly, and release between two frames makes one change 1.5 times the next. By reasoning:
-at half such releases count as leaps, at twice a door that was followed passes for the tip."""
+LEAP_RATIO = 3.0
+"""Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
+motion that follows. Chosen: from rest steps grow evenly, and a release between two frames makes one change 1.5 times
+the next. By reasoning: at half, such releases count as leaps; at twice, a door that was followed passes for the tip."""
 LEAST_LEAP_PX = ASTRAY_PX
-"""The same at least. Chosen: what a guess may be off by. At half the noise of slow starts counts as a leap, at twice
-small ones pass."""
-SPEEDS_UP = 0.3
-"""Gain of speed over the next four frames, in the step after a leap, from which a motion still speeds up. Chosen: force
-and damping B·v^0.37 leave a third of the first acceleration at 0.3 of the final speed, so that a step reached within a
-frame is followed by less. By reasoning: at half vines whose speed settles count as leaps, at twice some leaps pass."""
+"""Smallest change of the step that is a leap. Chosen: the error of a guess. At half, the noise of slow starts counts as
+a leap; at twice, small leaps pass."""
+SPEED_GAIN = 0.3
+"""Gain of speed over the next four frames, as a part of the step after a leap, above which the motion is still
+accelerating. Chosen: force and damping B·v^0.37 leave a third of the first acceleration at 0.3 of the final speed, so
+that a step reached within a frame is followed by less. By reasoning: at half, vines whose speed settles count as leaps;
+at twice, some leaps pass."""
 
 
 @dataclass(frozen=True)
 class Mouth:
-    """`before`, shape (n_frames,), marks frames in which the edge stands at a border that stays when the tip has gone.
+    """A launcher's mouth at the start.
 
-    `moved_behind`: the tip comes out faster than a start from rest at that border allows; it was further back.
+    `before`, shape (n_frames,), marks the frames in which the edge stands at a border that stays after the tip has
+    gone. `moved_behind`: the tip comes out faster than a start from rest at that border allows; it started further
+    back.
     """
 
     before: Bools
@@ -95,12 +101,12 @@ class Mouth:
 
 
 def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
-    """Look for a border that stays where the edge rested.
+    """Look for a straight border that stays where the edge rested.
 
     Parameters
     ----------
     strip : along the axis.
-    state : what lies before and after the edge.
+    state : of the edge tracker.
     edge : shape (n_frames,), px; finite.
 
     Returns
@@ -109,89 +115,106 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     """
     none = Mouth(np.zeros(len(edge), dtype=bool), False)
     first = int(np.flatnonzero(moving_frames(state.edge))[0])
-    if first < FEWEST_AT_REST:
+    if first < FEWEST_REST_FRAMES:
         return none
-    place = float(np.median(edge[:first]))
-    gone = np.flatnonzero((edge > place + CLEAR_PX) & (np.arange(len(edge)) >= first))
-    near = np.arange(round(place) - LOOKED_PX, round(place) + LOOKED_PX + 1)
-    # Not where the tip, which is round, comes to rest.
-    later = np.arange(near[-1] + FILM_PX[0], min(near[-1] + FILM_PX[1], int(edge.max() - CLEAR_PX)))
-    if len(gone) < FEWEST_AT_REST or near[0] < GAP_PX + SIDE_PX or len(later) < FILM_PX[0]:
+    rest_px = float(np.median(edge[:first]))
+    exited = np.flatnonzero((edge > rest_px + CLEAR_PX) & (np.arange(len(edge)) >= first))
+    near = np.arange(round(rest_px) - SEARCH_PX, round(rest_px) + SEARCH_PX + 1)
+    # Not where the tip comes to rest: it is round.
+    later = np.arange(near[-1] + FILM_RANGE_PX[0], min(near[-1] + FILM_RANGE_PX[1], int(edge.max() - CLEAR_PX)))
+    if len(exited) < FEWEST_REST_FRAMES or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < FILM_RANGE_PX[0]:
         return none
-    film = _middle_picture(strip, gone)
-    steps = np.stack([_border(film, int(column)) for column in near])
-    strongest = steps[int(np.argmax(np.abs(np.median(steps, axis=1))))]
-    size = float(np.median(strongest))
-    usual = max(abs(float(np.median(_border(film, int(column))))) for column in later)
+    film_picture = _middle_picture(strip, exited)
+    border_steps = np.stack([_border(film_picture, int(column)) for column in near])
+    border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
+    border_step = float(np.median(border))
+    film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in later)
     contrast = np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))[later]
-    straight = float(np.mean(np.sign(strongest) == np.sign(size)))
-    if straight < STRAIGHT or abs(size) < max(STRONGEST * usual, LEAST_PART * float(np.median(contrast))):
+    straight = float(np.mean(np.sign(border) == np.sign(border_step)))
+    if straight < STRAIGHT_PART or abs(border_step) < max(
+        BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast))
+    ):
         return none
-    out = place + 3 * state.blur + 1
-    leaves = first + int(np.argmax(edge[first:] > out))
-    return Mouth(np.arange(len(edge)) < leaves, _moved_behind(edge[leaves : leaves + FRAMES_OUT], place))
+    clear_px = rest_px + 3 * state.blur + 1
+    exit_frame = first + int(np.argmax(edge[first:] > clear_px))
+    return Mouth(
+        np.arange(len(edge)) < exit_frame, _moved_behind(edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT], rest_px)
+    )
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
-    """Share of the columns before the start that change before the edge reaches them: a door swings there.
+    """Share of the columns at the start that change before the edge reaches them: a door swings there.
 
     Parameters
     ----------
     strip : along the axis.
-    state : what lies before and after the edge.
+    state : of the edge tracker.
 
     Returns
     -------
     0 to 1.
     """
     begin, columns = state.edge[0], strip.values.shape[2]
-    places = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + CLEAR_PX), columns - 1))
+    column_range = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + CLEAR_PX), columns - 1))
     moving = np.flatnonzero(moving_frames(state.edge))
-    if len(places) < DOOR_COLUMNS[1] or moving[0] < 2:
+    if len(column_range) < DOOR_COLUMNS[1] or moving[0] < 2:
         return 0.0
     first = max(0, int(moving[0]) - DOOR_FRAMES)
     rising = np.maximum.accumulate(state.edge)
     contrast = float(np.median(np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))))
     changed = 0
-    for place in places:
-        arrival = int(np.searchsorted(rising, place - 5.0))
-        seen = strip.values[first : max(arrival - 1, first + 1), :, place].mean(axis=1)
-        change = np.ptp(seen * strip.scale[first : first + len(seen)] + strip.offset[first : first + len(seen)])
+    for column in column_range:
+        arrival = int(np.searchsorted(rising, column - 5.0))
+        brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
+        change = np.ptp(
+            brightness * strip.scale[first : first + len(brightness)] + strip.offset[first : first + len(brightness)]
+        )
         changed += change > max(DOOR_PART * contrast, DOOR_GREY)
-    return changed / len(places)
+    return changed / len(column_range)
 
 
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, apart: Floats) -> Floats:
-    """Errors made larger where a door still stands before the tip.
+    """Enlarge the errors of frames in which a door still hides the tip.
 
-    Then the edge is a guess, and none at all where the picture is quite another or hardly any contrast is left.
+    There the edge is a guess; where the picture differs entirely from the model, or hardly any contrast is left, there
+    is no edge.
 
     Parameters
     ----------
     fit : from `edge_state.fit_edges`, shape (n_frames, 6).
-    misfit_ratio : misfit over the usual one, shape (n_frames,).
+    misfit_ratio : misfit over the median, shape (n_frames,).
     edge : shape (n_frames,), px.
-    apart : what is to be added to the error in square, shape (n_frames,), px.
+    apart : error that is added to the likelihood's in quadrature, shape (n_frames,), px.
 
     Returns
     -------
-    the same, larger where the tip is hidden, shape (n_frames,), px.
+    `apart`, larger where the tip is hidden, shape (n_frames,), px.
     """
     near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
-    other, odd = misfit > HIDDEN, misfit > HIDDEN / 2
-    covered = near & (misfit_ratio > UNUSUAL) & ((misfit > SURELY_HIDDEN) | odd & (amplitude < PALE))
+    large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
+    covered = (
+        near
+        & (misfit_ratio > UNUSUAL_MISFIT_RATIO)
+        & ((misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE))
+    )
     if covered.sum() > 1:
-        # A door leaves, it does not come: what stood before it was hidden too.
+        # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
         apart = np.where(earlier, np.hypot(apart, ASTRAY_PX), apart)
-    guessed = near & (other & (misfit_ratio > HIDDEN) | odd & (misfit_ratio > UNUSUAL) & (amplitude < PARTLY_PALE))
+    guessed = near & (
+        large & (misfit_ratio > HIDDEN_MISFIT)
+        | raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
+    )
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(apart, GUESSED_PX), apart))
 
 
 def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float32]:
-    """Median of the middle rows over some frames, grey levels freed of flicker: the moving tail averages out."""
+    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker.
+
+    The moving tail averages out.
+    """
     rows = strip.values.shape[1]
     edge_rows = round((1 - MIDDLE_ROWS) / 2 * rows)
     chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
@@ -201,33 +224,34 @@ def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float3
 
 
 def _border(picture: NDArray[np.float32], column: int) -> NDArray[np.float32]:
-    """Step of each row across a column, shape (n_rows,)."""
-    ahead = picture[:, column + GAP_PX : column + GAP_PX + SIDE_PX].mean(axis=1)
-    behind = picture[:, column - GAP_PX - SIDE_PX : column - GAP_PX].mean(axis=1)
+    """Step of brightness across a column, by row, shape (n_rows,)."""
+    ahead = picture[:, column + BORDER_GAP_PX : column + BORDER_GAP_PX + BORDER_SIDE_PX].mean(axis=1)
+    behind = picture[:, column - BORDER_GAP_PX - BORDER_SIDE_PX : column - BORDER_GAP_PX].mean(axis=1)
     return np.asarray(ahead - behind, dtype=np.float32)
 
 
-def _moved_behind(edge: Floats, place: float) -> bool:
-    """Whether a tip seen first at `edge` started further back than at `place`.
+def _moved_behind(edge: Floats, rest_px: float) -> bool:
+    """Whether a tip first seen at `edge` started further back than at `rest_px`.
 
-    From rest under the acceleration a that it has now, it would have come v²/2a: the speed it has, held against the way
-    that is seen. As much again, and 5 px, are forgiven for an acceleration that falls.
+    From rest under its present acceleration a it would have come v²/2a, with v its present speed; this is compared with
+    the distance from `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
     """
-    if len(edge) < FRAMES_OUT:
+    if len(edge) < FRAMES_AFTER_EXIT:
         return False
-    bend, speed, begin = np.polyfit(np.arange(FRAMES_OUT), edge, 2)
-    run = speed**2 / (4 * bend) if bend > 0 else np.inf
-    return bool(run > 2 * (begin - place) + 5)
+    half_acceleration, speed, start_px = np.polyfit(np.arange(FRAMES_AFTER_EXIT), edge, 2)
+    run_up_px = speed**2 / (4 * half_acceleration) if half_acceleration > 0 else np.inf
+    return bool(run_up_px > 2 * (start_px - rest_px) + 5)
 
 
 def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
-    """How far hidden frames are from where the motion that follows comes from, if they do not lead up to it.
+    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it.
 
-    What swings before the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
-    Back from the first frames that are not hidden, a step that differs from the one after it by more than LEAPS times
-    what any of the next four do is such a leap, if these still speed up (SPEEDS_UP): a vine whose speed settles within
-    a frame may set off like that, one that goes on speeding up was no faster to begin with. Before the leap the motion
-    is followed back at their mean acceleration, no slower than rest, and the edge is off by as much as it differs.
+    What swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps
+    to it. Going back from the first frame that is not hidden, a leap is a step that differs from the one after it by
+    more than LEAP_RATIO times the largest difference among the next four steps, provided those still accelerate
+    (SPEED_GAIN): a vine whose speed settles within a frame may start like that, but one that goes on accelerating was
+    no faster before. Before the leap the motion is extrapolated backwards at the mean acceleration of those steps, no
+    slower than rest; the error is the distance of the edge from it.
 
     Parameters
     ----------
@@ -242,12 +266,12 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
     if hidden.all():
         return out
     steps = np.diff(edge)
-    bends = np.diff(steps)  # bends[t] is between the steps from t and from t + 1
+    bends = np.diff(steps)  # bends[t] is the change between the steps from t and from t + 1
     for t in range(int(np.argmin(hidden)) - 1, -1, -1):
-        later = bends[t + 1 : t + FRAMES_OUT]
-        if len(later) < FRAMES_OUT - 1 or not later.sum() > SPEEDS_UP * steps[t + 1]:
+        later = bends[t + 1 : t + FRAMES_AFTER_EXIT]
+        if len(later) < FRAMES_AFTER_EXIT - 1 or not later.sum() > SPEED_GAIN * steps[t + 1]:
             continue
-        if abs(bends[t]) <= max(LEAPS * np.abs(later).max(), LEAST_LEAP_PX):
+        if abs(bends[t]) <= max(LEAP_RATIO * np.abs(later).max(), LEAST_LEAP_PX):
             continue
         back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
         out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))

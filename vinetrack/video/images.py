@@ -1,4 +1,4 @@
-"""Recordings that are image files: a numbered folder of PNG, JPEG, TIFF, DNG or BMP, or one TIFF stack."""
+"""Read recordings that are image files: a numbered folder of PNG, JPEG, TIFF, DNG or BMP, or one TIFF stack."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
 
 
 def inspect_images(path: Path) -> Recording:
-    """Facts about a folder of images or a TIFF stack, from its first picture.
+    """Read the facts of a folder of images or a TIFF stack from its first picture.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def inspect_images(path: Path) -> Recording:
 
 
 def read_images(recording: Recording, region: Region) -> Frames:
-    """Read every picture; one that is missing its end or cannot be read is black or partial and marked damaged.
+    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def read_images(recording: Recording, region: Region) -> Frames:
         )
     slot = np.arange(len(pictures))
     if recording.numbers:
-        slot, missing = _slots_from_numbers(np.array(recording.numbers))
+        slot, missing = _capture_periods(np.array(recording.numbers))
         if missing:
             notes.append(f"{name}: {missing} pictures are missing by their numbers; the others keep their own time")
     return Frames(recording, region, np.stack(pictures), slot, np.array(damaged, dtype=bool), tuple(notes))
@@ -127,12 +127,12 @@ def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any
 
 
 def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tuple[str, ...]]:
-    """Images of the folder in the order of their numbers; those named otherwise than the most are left out."""
+    """Images of the folder in the order of their numbers; those not named like the majority are left out."""
     images = sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGES and not f.name.startswith("."))
     if not images:
         raise RecordingError(f"{folder.name}: the folder holds no images; expected PNG, JPEG, TIFF or DNG frames")
-    if waits := next(filter(is_pipe_or_device, images), None):
-        raise RecordingError(f"{folder.name}: {waits.name} cannot be read: {NOT_A_FILE}")
+    if unreadable := next(filter(is_pipe_or_device, images), None):
+        raise RecordingError(f"{folder.name}: {unreadable.name} cannot be read: {NOT_A_FILE}")
     groups: dict[tuple[str, str], list[tuple[int, Path]]] = {}
     for file in images:
         match = re.fullmatch(r"(.*?)(\d+)\D*", file.stem)
@@ -153,27 +153,28 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
     return files, numbers, (note,) if note else ()
 
 
-def _slots_from_numbers(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
-    """Capture period from the numbers of the files, which may count by any step, and how many are missing."""
-    plain = np.arange(len(numbers))
+def _capture_periods(numbers: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
+    """Capture periods from the numbers of the files, which may count in any step, and how many are missing."""
+    consecutive = np.arange(len(numbers))
     if len(numbers) < 3:
-        return plain, 0
+        return consecutive, 0
     steps = np.diff(numbers)
     step = int(np.median(steps))
     if step <= 0 or np.any(steps % step) or np.any(steps <= 0):
-        return plain, 0
+        return consecutive, 0
     slot = np.concatenate([[0], np.cumsum(steps // step)])
-    missing = int(slot[-1] - plain[-1])
-    return (slot, missing) if missing <= max(3, len(numbers) // 10) else (plain, 0)
+    missing = int(slot[-1] - consecutive[-1])
+    return (slot, missing) if missing <= max(3, len(numbers) // 10) else (consecutive, 0)
 
 
 def _read_folder(recording: Recording, region: Region) -> tuple[list[NDArray[Any]], list[bool]]:
+    """The pictures of a folder, and which are damaged."""
     pictures: list[NDArray[Any]] = []
     damaged: list[bool] = []
     dtype = np.uint8 if recording.bit_depth == 8 else np.uint16
     for file in recording.files:
         picture = _read_or_none(file)
-        bad = picture is None or picture.shape != (recording.height, recording.width) or not _has_its_end(file)
+        bad = picture is None or picture.shape != (recording.height, recording.width) or not _has_end_marker(file)
         if picture is None or picture.shape != (recording.height, recording.width):
             picture = np.zeros((recording.height, recording.width), dtype)
         pictures.append(picture[region.slices].astype(dtype, copy=False))
@@ -181,8 +182,8 @@ def _read_folder(recording: Recording, region: Region) -> tuple[list[NDArray[Any
     return pictures, damaged
 
 
-def _has_its_end(file: Path) -> bool:
-    """Whether a JPEG or PNG carries its end marker: decoders fill what is missing with grey and say nothing."""
+def _has_end_marker(file: Path) -> bool:
+    """Whether a JPEG or PNG has its end marker: decoders silently fill a missing part with grey."""
     suffix = file.suffix.lower()
     if suffix not in {".jpg", ".jpeg", ".png"}:
         return True
@@ -236,7 +237,7 @@ def _dng_pages(tiff: Any) -> Iterator[Any]:
 
 
 def _dng_clock(file: Path) -> tuple[float | None, float | None]:
-    """Capture rate and exposure that a CinemaDNG frame carries (tags 51044 and 33434); None where absent."""
+    """Capture rate and exposure of a CinemaDNG frame (tags 51044 and 33434); None where absent."""
     import tifffile
 
     values: dict[int, float] = {}
@@ -271,7 +272,7 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
 
 
 def _unpack_12_bit(file: Path, page: Any) -> NDArray[np.uint16]:
-    """Two pixels in three bytes, most significant bits first, rows beginning on whole bytes."""
+    """Unpack two pixels from three bytes, most significant bits first, rows beginning on whole bytes."""
     with file.open("rb") as stream:
         parts = []
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):

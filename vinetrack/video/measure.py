@@ -1,4 +1,4 @@
-"""A recording measured: its track in metres by the calibration that its experiment names, and how good the scale is."""
+"""Measure a recording: its track in metres by the experiment's calibration, and the error of the scale."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Measurement:
 
     `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its relative standard error, NaN where unknown:
     an error that all points share, kept apart from the random error of each. `calibration` is None where the scale is
-    the trial's own `mm_per_px`. `capture_fps` and the `recording` are what the track was made from.
+    the trial's `mm_per_px`. `capture_fps` and the `recording` are those that the track was made from.
     """
 
     tracking: Tracking
@@ -40,7 +40,7 @@ class Measurement:
 
     @property
     def growth_m(self) -> float:
-        """From the first usable position to the furthest, m."""
+        """Distance from the first usable position to the furthest, m."""
         position_m = self.tracking.track.lead_position_m[self.tracking.track.usable]
         return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
 
@@ -52,7 +52,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     ----------
     trial : its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
     settings : `calibration` and, where the trial has none of its own, `axis` are used.
-    folder : the experiment's folder, from which the calibration's picture counts.
+    folder : the experiment's folder, to which the path of the calibration's picture is relative.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
         along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
     notes = [*tracking.track.notes]
-    # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
+    # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
     if calibration is not None and math.isfinite(calibration.reprojection_px):
         notes += calibration.notes
     tracking = replace(tracking, track=replace(tracking.track, notes=tuple(notes)))
@@ -93,7 +93,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
 def calibration_of(
     trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
 ) -> PlaneCalibration | None:
-    """The calibration of the experiment; None where the trial brings a scale of its own or there is none.
+    """The calibration of the experiment; None where the trial has its own scale or there is no calibration.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def calibration_of(
 
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
-    """Return the growth axis of the sheet or the settings.
+    """Return the growth axis of the sheet, else of the settings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What ends a motion, in words: the whole vine has grown, something stands in its way, the recording ends before it."""
+"""Say why a motion ended: the whole vine has grown, an obstacle stopped it, or the recording ended first."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
 
 GROWN_TOLERANCE = 0.03
-"""Part of a vine's length by which travel and length may differ, for the vine to have grown whole. Chosen: lengths are
-cut to a few millimetres in 20 cm, and scales err by a per cent. At half whole growths go unrecognised, at twice a stop
-just before the end passes for it."""
-SHORTEST_END = 4
-"""Frames of standstill at the end that are worth a word. Chosen; at half two frames alike are told of."""
-STILL_CHANGING = 0.3
-"""Part of the change of pictures in motion from which the picture goes on changing when the edge stands. Chosen between
-noise, 0, and motion, 1. At half a hand that lets go counts, at twice only film that goes on sliding does."""
+"""Relative difference of travel and length within which the whole vine has grown. Chosen: lengths are cut to a few
+millimetres in 20 cm, and scales err by a per cent. At half, complete growths go unrecognised; at twice, a stop just
+before the end counts as one."""
+FEWEST_STILL_FRAMES = 4
+"""Fewest frames of standstill at the end that are reported. Chosen; at half, two equal frames are reported."""
+CHANGING_PART = 0.3
+"""Change of the pictures after the stop, as a part of that in motion, above which the picture goes on changing. Chosen
+between noise, 0, and motion, 1. At half, a hand that lets go counts; at twice, only film that goes on sliding does."""
 
 
-def is_grown(edge_px: Floats, verdict: PointQuality, length_px: float) -> bool:
-    """Whether the edge stops where the whole vine has grown, as it should; no where its length or rest is unknown.
+def is_grown(edge_px: Floats, quality: PointQuality, length_px: float) -> bool:
+    """Whether the edge stops where the whole vine has grown; False where its length or its rest is unknown.
 
     Parameters
     ----------
     edge_px : along the axis, shape (n_frames,), px.
-    verdict : which frames it moves in.
+    quality : which frames it moves in.
     length_px : of the vine; NaN where unknown.
 
     Returns
     -------
     whether it has.
     """
-    if verdict.last_moving < 0 or not np.isfinite(length_px):
+    if quality.last_moving < 0 or not np.isfinite(length_px):
         return False
-    start, end = edge_px[: verdict.first_moving], edge_px[verdict.last_moving + 1 :]
+    start, end = edge_px[: quality.first_moving], edge_px[quality.last_moving + 1 :]
     if not (np.isfinite(start).any() and np.isfinite(end).any()):
         return False
     return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
 
 
 def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
-    """What is to be said of a body that goes its way no further.
+    """Say why a body is not followed to the end of the recording.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
 
     Returns
     -------
-    words.
+    the sentence.
     """
     frame = number[end.last_frame]
     if end.turns_back:
@@ -65,14 +65,14 @@ def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
 
 
 def growth_end_notes(
-    luma: NDArray[Any], verdict: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
+    luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
 ) -> list[str]:
-    """What is to be said of an edge that stops before the recording does.
+    """Say why the edge stops before the recording does.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width).
-    verdict : which frames the edge moves in.
+    quality : which frames the edge moves in.
     edge_px : along the axis, shape (n_frames,), px.
     name : of the recording.
     number : of each frame in the recording, shape (n_frames,).
@@ -81,32 +81,32 @@ def growth_end_notes(
     -------
     a sentence, or none.
     """
-    n, last = len(edge_px), verdict.last_moving
-    if last < 0 or last >= n - SHORTEST_END or verdict.left_picture is not None:
+    n, last = len(edge_px), quality.last_moving
+    if last < 0 or last >= n - FEWEST_STILL_FRAMES or quality.left_picture is not None:
         return []
     import cv2
 
     pairs = itertools.pairwise(np.ascontiguousarray(luma[:, ::3, ::3]))
     change = np.array([cv2.absdiff(a, b).mean() for a, b in pairs])
-    before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
+    before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))
     resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
     if not resting.size:
         return [f"{name}: the leading edge is not seen after frame {number[last]}"]
     where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
-    if later - least > STILL_CHANGING * (before - least):
+    if later - least > CHANGING_PART * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 
 
-def truncation_notes(edge_px: Floats, verdict: PointQuality, length_px: float, name: str) -> list[str]:
-    """What is to be said of a recording that ends while the edge is on its way.
+def truncation_notes(edge_px: Floats, quality: PointQuality, length_px: float, name: str) -> list[str]:
+    """Say that the recording ends while the edge is moving.
 
     Parameters
     ----------
     edge_px : along the axis, shape (n_frames,), px.
-    verdict : which frames it moves in.
+    quality : which frames it moves in.
     length_px : of the vine; NaN where unknown.
     name : of the recording.
 
@@ -115,8 +115,8 @@ def truncation_notes(edge_px: Floats, verdict: PointQuality, length_px: float, n
     a sentence, or none.
     """
     seen = np.flatnonzero(np.isfinite(edge_px))
-    if verdict.last_moving < seen[-1] or verdict.left_picture is not None:
+    if quality.last_moving < seen[-1] or quality.left_picture is not None:
         return []
-    grown = edge_px[seen[-1]] - float(np.median(edge_px[seen][: max(verdict.first_moving, 1)]))
+    grown = edge_px[seen[-1]] - float(np.median(edge_px[seen][: max(quality.first_moving, 1)]))
     part = f", after {grown / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
     return [f"{name}: the recording ends while the leading edge moves{part}"]

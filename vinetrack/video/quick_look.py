@@ -1,6 +1,7 @@
-"""A recording looked at before any work: axis, width of the tube and growth, from about a hundred of its frames.
+"""Look into a recording before any work: axis, width of the tube and growth, from about a hundred of its frames.
 
-A second a recording, no edge fitted: the widths agree with those of the tracker, growth is known to some per cent.
+It takes a second a recording and fits no edge: the widths agree with those of the tracker, growth is known to some per
+cent.
 """
 
 from __future__ import annotations
@@ -23,18 +24,19 @@ from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.track import locate_axis
 from vinetrack.video.tube_strip import tube_strip
 
-LOOKED_AT = 100
-"""Chosen: frames of a recording that are looked at. At half of them a vine that grows within a tenth of the recording
+FRAMES_LOOKED_AT = 100
+"""Frames of a recording that are looked at. Chosen: at half of them a vine that grows within a tenth of the recording
 shows in five frames; at twice as many a look takes twice the time."""
 MOST_BYTES = 200_000_000
-"""Chosen: memory for those frames, as a laptop has it to spare; 100 frames of 2 megapixels fit."""
+"""Memory for those frames. Chosen: what a laptop has to spare; 100 frames of 2 megapixels fit."""
 MOST_DECODED = 4000
-"""Chosen: frames that are decoded, some three seconds' work; of a longer recording the beginning is looked at."""
+"""Most frames that are decoded, some three seconds' work; of a longer recording the beginning is looked at. Chosen for
+time."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Axis in the picture, width of the tube and its standard error, growth, greatest speed; NaN where not seen.
+    """What a quick look shows; NaN where not seen.
 
     `growth_px` is NaN as well where the recording is longer than what was looked at; `px_per_frame` is the mean speed
     over the middle of the growth.
@@ -50,39 +52,37 @@ class Look:
 def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | None) -> Look:
     """Look for the axis, the width of the tube and its growth.
 
-    The sheet's diameter is not used: what it is compared with must not depend on it.
+    The sheet's diameter is not used: what it will be compared with must not depend on it.
 
     Parameters
     ----------
     recording : opened.
     trial : its travel ratio.
     axis : growth axis in the picture, px; found from the motion where None.
-    count : frames of the recording as far as they are known; None where they are not.
+    count : number of frames of the recording; None where unknown.
 
     Returns
     -------
-    look : without numbers where nothing grows along one line.
+    the look, without numbers where nothing grows along one line.
     """
-    most = int(np.clip(MOST_BYTES // (recording.width * recording.height), LOOKED_AT // 4, LOOKED_AT))
+    most = int(np.clip(MOST_BYTES // (recording.width * recording.height), FRAMES_LOOKED_AT // 4, FRAMES_LOOKED_AT))
     every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
     luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
     try:
-        axis_found, order = locate_axis(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
-        about = tube_strip(luma, axis_found, order) if trial.travel_ratio == 2 else None
-        if about is None:
-            return Look(axis_found)
-        strip, sides = about
+        located, front_share_of = locate_axis(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        outlined = tube_strip(luma, located, front_share_of) if trial.travel_ratio == 2 else None
+        if outlined is None:
+            return Look(located)
+        strip, tube = outlined
         growth_px, px_per_frame = rough_growth(strip)
     except (RecordingError, ValueError):
         return Look()
     whole = count is None or count <= MOST_DECODED
-    return Look(
-        strip.axis, sides.width_px, sides.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every
-    )
+    return Look(strip.axis, tube.width_px, tube.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every)
 
 
 def proposed_axis(luma: NDArray[Any]) -> Axis:
-    """The growth axis as the motion shows it, along the middle of the tube where one front passes once.
+    """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     small = SmallPictures(luma)
     axis = find_growth_axis(small, luma)
     try:
-        about = tube_strip(luma, axis, front_share_function(small, luma))
+        outlined = tube_strip(luma, axis, front_share_function(small, luma))
     except ValueError:
         return axis
-    return axis if about is None else about[0].axis
+    return axis if outlined is None else outlined[0].axis

@@ -1,7 +1,7 @@
-"""What was understood of a recording, and whether that agrees with the sheet.
+"""Facts of a recording, and whether they agree with the sheet.
 
-A ruler wrong by ten, a diameter in the column of the length or a rate of playback would otherwise come out as physics.
-`vinetrack.video.quick_look` sees width and growth before any work, the tracker sees them better.
+A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out as
+physics. `vinetrack.video.quick_look` measures width and growth before any work; the tracker measures them better.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from vinetrack.video.curved_axis import CurvedAxis, axis_entry
 from vinetrack.video.measure import Measurement
 from vinetrack.video.track import Tracking
 
-WIDTH_PART = 0.08
-"""Part of the diameter by which the width in the picture may miss it beyond its stated error. Measured
-(benchmarks/seen_sizes.py, seeds 20900 and up): 0.96 to 1.02 of it is seen. Beyond a ruler that lies 10 cm nearer to a
-camera 1.5 m away a tube looks 7 % narrower."""
-GROWTH_PART = {True: 0.06, False: 0.12}
-"""Part of the length by which growth may exceed it, as the tracker (True) or a quick look (False) sees it. Measured
-(as above): up to 1.00 and 1.02 of it are seen; the rest is for a ruler beside the plane of growth."""
-BLUR_PX = 3.0
-"""Blur, over its length, by which a stated exposure may miss what is seen; twice that is an error. Measured (seeds
+WIDTH_TOLERANCE = 0.08
+"""Relative difference of width and diameter that is allowed beyond the stated error. Measured
+(benchmarks/seen_sizes.py, seeds 20900 and up): 0.96 to 1.02 of the diameter is seen. With a ruler 10 cm nearer to a
+camera that is 1.5 m away, a tube looks 7 % narrower."""
+GROWTH_TOLERANCE = {True: 0.06, False: 0.12}
+"""Relative excess of growth over length that is allowed, with growth from the tracker (True) or a quick look (False).
+Measured (as above): up to 1.00 and 1.02 of it are seen; the rest is for a ruler beside the plane of growth."""
+EXPOSURE_TOLERANCE_PX = 3.0
+"""Difference of the blur lengths of stated and seen exposure that is allowed; twice that is an error. Measured (seeds
 20900 and up): true exposures miss it by up to 0.8 px, one of a whole frame for a tenth by 3.4 to 34 px at 7 to 45 px a
 frame."""
 ERROR_FACTOR = 1.5
-"""Factor between picture and sheet that no lens or ruler makes: an error. Chosen: the smallest usual slip, of an inch
-for a centimetre or a radius for a diameter, is 2 and more. At half (of its logarithm) wide lenses are refused, at
-twice (2.25) a diameter doubled by mistake passes."""
+"""Factor between picture and sheet above which the difference is an error: no lens or ruler makes it. Chosen: the
+smallest usual slip, of an inch for a centimetre or a radius for a diameter, is 2 and more. At half (of its logarithm)
+wide lenses are refused; at twice (2.25) a diameter doubled by mistake passes."""
 SIGMAS = 3.0
-"""Standard errors of the width that are allowed for."""
-SAME_FACTOR = 0.1
-"""Width and growth that are off by factors within a tenth of each other are off by one factor: the scale. Chosen:
-widths and growths are seen to some per cent. At half true errors of scale are told as two faults, at twice two faults
-as one of scale."""
-STEEP = 60.0
-"""Degrees between growth in the picture and its rows from which it runs up or down, and to its columns from which it
-runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be told, at 75 a camera askew by 20
-would not."""
-LEAVE_OUT = "or write compare_sizes: no where only part of the tube is seen"
+"""Standard errors of the width that are allowed for. Chosen: exceeded once in 370 by chance."""
+SAME_FACTOR_LOG = 0.1
+"""Difference of logarithms within which width and growth are off by the same factor, so that the scale is at fault.
+Chosen: widths and growths are seen to some per cent. At half, true errors of scale are reported as two faults; at
+twice, two faults as one of scale."""
+STEEP_DEG = 60.0
+"""Angle, in degrees, between growth and the picture's rows above which growth runs up or down, and between growth and
+its columns above which it runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be
+reported, at 75 a camera askew by 20 would not."""
+OR_SKIP_COMPARISON = "or write compare_sizes: no where only part of the tube is seen"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFacts:
-    """Numbers of one recording; NaN (None) where not known.
+    """Facts of one recording; NaN (None) where not known.
 
-    `tracked` tells whether width and growth come from the tracker or from a quick look; `picture_mm` is the width of
-    the picture; `mean_speed_m_s` that of the leading edge over the middle of its growth.
+    `tracked` says whether width and growth come from the tracker or from a quick look; `picture_mm` is the width of the
+    picture; `mean_speed_m_s` is that of the leading edge over the middle of its growth.
     """
 
     trial: str
@@ -75,17 +75,17 @@ class RecordingFacts:
 
     @property
     def duration_s(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last."""
         return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
 
 
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
-    """What the tracker understood of a recording.
+    """Facts of a recording that was tracked.
 
     Parameters
     ----------
-    trial : as the sheet has it.
-    measurement : its recording, tracked.
+    trial : of the sheet.
+    measurement : of its recording.
 
     Returns
     -------
@@ -110,14 +110,14 @@ def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
 
 
 def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
-    """Sizes in the picture that the sheet contradicts: warnings, beyond a factor 1.5 errors.
+    """List the sizes in the picture that contradict the sheet: warnings, or errors beyond a factor of ERROR_FACTOR.
 
-    A body that moves as a whole has no tube; `compare_sizes: no` in the sheet leaves the comparison out.
+    A body that moves as a whole has no tube; `compare_sizes: no` in the sheet skips the comparison.
 
     Parameters
     ----------
-    trial : as the sheet has it.
-    facts : what the picture shows of it.
+    trial : of the sheet.
+    facts : of its recording.
 
     Returns
     -------
@@ -128,26 +128,26 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     diameter_mm, length_mm = 1e3 * trial.diameter_m, 1e3 * trial.length_m
     width, growth = facts.tube_width_mm / diameter_mm, facts.growth_mm / length_mm
     sigma = math.hypot(facts.tube_width_sigma_mm / diameter_mm, float(np.nan_to_num(facts.scale_rel_sigma)))
-    wide = abs(width - 1) > WIDTH_PART + SIGMAS * sigma
-    long = growth > 1 + GROWTH_PART[facts.tracked]
-    of_width = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
-    of_growth = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
-    remedy = f"check it, its unit and the scale, {LEAVE_OUT}"
-    if wide and _near(facts.tube_width_mm / length_mm) and _near(facts.growth_mm / diameter_mm):
-        remedy = "diameter_mm and length_mm stand in each other's place"
-    elif wide and growth > 0 and abs(math.log(width / growth)) < SAME_FACTOR:
-        both = f"{of_width}, and {of_growth} ({length_mm:g} in the sheet)"
+    width_off = abs(width - 1) > WIDTH_TOLERANCE + SIGMAS * sigma
+    growth_too_long = growth > 1 + GROWTH_TOLERANCE[facts.tracked]
+    width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
+    growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
+    remedy = f"check it, its unit and the scale, {OR_SKIP_COMPARISON}"
+    if width_off and _near_one(facts.tube_width_mm / length_mm) and _near_one(facts.growth_mm / diameter_mm):
+        remedy = "diameter_mm and length_mm are swapped"
+    elif width_off and growth > 0 and abs(math.log(width / growth)) < SAME_FACTOR_LOG:
+        both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
         return [_problem("diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
-    problems = [_problem("diameter_mm", diameter_mm, of_width, width, remedy)] if wide else []
-    return [*problems, *([_problem("length_mm", length_mm, of_growth, growth, remedy)] if long else [])]
+    problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
+    return [*problems, *([_problem("length_mm", length_mm, growth_text, growth, remedy)] if growth_too_long else [])]
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """A stated exposure that the blur of the moving edge contradicts: a warning, of many pixels an error.
+    """Report a stated exposure that the blur of the moving edge contradicts: a warning, or an error beyond many pixels.
 
     Parameters
     ----------
-    trial : as the sheet has it.
+    trial : of the sheet.
     tracking : of its recording.
 
     Returns
@@ -155,15 +155,19 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
     problems : one or none.
     """
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
-    apart_px = abs(stated - seen) * tracking.fast_px_per_frame
-    if not (apart_px > BLUR_PX and max(stated / seen, seen / stated) > ERROR_FACTOR and trial.exposure_s > 0):
+    difference_px = abs(stated - seen) * tracking.fast_px_per_frame
+    if not (
+        difference_px > EXPOSURE_TOLERANCE_PX
+        and max(stated / seen, seen / stated) > ERROR_FACTOR
+        and trial.exposure_s > 0
+    ):
         return []
     stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
     message = (
         f"differs: the edge is blurred as by {number(seen_us, 2)} µs, a factor {_factor(stated / seen)}, where it "
         f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
     )
-    severity = "error" if apart_px > 2 * BLUR_PX else "warning"
+    severity = "error" if difference_px > 2 * EXPOSURE_TOLERANCE_PX else "warning"
     remedy = "check exposure_us, its unit and capture_fps"
     return [
         Problem(
@@ -177,15 +181,18 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
     ]
 
 
-def _near(ratio: float) -> bool:
+def _near_one(ratio: float) -> bool:
+    """Whether a ratio is 1 to within 0.2."""
     return abs(ratio - 1) < 0.2
 
 
 def _factor(ratio: float) -> str:
+    """The larger of a ratio and its inverse, in words."""
     return f"{max(ratio, 1 / ratio):.3g}"
 
 
 def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
+    """The problem of a stated size, an error beyond ERROR_FACTOR."""
     severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
     return Problem(
         message=f"differs: {seen}",
@@ -198,10 +205,11 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
 
 
 def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
-    """Where growth in the picture looks otherwise than the sheet has it; no fault, for cameras are turned.
+    """Note where growth in the picture runs in another direction than in the sheet; no fault, since cameras are turned.
 
-    A vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as straight
-    down and that runs level. A stated 0 says that somebody thought of it: fast cameras lie on their side to fit it in.
+    That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
+    straight down and that runs level. A stated 0 shows that somebody thought of it: fast cameras are laid on their side
+    to fit the vine in.
 
     Parameters
     ----------
@@ -210,7 +218,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
 
     Returns
     -------
-    sentences, one for each of the two.
+    up to two sentences.
     """
     upright, level = [], []
     for fact, trial in zip(facts, trials, strict=True):
@@ -219,19 +227,21 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
         right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
         slope_deg = math.degrees(math.atan2(down, right))
         from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
-        upright += [trial.name] if slope_deg > STEEP and from_level_deg < 90 - STEEP else []
-        level += [trial.name] if slope_deg < 90 - STEEP and trial.name in blank else []
-    told = (
+        upright += [trial.name] if slope_deg > STEEP_DEG and from_level_deg < 90 - STEEP_DEG else []
+        level += [trial.name] if slope_deg < 90 - STEEP_DEG and trial.name in blank else []
+    findings = (
         (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
         (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
     )
-    return [f"growth runs {way} in the picture ({_some(names)}) and {remark}" for names, way, remark in told if names]
+    return [
+        f"growth runs {way} in the picture ({_named(names)}) and {remark}" for names, way, remark in findings if names
+    ]
 
 
 def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
     """Name recordings whose axis was found askew to that of most others that grow at the same angle.
 
-    Something else that moves, such as a door as long as the growth, is then taken for the tube.
+    Something else that moves, such as a door as long as the growth, was then taken for the tube.
 
     Parameters
     ----------
@@ -244,21 +254,22 @@ def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
     axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
     slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
     return [
-        f"a growth axis other than that of {agreed} recordings was found ({_some(names)}): where one camera filmed "
-        "them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those (column "
-        "`axis`)"
-        for names, agreed in askew_trials(slopes_deg, trials)
+        f"a growth axis other than that of {n_agreeing} recordings was found ({_named(names)}): where one camera "
+        "filmed them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those "
+        "(column `axis`)"
+        for names, n_agreeing in askew_trials(slopes_deg, trials)
     ]
 
 
-def _some(names: list[str]) -> str:
+def _named(names: list[str]) -> str:
+    """One name, or how many recordings and the first of them."""
     return names[0] if len(names) == 1 else f"{len(names)} recordings, {names[0]} first"
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """A table for the terminal, a line a recording, sizes of the picture beside those of the sheet.
+    """Lay out a table for the terminal, a line a recording, with sizes of the picture beside those of the sheet.
 
-    `down` is the growth angle from straight down as the sheet has it: no picture tells it.
+    `down` is the growth angle from straight down as the sheet states it: no picture shows it.
 
     Parameters
     ----------
@@ -289,7 +300,7 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 
 
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
-    """Return the numbers of a recording as JSON holds them.
+    """Convert the facts of a recording to a JSON mapping.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Where two edges of a printed pattern cross, to under a hundredth of a pixel in a sharp picture.
+"""Refine where two edges of a printed pattern cross, to under a hundredth of a pixel in a sharp picture.
 
-Around a corner of a checkerboard the picture is m + A·erf(a/s)·erf(b/s) on a slanting ground of light, with a and b
-the distances from the two edges and s the blur (√2 times its standard deviation): least squares for the crossing, both
-slants, blur, contrast and ground use every pixel beside the edges. Symmetry alone (OpenCV's `cornerSubPix`) leaves
-0.03 px in the same pictures.
+Around a corner of a checkerboard the picture is modelled as m + A·erf(a/s)·erf(b/s) on a linear ramp of light, with a
+and b the distances from the two edges and s the blur (√2 times its standard deviation). Levenberg-Marquardt least
+squares for the crossing, both slants, blur, contrast and ramp uses every pixel beside the edges. Symmetry alone
+(OpenCV's `cornerSubPix`) leaves 0.03 px in the same pictures.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 
 HALF_WINDOW_PX = 12
-"""Beyond it a strong lens bends edges by more than the fit gains: 6 k₁ r / f² · 12²/2 ≈ 0.015 px. Derived with k₁ of a
-wide lens."""
+"""Half the side of the window. Beyond it a strong lens bends edges by more than the fit gains: 6 k₁ r / f² · 12²/2 ≈
+0.015 px. Derived with k₁ of a wide lens."""
 EDGE_SHARE = 0.42
-"""Share of a square that its edges are followed from the corner. Chosen below half, where the next corner begins to
-blur in. At half a quarter of the pixels count and noise doubles."""
-STRAY_PX = 2.5
-"""A corner that moves further from where it was detected was none. Chosen: detected corners are good to a pixel. At
-half some are refused, at twice a neighbouring mark may be taken."""
+"""Part of a square over which its edges are followed from the corner. Chosen below half, where the next corner begins
+to blur in. At half, a quarter of the pixels count and noise doubles."""
+LARGEST_MOVE_PX = 2.5
+"""Largest distance of a refined corner from the detected one; beyond it there was no corner. Chosen: detected corners
+are good to a pixel. At half some are refused, at twice a neighbouring mark may be taken."""
 FIRST_BLUR_PX = 1.1
-"""Where the search for the blur begins. Chosen as usual for a sharp picture; the answer does not depend on it."""
+"""First value of the blur. Chosen as usual for a sharp picture; the result does not depend on it."""
 
 BLURS_PX = (0.4, 8.0)
-"""Least and largest blur. Chosen: sharper is not sampled, and wider than two thirds of the window shows no corner."""
+"""Bounds of the blur. Chosen: sharper is not sampled, and wider than two thirds of the window shows no corner."""
 
-STEPS, SETTLED_PX = 20, 1e-4
-"""Gauss–Newton steps at most, and the step at which a corner has settled. Chosen: a hundredth of the error; more steps
+MOST_STEPS, SETTLED_PX = 20, 1e-4
+"""Most steps of the fit, and the step at which a corner has converged. Chosen: a hundredth of the error; more steps
 cost time alone."""
 
 
@@ -41,27 +41,26 @@ def refine_saddles(
     Parameters
     ----------
     picture : grey levels, shape (height, width).
-    corners_px : detected corners (x, y), shape (n, 2), good to STRAY_PX.
+    corners_px : detected corners (x, y), shape (n, 2), good to LARGEST_MOVE_PX.
     steps_px : steps in the picture to the next corner along the pattern's two directions, shape (n, 2, 2): [:, 0] and
         [:, 1].
-    free_share : share of a square on both sides of an edge that holds nothing else (the gap beside markers; 0.5 without
-        any).
+    free_share : part of a square on both sides of an edge that is empty (the gap beside markers; 0.5 without any).
 
     Returns
     -------
-    Corners, shape (n, 2), and which of them the fit holds for, shape (n,).
+    corners, shape (n, 2), and mask of those for which the fit holds, shape (n,).
     """
     offsets, levels, weights = _windows(picture, corners_px, steps_px, free_share)
     values = _first_values(offsets, levels, weights, steps_px)
     model, slopes = _model(values, offsets)
     cost, damping = (weights * (levels - model) ** 2).sum(axis=1), np.full(len(values), 1e-3)
-    for _ in range(STEPS):
+    for _ in range(MOST_STEPS):
         weighted = slopes * weights[:, :, None]
         normal = np.swapaxes(weighted, 1, 2) @ slopes
-        pull = np.swapaxes(weighted, 1, 2) @ (levels - model)[:, :, None]
+        gradient = np.swapaxes(weighted, 1, 2) @ (levels - model)[:, :, None]
         diagonal = np.einsum("nii->ni", normal)
         normal = normal + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(values.shape[1])
-        trial = values + np.linalg.solve(normal, pull)[:, :, 0]
+        trial = values + np.linalg.solve(normal, gradient)[:, :, 0]
         trial[:, 4] = np.clip(trial[:, 4], *BLURS_PX)
         trial_model, trial_slopes = _model(trial, offsets)
         trial_cost = (weights * (levels - trial_model) ** 2).sum(axis=1)
@@ -73,8 +72,8 @@ def refine_saddles(
         if (moved_px < SETTLED_PX).all() and (better | (damping > 1e3)).all():
             break
     crossings = np.rint(corners_px) + values[:, :2]
-    enough = (weights.sum(axis=1) > 30) & (np.abs(values[:, 6]) > 3)
-    return crossings, enough & (np.linalg.norm(crossings - corners_px, axis=1) < STRAY_PX)
+    usable = (weights.sum(axis=1) > 30) & (np.abs(values[:, 6]) > 3)
+    return crossings, usable & (np.linalg.norm(crossings - corners_px, axis=1) < LARGEST_MOVE_PX)
 
 
 def _windows(
@@ -102,10 +101,10 @@ def _windows(
 
 
 def _first_values(offsets: Floats, levels: Floats, weights: Floats, steps_px: Floats) -> Floats:
-    """Crossing (2), slants of the two edges' normals (2), blur, middle level, half contrast, ground's slopes (2)."""
+    """First values: crossing (2), slants of the edge normals (2), blur, level, half contrast, ramp slopes (2)."""
     n = len(levels)
     values = np.zeros((n, 9))
-    # An edge along a step has its normal a quarter turn from it.
+    # The normal of an edge is a quarter turn from the step along it.
     values[:, 2:4] = np.arctan2(steps_px[:, :, 0], -steps_px[:, :, 1])
     values[:, 4] = FIRST_BLUR_PX
     total = weights.sum(axis=1).clip(1)
@@ -137,16 +136,16 @@ def _model(values: Floats, offsets: Floats) -> tuple[Floats, Floats]:
     rise = contrast[..., None] * bell * other
     ground = values[:, 7, None] * away[..., 0] + values[:, 8, None] * away[..., 1]
     slopes = np.empty((*ground.shape, 9))
-    slopes[..., 0] = -_both(rise * cosine) - values[:, 7, None]
-    slopes[..., 1] = -_both(rise * sine) - values[:, 8, None]
+    slopes[..., 0] = -_sum_of_edges(rise * cosine) - values[:, 7, None]
+    slopes[..., 1] = -_sum_of_edges(rise * sine) - values[:, 8, None]
     slopes[..., 2:4] = rise * turned
-    slopes[..., 4] = -_both(rise * distance / blur)
+    slopes[..., 4] = -_sum_of_edges(rise * distance / blur)
     slopes[..., 5] = 1
     slopes[..., 6] = step[..., 0] * step[..., 1]
     slopes[..., 7:9] = away
     return values[:, 5, None] + contrast * slopes[..., 6] + ground, slopes
 
 
-def _both(parts: Floats) -> Floats:
+def _sum_of_edges(parts: Floats) -> Floats:
     """Sum over the two edges; several times faster than `sum` over an axis of two."""
     return np.asarray(parts[..., 0] + parts[..., 1])

@@ -1,8 +1,8 @@
-"""Recordings and calibration looked at before any work: what can be known in seconds.
+"""Check recordings and calibration before any work, in seconds.
 
-Every recording is opened and its header read; its frames are counted where the file's own index, or a walk through
-its packets, tells without decoding. The calibration is read once for each size of picture. Into one recording of each
-condition a look is taken, and what it shows is compared with the sheet.
+Every recording is opened and its header read; its frames are counted where the file's index, or a walk through its
+packets, gives the number without decoding. The calibration is read once for each picture size. One recording of each
+condition is looked into, and what it shows is compared with the sheet.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
-from vinetrack.video.curved_axis import axis_through, curve_complaint
+from vinetrack.video.curved_axis import axis_through, curve_problem
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.measure import given_axis
 from vinetrack.video.quick_look import look_at
@@ -32,19 +32,20 @@ if TYPE_CHECKING:
 
 SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000
-"""A file without an index is read to its end to count its frames; of larger ones a hundred would take minutes. Chosen:
-half a second at 130 MB/s. At twice a check takes twice as long, at half fewer recordings have their frames counted."""
+"""Largest file without an index that is read to its end to count its frames; a hundred larger ones would take minutes.
+Chosen: half a second at 130 MB/s. At twice, a check takes twice as long; at half, fewer recordings have their frames
+counted."""
 
 
 MOST_LOOKS = 12
-"""Chosen: recordings that are looked into, about a second each; at half of them a sheet of eight conditions is not
-covered, at twice as many `check` takes half a minute."""
+"""Most recordings that are looked into, about a second each. Chosen: at half of them a sheet of eight conditions is not
+covered; at twice as many `check` takes half a minute."""
 
 
 class Surveyor:
-    """Opens the recordings of an experiment; keeps what was understood of each in `facts`, by trial.
+    """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial.
 
-    `looked_into` are those in which frames were looked at.
+    `looked_into` are the trials whose frames were looked at.
     """
 
     def __init__(self) -> None:
@@ -52,12 +53,12 @@ class Surveyor:
         self.looked_into: list[Trial] = []
 
     def __call__(self, experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-        """Say what is wrong with the recordings of these trials, each with the trial's name, and with the calibration.
+        """List the problems of the recordings of these trials, each with the trial's name, and of the calibration.
 
         Parameters
         ----------
         experiment : its settings (`calibration`, `axis`) and folder.
-        trials : those whose recording is there to be opened.
+        trials : those whose recording exists.
 
         Returns
         -------
@@ -69,24 +70,24 @@ class Surveyor:
         for trial in progress(list(trials), "recordings", unit="recording"):
             try:
                 opened[trial] = recording = inspect_recording(trial.video or Path())
-                of_trial = _judge(trial, recording)
+                of_trial = _recording_problems(trial, recording)
             except (RecordingError, OSError) as error:
-                of_trial = [_unusable(error, trial.video.name if trial.video else "")]
+                of_trial = [_unusable_recording(error, trial.video.name if trial.video else "")]
             if all(problem.severity != "error" for problem in of_trial):
                 sound.append(trial)
             problems += [replace(problem, trial=trial.name) for problem in of_trial]
-        of_scale, calibrations = _judge_scale(experiment.settings, experiment.folder, opened)
-        self.looked_into = _one_a_condition(sound)
+        of_scale, calibrations = _scale_problems(experiment.settings, experiment.folder, opened)
+        self.looked_into = _one_per_condition(sound)
         for trial in progress(sound, "looking into recordings", unit="recording"):
             scale = calibrations.get((opened[trial].width, opened[trial].height))
-            facts = _understood(trial, experiment.settings, opened[trial], scale, trial in self.looked_into)
+            facts = _recording_facts(trial, experiment.settings, opened[trial], scale, trial in self.looked_into)
             problems += [replace(problem, trial=trial.name) for problem in size_problems(trial, facts)]
             self.facts[trial] = facts
         return problems + of_scale
 
 
 def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-    """Say what is wrong with the recordings of these trials; see `Surveyor`.
+    """List the problems of the recordings of these trials; see `Surveyor`.
 
     Parameters
     ----------
@@ -99,8 +100,8 @@ def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
     return Surveyor()(experiment, trials)
 
 
-def _one_a_condition(trials: list[Trial]) -> list[Trial]:
-    """The recordings to look into: all of a few, else the first of each condition, of each vine where many."""
+def _one_per_condition(trials: list[Trial]) -> list[Trial]:
+    """The recordings to look into: all of a few, else one of each condition, or of each vine where those are many."""
     if len(trials) <= MOST_LOOKS:
         return trials
     conditions = list({(trial.condition, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
@@ -111,19 +112,19 @@ def _one_a_condition(trials: list[Trial]) -> list[Trial]:
     return [*vines, *others][:MOST_LOOKS]
 
 
-def _understood(
+def _recording_facts(
     trial: Trial, settings: ExperimentSettings, recording: Recording, scale: PlaneCalibration | None, look: bool
 ) -> RecordingFacts:
-    """The facts of one recording, with those that a look into it shows where it is wanted."""
+    """Facts of one recording; with `look`, also those that a quick look at its frames gives."""
     m_per_px, rel_sigma = trial.m_per_px, math.nan
     if not math.isfinite(m_per_px) and scale is not None:
         m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
     axis = given_axis(trial, settings, m_per_px)
     count = _frames_present(recording)
     count = recording.declared_frames if count is None else count
-    seen = look_at(recording, trial, axis, count) if look else None
-    if scale is not None and seen is not None and seen.axis is not None and not math.isfinite(trial.m_per_px):
-        along = scale.along(seen.axis.from_px, seen.axis.to_px)
+    view = look_at(recording, trial, axis, count) if look else None
+    if scale is not None and view is not None and view.axis is not None and not math.isfinite(trial.m_per_px):
+        along = scale.along(view.axis.from_px, view.axis.to_px)
         m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
     capture_fps = capture_rate(trial, recording)
     facts = RecordingFacts(
@@ -136,20 +137,20 @@ def _understood(
         picture_mm=1e3 * m_per_px * recording.width,
         axis=axis,
     )
-    if seen is None:
+    if view is None:
         return facts
     return replace(
         facts,
-        axis=seen.axis or axis,
-        tube_width_mm=1e3 * m_per_px * seen.tube_width_px,
-        tube_width_sigma_mm=1e3 * m_per_px * seen.tube_width_sigma_px,
-        growth_mm=1e3 * m_per_px * seen.growth_px,
-        mean_speed_m_s=m_per_px * seen.px_per_frame * capture_fps,
+        axis=view.axis or axis,
+        tube_width_mm=1e3 * m_per_px * view.tube_width_px,
+        tube_width_sigma_mm=1e3 * m_per_px * view.tube_width_sigma_px,
+        growth_mm=1e3 * m_per_px * view.growth_px,
+        mean_speed_m_s=m_per_px * view.px_per_frame * capture_fps,
     )
 
 
-def _judge(trial: Trial, recording: Recording) -> list[Problem]:
-    """A recording that opens, against what the sheet says of it and what the file declares."""
+def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
+    """Compare a recording that opens with the sheet and with what the file declares."""
     place: dict[str, Any] = {"column": "video", "value": recording.path.name}
     for column, clock in (("capture_fps", capture_rate), ("exposure_us", capture_exposure)):
         try:
@@ -174,7 +175,7 @@ def _judge(trial: Trial, recording: Recording) -> list[Problem]:
 
 
 def _frames_present(recording: Recording) -> int | None:
-    """How many frames lie in the file as far as that is known without decoding; None where it is not."""
+    """Number of frames in the file as far as it is known without decoding; None where it is not."""
     if recording.raw is not None:
         return _raw_frames_present(recording.path.stat().st_size, recording.raw)
     if recording.kind != "container":
@@ -192,49 +193,50 @@ def _frames_present(recording: Recording) -> int | None:
                 return None
             return sum(1 for packet in container.demux(stream) if packet.size)
     except (av.error.FFmpegError, AttributeError):
-        # A walk that ends in an error has met damage that decoding will put into words.
+        # The walk met damage, which decoding will report.
         return None
 
 
 def _raw_frames_present(size: int, raw: RawFrames) -> int:
+    """Number of whole frames in a raw file of `size` bytes."""
     return sum(offset + raw.frame_bytes <= size for offset in raw.offsets)
 
 
 Calibrations = dict[tuple[int, int], "PlaneCalibration"]
 
 
-def _judge_scale(
+def _scale_problems(
     settings: ExperimentSettings, folder: Path, opened: dict[Trial, Recording]
 ) -> tuple[list[Problem], Calibrations]:
-    """What is wrong with calibration and axis, for the recordings that open; and the calibration by size of picture."""
+    """Problems of calibration and axis, for the recordings that open; and the calibration by picture size."""
     problems: list[Problem] = []
     calibrations: Calibrations = {}
     unscaled = [trial for trial in opened if not math.isfinite(trial.m_per_px)]
     sizes = sorted({(opened[trial].width, opened[trial].height) for trial in unscaled})
     if unscaled and settings.calibration is None:
-        some = "no recording has" if len(unscaled) == len(opened) else f"{len(unscaled)} recordings have no"
+        lacking = "no recording has" if len(unscaled) == len(opened) else f"{len(unscaled)} recordings have no"
         remedy = "give it here, or mm_per_px in the sheet"
-        message = f"is missing: {some} a scale" if some.startswith("no ") else f"is missing: {some} scale"
+        message = f"is missing: {lacking} a scale" if lacking.startswith("no ") else f"is missing: {lacking} scale"
         problems.append(Problem(message=message, file=SETTINGS, column="calibration", remedy=remedy))
     elif unscaled:
-        problems += _judge_calibration(settings, folder, sizes, calibrations)
+        problems += _calibration_problems(settings, folder, sizes, calibrations)
     for trial, recording in opened.items():
         if trial.axis is not None:
-            problems += _judge_axis(trial, trial.axis, recording, {"trial": trial.name}, calibrations)
+            problems += _axis_problems(trial, trial.axis, recording, {"trial": trial.name}, calibrations)
     if settings.axis is not None:
         for trial, recording in opened.items():
-            given = _judge_axis(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
-            if trial.axis is None and given:
-                problems += given
+            axis_problems = _axis_problems(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
+            if trial.axis is None and axis_problems:
+                problems += axis_problems
                 break
     return problems, calibrations
 
 
-def _judge_axis(
+def _axis_problems(
     trial: Trial, given: AxisSettings | PictureAxis, recording: Recording, place: dict[str, Any],
     calibrations: Calibrations,
 ) -> list[Problem]:  # fmt: skip
-    """What is wrong with a given axis in the picture of one recording, told at its place in the files."""
+    """Problems of a given axis in the picture of one recording, reported at its place in the files."""
     through = (given.from_px, *(given.via_px or ()), given.to_px)
     if not all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in through):
         message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
@@ -246,14 +248,14 @@ def _judge_axis(
     m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
     width_mm = given.width_mm if isinstance(given, AxisSettings) else 1e3 * given.width_m
     width_m = trial.diameter_m if width_mm is None or math.isnan(width_mm) else width_mm / 1e3
-    complaint = curve_complaint(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
+    complaint = curve_problem(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
     return [] if complaint is None else [Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)]
 
 
-def _judge_calibration(
+def _calibration_problems(
     settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]], calibrations: Calibrations
 ) -> list[Problem]:
-    """Read the calibration for each size of recording into `calibrations`; the first complaint is enough."""
+    """Read the calibration for each picture size into `calibrations`; only the first problem is reported."""
     from vinetrack.video.calibration import CalibrationError, calibrate
 
     image = getattr(settings.calibration, "image", None)
@@ -273,7 +275,8 @@ def _judge_calibration(
     return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
 
 
-def _unusable(error: Exception, name: str) -> Problem:
+def _unusable_recording(error: Exception, name: str) -> Problem:
+    """The problem of a recording that cannot be used, from the message of its error."""
     message, _, remedy = str(error).removeprefix(f"{name}: ").rpartition("; ")
     words = f"cannot be used: {message or remedy}"
     return Problem(message=words, column="video", value=name, remedy=remedy if message else "")

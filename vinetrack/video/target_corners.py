@@ -1,4 +1,4 @@
-"""Corners of calibration targets in a picture, to a few hundredths of a pixel; what is wrong where there are none.
+"""Find the corners of calibration targets in a picture, to a few hundredths of a pixel, or say why there are none.
 
 OpenCV finds the board; every corner is then fitted to the picture around it (`saddle`), markers left out.
 """
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 Grey = NDArray[np.uint8]
 
 FEWEST_CORNERS = 8
-"""A plane and a lens are ten numbers, two of them nearly fixed beforehand: four corners would fit anything. Chosen:
-sixteen coordinates for the ten numbers."""
+"""Fewest corners of a calibration. A plane and a lens are ten numbers, two of them nearly fixed beforehand: four
+corners would fit anything. Chosen: sixteen coordinates for the ten numbers."""
 MARKER_OUTLIER = 0.3
-"""A marker further than this (squares) from where the board has it belongs to another board. Chosen: below half a
-square, where the next marker begins. At half bent boards are refused, at twice markers of another board pass."""
+"""Distance, in squares, from where the board has it beyond which a marker belongs to another board. Chosen: below half
+a square, where the next marker begins. At half bent boards are refused, at twice markers of another board pass."""
 MARKER_TOLERANCE = 0.10
-"""Markers that differ from `marker_mm` by more than this, as a share of it, were printed at another size. Blur alone
-makes small ones (25 px) look 4 % smaller. Chosen above that 4 %, below the steps of usual prints. At half small
-markers are refused, at twice a print scaled to fit the page passes."""
+"""Relative difference from `marker_mm` above which markers were printed at another size. Blur alone makes small ones
+(25 px) look 4 % smaller. Chosen above that 4 %, below the steps of usual prints. At half small markers are refused, at
+twice a print scaled to fit the page passes."""
 DICTIONARY_SIZES = (50, 100, 250, 1000)
-"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger. Defined by
+"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger one. Defined by
 OpenCV."""
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
@@ -39,7 +39,7 @@ class CornersError(ValueError):
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
-    """Grey levels, shape (height, width), stretched so that 0.5 % of the pixels are black and 0.5 % white.
+    """Stretch grey levels, shape (height, width), so that 0.5 % of the pixels are black and 0.5 % white.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def eight_bits(picture: NDArray[Any]) -> Grey:
 
 
 def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floats]:
-    """Corners of a ChArUco board in the picture (px) and on the board (m), both of shape (n, 2).
+    """Find the corners of a ChArUco board in the picture (px) and on the board (m).
 
     Boards printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
 
@@ -76,14 +76,14 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     import cv2
 
     grey = eight_bits(picture)
-    words = _words(board.dictionary)
-    corners, ids = _markers(grey, words)
+    dictionary = _dictionary(board.dictionary)
+    corners, ids = _detect_markers(grey, dictionary)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
-        corners, ids = max((corners, ids), _markers(grey, words, enlarge=2), key=lambda pair: len(pair[1]))
+        corners, ids = max((corners, ids), _detect_markers(grey, dictionary, enlarge=2), key=lambda pair: len(pair[1]))
     if not len(ids):
         raise CornersError(_no_markers(grey, board.dictionary))
-    layouts = [_charuco_board(board, words, legacy) for legacy in (False, True)]
-    agreement = [_agreeing_markers(layout, corners, ids, board) for layout in layouts]
+    layouts = [_charuco_board(board, dictionary, legacy) for legacy in (False, True)]
+    agreement = [_marker_agreement(layout, corners, ids, board) for layout in layouts]
     layout = layouts[int(np.argmax([share for share, _ in agreement]))]
     share, marker_mm = max(agreement, key=lambda pair: pair[0])
     if share < 0.8:
@@ -108,7 +108,7 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
-    """Inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m); shape (n, 2).
+    """Find the inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m).
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
 
 
 def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Markers of a dictionary in a picture: corners of each, shape (1, 4, 2), px, and their numbers, shape (n, 1).
+    """Detect the markers of a dictionary in a picture.
 
     Parameters
     ----------
@@ -147,37 +147,37 @@ def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]]
 
     Returns
     -------
-    corners, ids
+    corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1)
     """
-    return _markers(grey, _words(dictionary))
+    return _detect_markers(grey, _dictionary(dictionary))
 
 
 def marker_agreement(
     corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: str
 ) -> tuple[float, float]:
-    """Share of markers that lie where a board has them, and their size (mm) beside squares of its `square_mm`.
+    """Share of markers that lie where a board has them, and their size (mm) relative to squares of `square_mm`.
 
     Boards printed by OpenCV before 4.6 count too.
 
     Parameters
     ----------
-    corners, ids : as of `markers_seen`.
-    board : layout and sizes; its own dictionary is not used.
-    dictionary : that the markers belong to.
+    corners, ids : from `markers_seen`.
+    board : layout and sizes; its dictionary is not used.
+    dictionary : of the markers.
 
     Returns
     -------
     share, marker_mm
     """
-    words = _words(dictionary)
-    layouts = [_charuco_board(board, words, legacy) for legacy in (False, True)]
+    predefined = _dictionary(dictionary)
+    layouts = [_charuco_board(board, predefined, legacy) for legacy in (False, True)]
     return max(
-        (_agreeing_markers(layout, corners, ids, board) for layout in layouts), key=lambda agreement: agreement[0]
+        (_marker_agreement(layout, corners, ids, board) for layout in layouts), key=lambda agreement: agreement[0]
     )
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
-    """Squares across and down of the checkerboard in a picture, as far as it can be seen; None where there is none.
+    """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is none.
 
     Parameters
     ----------
@@ -206,12 +206,13 @@ def _enlarged(grey: Grey, times: int) -> Grey:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC))
 
 
-def _reduced(corners_px: NDArray[Any], times: int) -> Floats:
-    """Places in an enlarged copy as places in the picture: its pixel 0 is centred on ½/times − ½ of the picture's."""
+def _in_original(corners_px: NDArray[Any], times: int) -> Floats:
+    """Convert places in an enlarged copy: its pixel 0 is centred on ½/times − ½ of the picture's."""
     return (np.asarray(corners_px, dtype=float) + 0.5) / times - 0.5
 
 
-def _words(name: str) -> Any:
+def _dictionary(name: str) -> Any:
+    """A dictionary of markers by its name in OpenCV."""
     import cv2
 
     code = getattr(cv2.aruco, name, None)
@@ -220,75 +221,78 @@ def _words(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(code)
 
 
-def _charuco_board(board: Charuco, words: Any, legacy: bool) -> Any:
+def _charuco_board(board: Charuco, dictionary: Any, legacy: bool) -> Any:
+    """The layout of a board, as OpenCV printed it from version 4.6, or before (`legacy`)."""
     import cv2
 
-    layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, words)
+    layout = cv2.aruco.CharucoBoard(board.squares, board.square_mm / 1000, board.marker_mm / 1000, dictionary)
     layout.setLegacyPattern(legacy)
     return layout
 
 
-def _markers(grey: Grey, words: Any, enlarge: int = 1) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+def _detect_markers(
+    grey: Grey, dictionary: Any, enlarge: int = 1
+) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
     """Corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1)."""
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(words).detectMarkers(_enlarged(grey, enlarge))
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(_enlarged(grey, enlarge))
     if ids is None:
         return [], np.empty((0, 1), np.int32)
-    return [_reduced(corner, enlarge).astype(np.float32) for corner in corners], np.asarray(ids)
+    return [_in_original(corner, enlarge).astype(np.float32) for corner in corners], np.asarray(ids)
 
 
-def _agreeing_markers(layout: Any, corners: list[Any], ids: NDArray[np.int32], board: Charuco) -> tuple[float, float]:
+def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], board: Charuco) -> tuple[float, float]:
     """Share of markers where the board has them, and their size (mm) when squares are `square_mm`.
 
-    Middles of markers fix the plane whatever their size; sizes are then read off in that plane.
+    The centres of the markers fix the plane whatever their size; sizes are then measured in that plane.
     """
     import cv2
 
     places = {
         int(key): np.array(square)[:, :2] for key, square in zip(layout.getIds(), layout.getObjPoints(), strict=True)
     }
-    known = [k for k, key in enumerate(ids.ravel()) if int(key) in places]
-    if len(known) < 4:
-        return (1.0, board.marker_mm) if len(known) == len(ids) else (len(known) / len(ids) / 2, board.marker_mm)
-    seen = np.array([np.asarray(corners[k]).reshape(4, 2) for k in known], dtype=float)
-    stated = np.array([places[int(ids.ravel()[k])] for k in known]) * 1000
+    on_board = [k for k, key in enumerate(ids.ravel()) if int(key) in places]
+    if len(on_board) < 4:
+        return (1.0, board.marker_mm) if len(on_board) == len(ids) else (len(on_board) / len(ids) / 2, board.marker_mm)
+    detected = np.array([np.asarray(corners[k]).reshape(4, 2) for k in on_board], dtype=float)
+    stated = np.array([places[int(ids.ravel()[k])] for k in on_board]) * 1000
     plane, _ = cv2.findHomography(
-        seen.mean(axis=1), stated.mean(axis=1), cv2.RANSAC, MARKER_OUTLIER * board.square_mm, maxIters=5000
+        detected.mean(axis=1), stated.mean(axis=1), cv2.RANSAC, MARKER_OUTLIER * board.square_mm, maxIters=5000
     )  # fmt: skip
     if plane is None:
         return 0.0, board.marker_mm
-    read = cv2.perspectiveTransform(seen.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
-    away = np.linalg.norm(read.mean(axis=1) - stated.mean(axis=1), axis=1)
-    inside = away < MARKER_OUTLIER * board.square_mm
+    read = cv2.perspectiveTransform(detected.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
+    distance = np.linalg.norm(read.mean(axis=1) - stated.mean(axis=1), axis=1)
+    inside = distance < MARKER_OUTLIER * board.square_mm
     sides = np.linalg.norm(read - np.roll(read, 1, axis=1), axis=2).mean(axis=1)
     size_mm = float(np.median(sides[inside])) if inside.any() else board.marker_mm
     return float(inside.sum()) / len(ids), size_mm
 
 
 def _sector_corners(grey: Grey, columns: int, rows: int, enlarge: int = 1) -> Floats | None:
-    """Inner corners by the sector-based detector (Duda & Frese 2018), shape (columns · rows, 2), px; None if unseen."""
+    """Inner corners by the sector-based detector (Duda & Frese 2018), (columns · rows, 2), px; None where not found."""
     import cv2
 
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     seen, corners = cv2.findChessboardCornersSB(_enlarged(grey, enlarge), (columns, rows), flags=flags)
-    return _reduced(corners.reshape(-1, 2), enlarge) if seen else None
+    return _in_original(corners.reshape(-1, 2), enlarge) if seen else None
 
 
 def _refined(
     grey: Grey, corners_px: Floats, grid_m: Floats, square_m: float, free_share: float
 ) -> tuple[Floats, Floats]:
-    """Corners refined and their places on the board, without those that could not be, both of shape (n, 2)."""
-    refined_px, held = refine_saddles(grey, corners_px, _steps_px(corners_px, grid_m, square_m), free_share)
-    places_m = grid_m[held]
-    if held.sum() < FEWEST_CORNERS:
-        raise CornersError(_too_few(int(held.sum()), f"{len(held)} are detected"))
+    """Refined corners and their places on the board, without those that could not be refined, both of shape (n, 2)."""
+    refined_px, refined = refine_saddles(grey, corners_px, _corner_steps_px(corners_px, grid_m, square_m), free_share)
+    places_m = grid_m[refined]
+    if refined.sum() < FEWEST_CORNERS:
+        raise CornersError(_too_few(int(refined.sum()), f"{len(refined)} are detected"))
     if min(len(np.unique(places_m[:, k].round(6))) for k in (0, 1)) < 2:
         raise CornersError(_too_few(len(places_m), "they lie on one line"))
-    return refined_px[held], places_m
+    return refined_px[refined], places_m
 
 
-def _steps_px(corners_px: Floats, grid_m: Floats, square_m: float) -> Floats:
+def _corner_steps_px(corners_px: Floats, grid_m: Floats, square_m: float) -> Floats:
     """Steps in the picture to the next corner along the board's two directions, at each corner, shape (n, 2, 2)."""
     import cv2
 
@@ -301,13 +305,14 @@ def _steps_px(corners_px: Floats, grid_m: Floats, square_m: float) -> Floats:
 
 
 def _is_a_grid(corners_px: NDArray[Any]) -> bool:
-    """Whether corners, shape (rows, columns, 2), lie evenly: second differences below a tenth of a square."""
+    """Whether corners, shape (rows, columns, 2), are evenly spaced: second differences below a tenth of a square."""
     steps = np.linalg.norm(np.diff(corners_px, axis=1), axis=2)
     bends = [np.linalg.norm(np.diff(corners_px, 2, axis=axis), axis=2).max() for axis in (0, 1)]
     return bool(max(bends) < 0.1 * np.median(steps))
 
 
 def _too_few(n: int, why: str) -> str:
+    """Say that too few corners can be read."""
     return (
         f"only {n} corners of the board can be read ({why}; at least {FEWEST_CORNERS}, not on one line, are needed); "
         "show more of it, larger, in focus, evenly lit and not mirrored"
@@ -319,7 +324,7 @@ def _no_markers(grey: Grey, dictionary: str) -> str:
     best, numbers = "", np.empty(0, int)
     for name in OTHER_DICTIONARIES:
         family = f"{name}_{DICTIONARY_SIZES[-1]}" if name[-2] == "X" else name
-        ids = _markers(grey, _words(family))[1].ravel()
+        ids = _detect_markers(grey, _dictionary(family))[1].ravel()
         if name not in dictionary and len(ids) > len(numbers):
             best, numbers = name, ids
     if len(numbers) >= 3:

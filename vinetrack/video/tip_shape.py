@@ -1,4 +1,4 @@
-"""Shape of the tip, its light and shade, optical blur and exposure, from what an edge leaves unexplained."""
+"""Estimate the tip's shape and shading, the optical blur and the exposure from the residuals of the edge fit."""
 
 from __future__ import annotations
 
@@ -20,45 +20,47 @@ from vinetrack.video.edge_state import (
 )
 from vinetrack.video.strip import Strip
 
-SMOOTHING = (0.25, 0.5, 0.25)
-"""Weights by which neighbours share in the shading of the tip. Chosen: a pixel wide, no sharper than optics are. By
-reasoning: without it noise of single pixels is taken for shading; over twice the width a narrow rim is blurred."""
+SHADING_KERNEL = (0.25, 0.5, 0.25)
+"""Smoothing kernel of the tip's shading. Chosen: a pixel wide, no sharper than optics are. By reasoning: without it,
+noise of single pixels is taken for shading; over twice the width, a narrow rim is blurred."""
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated. Chosen as usual for high-speed cameras; it is replaced after the
 second round."""
-FEWEST_FAST = 6
-"""Chosen: frames from which a blur is told from the shape of the tip; a clip of eight frames, five of them in motion
-and without any blur, showed one of 0.4 frames. The fastest trials of the demonstration have seven."""
-CONTRADICTED = 1.01
-"""Measured (seeds 20900 and up): the true exposure leaves a misfit within 1.003 of the least of any exposure but in
-one recording of eight (1.012); twice the true one or more leaves 1.02 to 1.35 where the edge moves 7 px a frame."""
-FASTEST_LAG_STEP_PX = 4.0
+FEWEST_FAST_FRAMES = 6
+"""Fewest frames from which a blur is told from the shape of the tip. Chosen: a clip of eight frames, five of them in
+motion and without any blur, showed one of 0.4 frames. The fastest trials of the demonstration have seven."""
+CONTRADICTION_RATIO = 1.01
+"""Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is
+contradicted. Measured (seeds 20900 and up): the true exposure leaves a misfit within 1.003 of the least but in one
+recording of eight (1.012); twice the true one or more leaves 1.02 to 1.35 where the edge moves 7 px a frame."""
+LARGEST_LAG_STEP_PX = 4.0
 """Largest change of a row's lag in one round. Chosen as trust region; only the number of rounds depends on it."""
 
 DEEPEST_LAG_PX = 60.0
 """Largest lag of a row behind the foremost point. Chosen: above the radius of the widest tip, 36 px at 3 px/mm."""
 
-FEW_FRAMES = 16
-"""Frames from which the blur is told. Chosen for time; at half the blur scatters by 1.4 more."""
+BLUR_FRAMES = 16
+"""Frames from which the blur is estimated. Chosen for time; at half the blur scatters by 1.4 times as much."""
 
 OPTICAL_BLUR_PX = (0.4, 3.0)
-"""From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge. Chosen;
-sharper is not sampled, and wider is noise."""
+"""Bounds of the optical blur, from a sharp pixel to a picture out of focus; a wider blur is fitted only where noise
+drowns the edge. Chosen; sharper is not sampled, and wider is noise."""
 
 
-def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeState:
-    """Estimate how far each row of the tip lags behind its foremost point, then the optical blur.
+def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) -> EdgeState:
+    """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur.
 
-    From the core frames with less blur by motion: not those in which a door may still stand before the tip.
+    Both come from the core frames with less motion blur; frames in which a door may still stand in front of the tip are
+    not among them.
 
     Parameters
     ----------
     strip : along the axis.
     state : the last estimate.
     fit : from `fit_edges`, shape (n_frames, 6).
-    anew : whether the blur is looked for everywhere, not only near the last one.
+    everywhere : whether all blurs are tried, not only those near the last one.
 
     Returns
     -------
@@ -69,24 +71,24 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeS
     for _ in range(3):
         by_row = residuals(strip, state, fit, slow).by_row
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
-        step = np.clip(step, -FASTEST_LAG_STEP_PX, FASTEST_LAG_STEP_PX)
+        step = np.clip(step, -LARGEST_LAG_STEP_PX, LARGEST_LAG_STEP_PX)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
-    candidates = BLURS_PX if anew else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
-    few = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // FEW_FRAMES)]
+    candidates = BLURS_PX if everywhere else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
+    sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // BLUR_FRAMES)]
     misfits = []
     for blur in candidates:
-        # Over the same pixels for all of them: pixels far from the edge, which always fit, would speak for the widest.
+        # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
         margin = MARGIN_PX + cover_reach(0.0, float(candidates.max())) - cover_reach(0.0, float(blur))
-        misfits.append(_misfit_refitted(strip, replace(state, blur=float(blur)), few, margin))
-    return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
+        misfits.append(_misfit_refitted(strip, replace(state, blur=float(blur)), sampled, margin))
+    return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """Estimate what the tip shows beyond film and background, by distance ahead of the edge.
 
-    A round tip is lit otherwise than the tube behind it: its rim may be as bright as the background where the film is
-    darker, and the edge would be sought behind the rim.
+    A round tip is lit differently from the tube behind it: its rim may be as bright as the background where the film is
+    darker, and the edge would be fitted behind the rim.
 
     Parameters
     ----------
@@ -102,14 +104,14 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     for _ in range(2):
         by_place = residuals(strip, state, fit, core).by_place
         middle = len(by_place) // 2
-        left, weight = by_place[middle - SHADED_PX : middle + SHADED_PX + 1].T
-        step = left / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
-        state = replace(state, shading=np.convolve(state.shading + step, SMOOTHING, mode="same"))
+        residual, weight = by_place[middle - SHADED_PX : middle + SHADED_PX + 1].T
+        step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
+        state = replace(state, shading=np.convolve(state.shading + step, SHADING_KERNEL, mode="same"))
     return state
 
 
 def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], margin_px: float) -> float:
-    """Misfit of some frames with their edges sought anew: a blur must not be judged by edges fitted with another."""
+    """Misfit of some frames after a new fit of their edges: a blur must not be judged by edges fitted with another."""
     edge = np.full(len(state.edge), np.nan)
     edge[frames] = state.edge[frames]
     fit = fit_edges(strip, replace(state, edge=edge))
@@ -119,7 +121,9 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
-    """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px.
+    """Exposure, in frame periods, that explains the blur of the faster frames best.
+
+    It is ASSUMED_EXPOSURE where no frame moves 2 px.
 
     Parameters
     ----------
@@ -134,13 +138,11 @@ def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
     speed, fast = _fast_frames(state, fit)
     if not fast.any():
         return ASSUMED_EXPOSURE
-    return _least(EXPOSURES, _misfits_of_exposures(strip, state, fit, speed, fast, EXPOSURES))
+    return _least_misfit(EXPOSURES, _misfits_of_exposures(strip, state, fit, speed, fast, EXPOSURES))
 
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
-    """Find the exposure that the blur shows in place of a stated one.
-
-    The exposure is NaN where the stated one explains the blur as well (misfit within CONTRADICTED).
+    """Find the exposure that the blur shows where it contradicts the stated one.
 
     Parameters
     ----------
@@ -151,20 +153,20 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
 
     Returns
     -------
-    exposure over frame period, NaN where the stated one explains the blur as well (misfit within CONTRADICTED); and the
-        median speed of the frames used, px a frame.
+    exposure over frame period, NaN where the stated one explains the blur as well (CONTRADICTION_RATIO); and the median
+        speed of the frames used, px a frame.
     """
     speed, fast = _fast_frames(state, fit)
-    if fast.sum() < FEWEST_FAST:
+    if fast.sum() < FEWEST_FAST_FRAMES:
         return np.nan, np.nan
     misfits = _misfits_of_exposures(strip, state, fit, speed, fast, np.append(EXPOSURES, stated_frames))
-    contradicted = misfits[-1] > CONTRADICTED * misfits.min()
-    seen = _least(EXPOSURES, misfits[:-1]) if contradicted else np.nan
+    contradicted = misfits[-1] > CONTRADICTION_RATIO * misfits.min()
+    seen = _least_misfit(EXPOSURES, misfits[:-1]) if contradicted else np.nan
     return seen, float(np.median(speed[fast]))
 
 
 def _fast_frames(state: EdgeState, fit: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Speed in every frame, px a frame, and the faster half of the core frames, of those that move 2 px."""
+    """Speed in every frame, px a frame, and the faster half of the core frames among those that move 2 px."""
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)
     return speed, core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
@@ -175,36 +177,36 @@ def _misfits_of_exposures(
 ) -> Floats:
     """Misfit of some frames with each exposure, shape (n_exposures,).
 
-    Without shading of the tip, which at constant speed looks like any error of the exposure.
+    The tip's shading is left out: at constant speed it looks like any error of the exposure.
     """
     bare = replace(state, shading=np.zeros_like(state.shading))
     return np.array([residuals(strip, replace(bare, lengths=speed * tau), fit, frames).misfit for tau in exposures])
 
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
-    """Smooth slightly along the rows, by weight, and set zero at the foremost point of the tip; what was taken off.
+    """Smooth the lag slightly along the rows, by weight, and subtract that of the foremost point; both are returned.
 
-    That point is the vertex of a parabola through the foremost third of the rows that show an edge at all: the least
-    of them would follow their noise.
+    The foremost point is the vertex of a parabola through the foremost third of the rows that show an edge: the
+    smallest lag would follow their noise.
     """
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / 0.8) ** 2)
     weight = weight + 1e-6 * float(weight.max() + 1e-12)
     top = np.convolve(np.pad(lag * weight, 3, mode="edge"), kernel, mode="valid")
     smooth = top / np.convolve(np.pad(weight, 3, mode="edge"), kernel, mode="valid")
-    seen = np.flatnonzero(weight > 0.1 * float(np.median(weight[weight >= np.median(weight)])))
-    front = seen[np.argsort(smooth[seen])[: max(len(seen) // 3, 3)]]
-    lead = float(np.average(smooth[front], weights=weight[front]))
-    if len(front) >= 6:
-        middle = float(front.mean())
-        curve = np.polyfit(front - middle, smooth[front], 2, w=np.sqrt(weight[front]))
+    showing = np.flatnonzero(weight > 0.1 * float(np.median(weight[weight >= np.median(weight)])))
+    foremost = showing[np.argsort(smooth[showing])[: max(len(showing) // 3, 3)]]
+    lead = float(np.average(smooth[foremost], weights=weight[foremost]))
+    if len(foremost) >= 6:
+        middle = float(foremost.mean())
+        curve = np.polyfit(foremost - middle, smooth[foremost], 2, w=np.sqrt(weight[foremost]))
         vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
-        if front.min() <= vertex + middle <= front.max():
+        if foremost.min() <= vertex + middle <= foremost.max():
             lead = float(np.polyval(curve, vertex))
     return np.clip(smooth - lead, -3.0, DEEPEST_LAG_PX), lead
 
 
-def _least(candidates: Floats, misfits: Floats) -> float:
-    """Candidate of least misfit, refined by a parabola through its neighbours in its logarithm."""
+def _least_misfit(candidates: Floats, misfits: Floats) -> float:
+    """Candidate of least misfit, refined by a parabola through its neighbours in the logarithm."""
     i = int(np.argmin(misfits))
     if i in (0, len(candidates) - 1):
         return float(candidates[i])

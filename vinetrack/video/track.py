@@ -1,4 +1,4 @@
-"""From a recording to a track: decode, find the axis, cut the strip, follow edge or body, judge each point."""
+"""Track one recording: find the growth axis, cut the strip along it, follow edge or body, assess each point."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Indices, Track, Trial
+from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
 from vinetrack.video.axis import Axis, FrontShare, centred_on_motion, find_axis
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.curve_search import find_growth_axis
@@ -42,39 +42,39 @@ from vinetrack.video.point_quality import (
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip
-from vinetrack.video.track_scale import in_metres
 
 if TYPE_CHECKING:
     from vinetrack.video.calibration import AxisScale
 
 
 FEWEST_FRAMES = 5
-"""Derived: fourth differences take five."""
+"""Fewest frames that can be tracked. Derived: a fourth difference takes five."""
 
-ROOM = 0.08
-"""Width added to a given axis, as a part of its length. Derived: the far end of an axis 2.3 degrees off lies off by
-0.04 of it, on either side."""
+GIVEN_AXIS_MARGIN = 0.08
+"""Width added to a given axis, as a fraction of its length. Derived: the far end of an axis 2.3 degrees off lies off by
+0.04 of its length, to either side."""
 MOVING_PX = 0.3
-"""Step of a frame from which the roughness of the track is judged there. Chosen: at rest compression freezes it."""
+"""Step of a frame from which the frame counts for the roughness of the track. Chosen: at rest compression freezes the
+picture, and the track is smoother than its errors."""
 MOSTLY_LOST = 0.5
-"""Part of the frames without an edge from which a recording is not one where nothing moves. Chosen: the majority; it
-decides which of two messages is given."""
+"""Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing moves.
+Chosen: the majority; it decides between two messages only."""
 
-STEADIED_PX = 0.1
-"""Error of a camera's shake taken off by what stands still: measured 0.1-0.15 px, mostly of its slow part."""
+STABILISED_PX = 0.1
+"""Error left after a shaken camera was stabilised on the still background. Measured: 0.1-0.15 px, mostly slow."""
 
 
 @dataclass(frozen=True)
 class Tracking:
     """A track and what a figure of it needs.
 
-    `kymograph`, shape (n_frames, n_along), is the strip's mean brightness across in grey levels; column j lies
-    `j` px from `axis.from_px`. `edge_px` of the track counts along the same axis. `pictures` are (frame number,
-    picture) of the first, middle and last moving frame, full region, as the camera wrote them. `shake_px`, shape
-    (n_frames,), is how far along the axis a shaken camera moved each picture: what is drawn on it goes along.
+    `kymograph`, shape (n_frames, n_along), is the strip's brightness averaged across, in grey levels; column j lies
+    `j` px from `axis.from_px`, and `edge_px` of the track counts from the same point. `pictures` are (frame number,
+    picture) of the first, middle and last moving frame: the full region, as the camera wrote it. `shake_px`, shape
+    (n_frames,), is how far along the axis a shaken camera moved each picture; what is drawn on a picture moves with it.
     `tube_width_px` is the width of the tube behind the edge and `tube_width_sigma_px` its standard error, NaN for a
-    body and for a tube that leaves the axis; `seen_exposure_frames`, `fast_px_per_frame` see `edge.EdgeFit`.
-    `strip_frames` are the frames that are the rows of `kymograph`, None for all.
+    body and for a tube that leaves the axis. For `seen_exposure_frames` and `fast_px_per_frame` see `edge.EdgeFit`.
+    `strip_frames` are the frame numbers of the rows of `kymograph`, None for all.
     """
 
     track: Track
@@ -103,15 +103,15 @@ def track_recording(
     m_per_px: float | None = None,
     position_m: Callable[[Floats], Floats] | None = None,
 ) -> Tracking:
-    """Track the leading edge (travel ratio 1: the body) of one recording.
+    """Track the leading edge of one recording, or the body where the travel ratio is 1.
 
     Parameters
     ----------
     trial : its `video`, `capture_fps`, `exposure_s`, `travel_ratio` and, unless given here, `m_per_px` are used.
-    axis : growth axis in the picture; found from the motion where None. It is centred on what moves along it.
-    m_per_px : scale; that of the trial where None. Without any, positions in metres are NaN and pixels remain.
-    position_m : metres along the axis of picture points (x, y), shape (n, 2): a calibration that knows distortion and
-        tilt.
+    axis : growth axis in the picture; found from the motion where None. It is then centred on what moves along it.
+    m_per_px : scale; the trial's where None. Without any, positions in metres are NaN and those in pixels remain.
+    position_m : function from picture points (x, y), shape (n, 2), to metres along the axis: a calibration that
+        corrects distortion and tilt.
 
     Returns
     -------
@@ -140,14 +140,14 @@ def track_frames(
     position_m: Callable[[Floats], Floats] | None = None,
     along_path: Callable[[Axis], AxisScale] | None = None,
 ) -> Tracking:
-    """Track frames that are in memory already; see `track_recording`.
+    """Track frames that are already in memory; see `track_recording`.
 
     Parameters
     ----------
     frames : decoded, with their capture periods.
     trial, axis, m_per_px, position_m : as in `track_recording`.
     capture_fps : frames a second.
-    along_path : a calibration's scale along the axis, in place of `position_m` and of `m_per_px`, then its mean scale.
+    along_path : a calibration's scale along the axis; it replaces `position_m` and `m_per_px`.
 
     Returns
     -------
@@ -160,133 +160,194 @@ def track_frames(
     """
     name = frames.recording.path.name
     exposure_s = capture_exposure(trial, frames.recording)
-    if len(frames) < FEWEST_FRAMES:
-        raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
-    rejected = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
-    first, last = trial.frames_used or (0, frames.n_recorded - 1)
-    number = frames.first + np.arange(len(frames))
-    used = (number >= first) & (number <= last)
-    if used.sum() < FEWEST_FRAMES:
-        raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
-    sound = sound_stretch(frames, used)
-    rejected &= sound
-    kept = np.flatnonzero(sound & ~rejected)
-    luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
+    selection = _select_frames(frames, trial)
+    rows, number = selection.rows, selection.number
+    luma = frames.luma if len(rows) == len(frames) else frames.luma[rows]
+    axis_given = axis is not None
     try:
-        given, (axis, order) = axis is not None, locate_axis(luma, axis, trial, m_per_px)
-        strip, edge_fit = follow(luma, trial, axis, exposure_s * capture_fps, order)
+        axis, front_share_of = locate_axis(luma, axis, trial, m_per_px)
+        strip, followed = follow(luma, trial, axis, exposure_s * capture_fps, front_share_of)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
-    repeated = repeated_frames(strip, edge_fit.edge_px)
-    moving = np.gradient(edge_fit.edge_px) > MOVING_PX if len(kept) > 1 else np.ones(len(kept), bool)
-    largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
-    known = np.isfinite(edge_fit.edge_px)
-    noise = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & known, largest=largest)
-    # Roughness and the bands' disagreement tell of the same noise; the larger also of what the other is blind to.
-    sigma = np.maximum(np.hypot(noise, FLOOR_PX), np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
-    sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
-    end_px = strip.axis.length_px - edge_fit.reach_px
-    verdict = assess_points(
-        edge_fit.edge_px, sigma, frames.slot[kept], number[kept], unsure=edge_fit.unsure, repeated=repeated,
-        end_px=end_px,
+    random_px, total_px = _edge_errors(strip, followed, trial)
+    quality = assess_points(
+        followed.edge_px, total_px, frames.slot[rows], number, unsure=followed.unsure,
+        repeated=repeated_frames(strip, followed.edge_px), end_px=strip.axis.length_px - followed.reach_px,
     )  # fmt: skip
-    sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
-    noise = np.minimum(np.hypot(np.maximum(noise, edge_fit.bands_sigma_px), verdict.departure_px), LOST_SIGMA_PX)
-    slow = np.hypot(np.broadcast_to(edge_fit.slow_px, noise.shape), STEADIED_PX if strip.steadied else 0.0)
-    slow = np.hypot(slow, path_error_px(strip.axis))
-    slow = np.minimum(slow, LOST_SIGMA_PX)
-    if verdict.last_moving < 0:
-        if np.mean(~(sigma < LOST_SIGMA_PX)) > MOSTLY_LOST:
-            raise RecordingError(
-                f"{name}: something moves, but its edge is too vague to be followed: film it nearer, with more light or"
-                " contrast, or at more frames a second"
-            )
-        raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
+    if quality.last_moving < 0:
+        raise RecordingError(f"{name}: {_why_motionless(total_px, quality)}")
+    errors_px = _random_error(random_px, followed, quality), _slow_error(strip, followed)
     scale = trial.m_per_px if m_per_px is None else m_per_px
     if along_path is not None:
         along = along_path(strip.axis)
         scale, position_m = along.m_per_px, along.position_m
-    notes = [*frames.notes, *verdict.notes]
-    if edge_fit.end is not None:
-        notes.append(f"{name}: {body_end_note(edge_fit.end, number[kept])}")
-    elif not is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
-        notes += growth_end_notes(luma, verdict, edge_fit.edge_px, name, number[kept])
-        if trial.travel_ratio == 2 and trial.frames_used is None and number[kept[-1]] == frames.n_recorded - 1:
-            notes += truncation_notes(edge_fit.edge_px, verdict, trial.length_m / scale, name)
-    if isinstance(strip.axis, CurvedAxis) and not given:
+    notes = [*frames.notes, *quality.notes]
+    notes += _end_notes(frames, luma, trial, followed, quality, number, trial.length_m / scale)
+    if isinstance(strip.axis, CurvedAxis) and not axis_given:
         notes.append(f"{name}: {curve_note(strip.axis)}")
-    if not edge_fit.is_edge:
+    if not followed.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
         )
-    if sound.sum() < used.sum():
-        notes.append(
-            f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {number[kept[0]]} to {number[kept[-1]]}: "
-            "damaged ones, and those beyond them or beyond lost ones, do not count until their edge is placed in "
-            "corrections.csv"
-        )
-    if rejected.any():
-        first = int(number[rejected][0])
-        notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
-    track = _assemble(frames, kept, edge_fit, (noise, slow), verdict, capture_fps, exposure_s, notes)
-    track = corrected_by_hand(track, trial.corrections)
-    track = in_metres(track, strip.axis, scale, position_m)
-    chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
-    pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
+    notes += selection.notes
+    track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
+    track = in_metres(corrected_by_hand(track, trial.corrections), strip.axis, scale, position_m)
+    shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
+    pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
     shake_px = np.zeros(frames.n_recorded)
-    shake_px[number[kept]] = shake_along(strip, edge_fit.edge_px) if strip.steadied else 0.0
+    shake_px[number] = shake_along(strip, followed.edge_px) if strip.steadied else 0.0
     return Tracking(
-        track, strip.axis, _kymograph(strip), pictures, edge_fit.blur_px, edge_fit.exposure_frames, shake_px,
-        *edge_fit.width_px, *edge_fit.seen_exposure, strip_frames=number[kept],
+        track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
+        *followed.width_px, *followed.seen_exposure, strip_frames=number,
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Selection:
+    """Frames to be tracked: their `rows` among the decoded frames and their `number` in the recording.
+
+    `notes` say which others are left out.
+    """
+
+    rows: Indices
+    number: Indices
+    notes: tuple[str, ...]
+
+
+def _select_frames(frames: Frames, trial: Trial) -> _Selection:
+    """Frames that the sheet allows, of the longest undamaged stretch, without odd ones at the start.
+
+    Raises
+    ------
+    RecordingError
+        Where too few are left.
+    """
+    name = frames.recording.path.name
+    if len(frames) < FEWEST_FRAMES:
+        raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
+    odd = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
+    first, last = trial.frames_used or (0, frames.n_recorded - 1)
+    number = frames.first + np.arange(len(frames))
+    allowed: Bools = (number >= first) & (number <= last)
+    if allowed.sum() < FEWEST_FRAMES:
+        raise RecordingError(f"{name}: frames_used leaves {int(allowed.sum())} of {len(frames)} frames; widen it")
+    sound = sound_stretch(frames, allowed)
+    odd &= sound
+    rows = np.flatnonzero(sound & ~odd)
+    notes = []
+    if sound.sum() < allowed.sum():
+        notes.append(
+            f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {number[rows[0]]} to {number[rows[-1]]}: "
+            "damaged frames, and frames beyond damaged or missing ones, are not used until their edge is placed in "
+            "corrections.csv"
+        )
+    if odd.any():
+        first_odd = int(number[odd][0])
+        notes.append(f"{name}: {int(odd.sum())} frames are unlike all others and rejected, first frame {first_odd}")
+    return _Selection(rows, number[rows], tuple(notes))
+
+
+def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Floats, Floats]:
+    """Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
+
+    The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
+    larger one counts.
+    """
+    edge_px = followed.edge_px
+    moving = np.gradient(edge_px) > MOVING_PX if len(edge_px) > 1 else np.ones(len(edge_px), bool)
+    largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
+    random_px = calibrated_sigma(edge_px, followed.sigma_px, moving & np.isfinite(edge_px), largest=largest)
+    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.apart_sigma_px, FLOOR_PX))
+    return random_px, np.hypot(total_px, STABILISED_PX if strip.steadied else 0.0)
+
+
+def _random_error(random_px: Floats, followed: Positions, quality: PointQuality) -> Floats:
+    """Random error with the disagreement of bands and the distance of outliers in it, LOST_SIGMA_PX at most."""
+    larger_px = np.maximum(random_px, followed.bands_sigma_px)
+    return np.minimum(np.hypot(larger_px, quality.departure_px), LOST_SIGMA_PX)
+
+
+def _slow_error(strip: Strip, followed: Positions) -> Floats:
+    """Error that neighbouring frames share: of edge, stabilisation and path, LOST_SIGMA_PX at most."""
+    slow_px = np.broadcast_to(followed.slow_px, followed.edge_px.shape)
+    slow_px = np.hypot(slow_px, STABILISED_PX if strip.steadied else 0.0)
+    return np.minimum(np.hypot(slow_px, path_error_px(strip.axis)), LOST_SIGMA_PX)
+
+
+def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
+    """The message for a recording in which no frame is moving."""
+    outlying_px = np.minimum(np.hypot(total_px, quality.departure_px), LOST_SIGMA_PX)
+    total_px = np.where(total_px < LOST_SIGMA_PX, outlying_px, total_px)
+    if np.mean(~(total_px < LOST_SIGMA_PX)) > MOSTLY_LOST:
+        return (
+            "something moves, but its edge is too vague to be followed: film it nearer, with more light or"
+            " contrast, or at more frames a second"
+        )
+    return "nothing moves along the axis; check the recording, or give the axis"
+
+
+def _end_notes(
+    frames: Frames, luma: NDArray[Any], trial: Trial, followed: Positions, quality: PointQuality, number: Indices,
+    length_px: float,
+) -> list[str]:  # fmt: skip
+    """What ended the motion, where it is not that the whole vine has grown."""
+    name = frames.recording.path.name
+    if followed.end is not None:
+        return [f"{name}: {body_end_note(followed.end, number)}"]
+    if is_grown(followed.edge_px, quality, length_px):
+        return []
+    notes = growth_end_notes(luma, quality, followed.edge_px, name, number)
+    if trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1:
+        notes += truncation_notes(followed.edge_px, quality, length_px, name)
+    return notes
+
+
 def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, FrontShare]:
-    """The axis, with a width, and how to ask how much of what changes along it is one front that passes once and stays.
+    """Find the growth axis, or give a known one a width and centre it on the motion.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width).
     axis : in the picture, px; found from the motion where None.
-    trial : its diameter or the axis gives the width; its travel ratio decides what is looked for.
+    trial : its diameter, or the axis, gives the width; its travel ratio says whether a tube or a body is looked for.
     m_per_px : scale; None where unknown.
 
     Returns
     -------
-    axis, px; and a function of an axis of its kind, straight or curved: the share of what changes along it that is one
-    front, less than `axis.LEAST_FRONT_SHARE` where the vine bends or sweeps away.
+    the axis, px, and a function from an axis of its kind, straight or curved, to its `axis.front_share`: below
+        `axis.LEAST_FRONT_SHARE` where the vine bends or sweeps away.
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
-        return _along_given_curve(luma, axis, trial, m_per_px)
+        return _given_curve(luma, axis, trial, m_per_px)
     small = SmallPictures(luma)
     if axis is None and trial.travel_ratio == 2:
         axis = find_growth_axis(small, luma)
     axis = axis if axis is not None else find_axis(small, grows=False)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if given and not axis.bends:
-        # Room for an axis that is a few degrees off; it is centred on what moves, here or by `tube_strip`.
-        axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
+        # A margin for an axis a few degrees off; it is centred on the motion, here or by `tube_strip`.
+        axis = replace(axis, width_px=axis.width_px + GIVEN_AXIS_MARGIN * axis.length_px)
         if trial.travel_ratio == 1:
             axis = centred_on_motion(small, axis)
     return axis, front_share_function(small, luma)
 
 
-def _along_given_curve(
+def _given_curve(
     luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
 ) -> tuple[CurvedAxis, FrontShare]:
-    """A given curve with a width, that of its strip at most; see `locate_axis`."""
+    """A given curve with a width, no wider than its curvature allows; see `locate_axis`."""
     half = _half_width(axis, trial, m_per_px)
-    known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
-    check_curve(axis, half if known else math.nan, luma.shape[1:])
-    wide = min(2 * half + ROOM * axis.length_px, 2 * axis.largest_half_px)
-    axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
+    width_known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
+    check_curve(axis, half if width_known else math.nan, luma.shape[1:])
+    wide = min(2 * half + GIVEN_AXIS_MARGIN * axis.length_px, 2 * axis.largest_half_px)
+    axis = replace(axis, width_px=max(wide, 2 * half) if width_known else wide)
     return axis, partial(front_share_on_curve, luma)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
-    """Half the width of the tube, px: the axis's own, or by the sheet's diameter and scale, or a tenth of the axis."""
+    """Half the width of the tube, px: the axis's, else the sheet's diameter by the scale, else a tenth of the axis."""
     if np.isfinite(axis.width_px):
         return axis.width_px / 2
     scale = trial.m_per_px if m_per_px is None else m_per_px
@@ -296,21 +357,21 @@ def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
 
 
 def _assemble(
-    frames: Frames, kept: NDArray[np.int_], edge_fit: Positions, errors_px: tuple[Floats, Floats],
-    verdict: PointQuality, capture_fps: float, exposure_s: float, notes: list[str],
+    frames: Frames, rows: Indices, followed: Positions, errors_px: tuple[Floats, Floats], quality: PointQuality,
+    capture_fps: float, exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
-    """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""
+    """The track in pixels, a row for every frame; rejected and later frames have no position."""
     n = len(frames)
     edge, noise, slow = np.full((3, n), np.nan)
     flag = np.full(n, "rejected", dtype="<U64")
-    flag[int(kept[-1]) + 1 :] = "after_end"
+    flag[int(rows[-1]) + 1 :] = "after_end"
     flag[frames.damaged] = "rejected"
     slot = frames.slot.astype(float)
-    edge[kept] = np.where(verdict.unseen, np.nan, edge_fit.edge_px)
-    noise[kept], slow[kept] = np.where(verdict.unseen, np.nan, errors_px)
-    flag[kept] = verdict.flag
-    slot[kept] = verdict.slot
-    # Frames that were not decoded, since nothing moves in them, have rows as well.
+    edge[rows] = np.where(quality.without_edge, np.nan, followed.edge_px)
+    noise[rows], slow[rows] = np.where(quality.without_edge, np.nan, errors_px)
+    flag[rows] = quality.flag
+    slot[rows] = quality.slot
+    # Frames before and after the event were not decoded, since nothing moves in them; they have rows as well.
     before, after = frames.slots_before, frames.slots_after
     slot = np.concatenate([before, slot, after + (slot[-1] - frames.slot[-1])])
     flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
@@ -322,6 +383,44 @@ def _assemble(
     )  # fmt: skip
 
 
+def in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
+    """Convert a track from pixels along its axis to metres.
+
+    Parameters
+    ----------
+    track : with its errors in px.
+    axis : along which its edge counts.
+    m_per_px : scale; positions and errors are NaN where it is.
+    position_m : function from picture points, shape (n, 2), px, to metres along the axis; replaces the scale.
+
+    Returns
+    -------
+    Track
+    """
+    if position_m is None:
+        return _scaled(track, track.edge_px * m_per_px, m_per_px)
+    finite = np.isfinite(track.edge_px)
+    position = np.full(len(track.edge_px), np.nan)
+    local_scale = np.full(len(track.edge_px), np.nan)
+    if finite.any():
+        along = track.edge_px[finite]
+        position[finite] = position_m(axis.points(along))
+        local_scale[finite] = position_m(axis.points(along + 0.5)) - position_m(axis.points(along - 0.5))
+    return _scaled(track, position, np.abs(local_scale))
+
+
+def _scaled(track: Track, position_m: Floats, m_per_px: Floats | float) -> Track:
+    """The track with these positions and with its errors in metres."""
+    slow_px = track.lead_position_systematic_m
+    return replace(
+        track,
+        lead_position_m=position_m,
+        lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
+        lead_position_systematic_m=None if slow_px is None else slow_px * m_per_px,
+    )
+
+
 def _kymograph(strip: Strip) -> NDArray[np.float32]:
+    """Brightness of the strip averaged across, shape (n_frames, n_along), grey levels."""
     mean = strip.values.mean(axis=1, dtype=np.float32)
     return (mean * strip.scale[:, None] + strip.offset[:, None]).astype(np.float32)

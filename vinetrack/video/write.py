@@ -1,4 +1,4 @@
-"""Pictures become a clip that any player, browser and slide plays: H.264 in MP4, its index in front."""
+"""Write pictures as a clip that any player, browser and slide plays: H.264 in MP4, with its index in front."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 CRF = 26
-"""Quality of the encoder: thin coloured lines stay clean, and a clip of six seconds weighs a few hundred kilobytes.
+"""Quality of the encoder: thin coloured lines stay clean, and a clip of six seconds takes a few hundred kilobytes.
 Chosen by eye; six more halve the size, six fewer double it."""
 
-SAME_BYTES = {"mbtree": "0"}
-"""Option of libx264 without which the same pictures become other bytes. Measured (54 pictures of 960 × 390, encoded six
-times in one process with one thread): four different files with x264's macroblock tree, one without it."""
+REPRODUCIBLE = {"mbtree": "0"}
+"""Option of libx264 without which the same pictures are encoded to different bytes. Measured (54 pictures of 960 × 390,
+encoded six times in one process with one thread): four different files with x264's macroblock tree, one without it."""
 
-CODES_709 = 1
+BT709 = 1
 """Code of ITU-R BT.709 in the stream: players otherwise guess the colours from the size of the picture. Defined by
 ITU-T H.273: 1 is BT.709."""
 
 
 def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int = CRF) -> int:
-    """Write RGB pictures of shape (height, width, 3), all alike and of even sides; whole or not at all.
+    """Write RGB pictures of shape (height, width, 3), all of one size and with even sides; the whole clip or nothing.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def _stream(container: Any, width: int, height: int, play_fps: float, crf: int) 
     stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     stream.codec_context.thread_count = 1
-    stream.options = {"preset": "faster", "crf": str(crf), "profile": "high", "tune": "animation", **SAME_BYTES}
+    stream.options = {"preset": "faster", "crf": str(crf), "profile": "high", "tune": "animation", **REPRODUCIBLE}
     context = stream.codec_context
-    context.colorspace = context.color_primaries = context.color_trc = CODES_709
+    context.colorspace = context.color_primaries = context.color_trc = BT709
     return stream
