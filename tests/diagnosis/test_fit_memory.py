@@ -15,7 +15,7 @@ from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import missed_fraction
+from vinetrack.inference.optimiser import relative_residual
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
     fit = whole
     light = without_curves(fit)
     assert not light.trials
-    assert missed_fraction(light.predictor, light.solution) == missed_fraction(fit.predictor, fit.solution)
+    assert relative_residual(light.predictor, light.solution) == relative_residual(fit.predictor, fit.solution)
     steps = fit.predictor.steps.copy()
     again = with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)

@@ -21,12 +21,12 @@ from vinetrack.inference.mixed_effects import (
     at_zero_deviations,
     bounded_solve,
     levenberg_marquardt_step,
-    spreads,
     sum_matrix_blocks,
+    trial_deviation_sd,
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.variance_kernels import decrease_within_bounds, sums_without_deviations
+from vinetrack.inference.variance_kernels import decrease_within_bounds, normal_equations_without_deviations
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
@@ -39,7 +39,7 @@ def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
 def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
     return MixedProblem(
         index=np.tile(np.arange(keys), (n_trials, 1)),
-        feels=np.tile([False, True], (n_trials, 1)),
+        has_deviation=np.tile([False, True], (n_trials, 1)),
         gauge_error=np.zeros(n_trials),
         release_origin_mean=np.zeros((n_trials, 2)),
         release_origin_precision=np.full((n_trials, 2), flat_sd**-2),
@@ -162,7 +162,7 @@ def test_deviations_that_are_nearly_the_same_are_integrated_out_of_precise_posit
         for j in range(i + 1, 4):
             part = whole[j][i] / pivot[i]
             whole[j] = [a - part * b for a, b in zip(whole[j], pivot, strict=True)]
-    information, slope, square, log_det = sums_without_deviations(
+    information, slope, square, log_det = normal_equations_without_deviations(
         np.array(block, dtype=float)[None], np.array([[0]]), np.array([roots], dtype=float), 1
     )
     assert square == pytest.approx(float(whole[3][3]), rel=1e-3)
@@ -244,7 +244,7 @@ def test_two_spreads_are_found_from_wherever_the_fit_stands(start: tuple[float, 
         own = np.column_stack([0 * slope, 0 * slope, slope + 0.1 * bend, -0.4 * slope])
         seen = own[:, 2:] @ deviations + 1e-4 * draw.standard_normal(count)
         columns.append(np.column_stack([own, slope, seen]))
-    frame = replace(frame_of(n_trials, count, 1), feels=np.ones((n_trials, 2), dtype=bool))
+    frame = replace(frame_of(n_trials, count, 1), has_deviation=np.ones((n_trials, 2), dtype=bool))
     state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
     part = marginal(all_products(columns, [np.arange(count) == 0] * n_trials), frame, state)
     pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
@@ -326,7 +326,9 @@ def test_the_noise_of_short_trials_is_drawn_together_as_far_as_chance_explains_i
 
 def test_a_measured_pressure_scatters_by_the_error_of_its_gauge() -> None:
     frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
-    assert spreads(frame, (0.01, 0.03)) == pytest.approx(np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]]))
+    assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
+        np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
+    )
 
 
 def test_one_step_solves_a_straight_problem() -> None:

@@ -15,7 +15,7 @@ from vinetrack.inference.assemble import _beside_smooth_errors, log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState
-from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
+from vinetrack.inference.optimiser import FixedTerms, _stagnates, solve
 from vinetrack.inference.position_errors import SmoothErrors
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, optimise_trial_effects, residuals_in, trial_costs
@@ -117,7 +117,7 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
 
     def looked(missed_there: float) -> object:
         missed[0] = missed_there
-        return search.look(solution.state, residuals_in(columns))
+        return search.likelier(solution.state, residuals_in(columns))
 
     assert looked(+4.0) is not None
     # The next search finds the trials where they had been.
@@ -139,7 +139,7 @@ def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_t
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
     for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
         monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_, at=likelier: at)
-        search.look(begins, residuals)
+        search.likelier(begins, residuals)
     assert search.returned.all()
 
 
@@ -154,7 +154,7 @@ def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_t
     ids=["it still falls", "it creeps", "a jump has just raised it", "too few steps"],
 )
 def test_a_fit_that_only_creeps_may_end(levels: list[float], *, ends: bool) -> None:
-    assert _creeps(levels, 1.0) == ends
+    assert _stagnates(levels, 1.0) == ends
 
 
 def test_residuals_of_several_ways_are_those_of_each(only_in_motion: Fit) -> None:

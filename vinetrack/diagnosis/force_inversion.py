@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
-from vinetrack.inference.fit_problem import floor, track_correlation
+from vinetrack.inference.fit_problem import track_correlation, variance_floor
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, FitState, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
@@ -68,7 +68,7 @@ class ForceFit:
         self.scatter = scatter
         spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
         before = fit.solution.state
-        state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, floor(data)))
+        state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, variance_floor(data)))
         still = replace(problem, free=np.zeros_like(problem.free))
         held = FixedTerms(spread, (rho, state.variance))
         solution = solve(fit.predictor, still, state, held, warm=True, most_iterations=OWN_ITERATIONS)

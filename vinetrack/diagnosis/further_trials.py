@@ -336,7 +336,7 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
     smaller = replace(
         problem,
         index=problem.index[where],
-        feels=problem.feels[where],
+        has_deviation=problem.has_deviation[where],
         gauge_error=problem.gauge_error[where],
         release_origin_mean=problem.release_origin_mean[where],
         release_origin_precision=problem.release_origin_precision[where],

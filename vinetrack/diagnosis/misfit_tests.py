@@ -26,7 +26,7 @@ from vinetrack.diagnosis.trial_effect_tests import between_conditions_p, noise_i
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import track_correlation
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, missed_fraction
+from vinetrack.inference.optimiser import is_poor_fit, relative_residual
 from vinetrack.inference.systematics import systematics_of
 
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
@@ -159,7 +159,7 @@ class MisfitTests:
     @property
     def exceeds_slow_errors(self) -> bool:
         """Whether the misfit exceeds the noise and, as a fraction of growth, the slow errors of the tracks."""
-        return self.far_off and missed_fraction(self.fit.predictor, self.fit.solution) > self._slow_error_fraction
+        return self.far_off and relative_residual(self.fit.predictor, self.fit.solution) > self._slow_error_fraction
 
     @property
     def _slow_error_fraction(self) -> float:

@@ -23,7 +23,7 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import deviance, marginal
-from vinetrack.inference.optimiser import CREEPING, FixedTerms, is_poor_fit, solve
+from vinetrack.inference.optimiser import STAGNATION_DECREASE, FixedTerms, is_poor_fit, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.inference.solving import SLOW_NOISE
@@ -265,7 +265,7 @@ def best_subset_fit(
         further = fitter.fit_hypothesis(best.effects, best.values, iterations=SUBSET_FURTHER_ITERATIONS, search=search)
         if further is None:
             break
-        required_fall = CREEPING * fitter.n_points if search and further.far_off else 0.1
+        required_fall = STAGNATION_DECREASE * fitter.n_points if search and further.far_off else 0.1
         improves_slowly = further.deviance > best.deviance - required_fall
         best = min((best, further), key=lambda subset_fit: subset_fit.deviance)
         if improves_slowly:

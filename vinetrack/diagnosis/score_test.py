@@ -30,7 +30,7 @@ from vinetrack.inference.mixed_effects import (
     sum_matrix_blocks,
     sum_vector_blocks,
 )
-from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
+from vinetrack.inference.mixed_effects import trial_deviation_sd as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.fit_problem import variance_floor
 from vinetrack.inference.fit_result import Fit
 
 STRETCH_FRAMES = 8
@@ -157,7 +157,7 @@ def noise_in_motion_p(fit: Fit) -> float:
         if (
             trial_data.slow_m is not None
             or trial_data.gauge_error > 0
-            or trial_data.noise_m**2 < floor([trial_data])[0]
+            or trial_data.noise_m**2 < variance_floor([trial_data])[0]
         ):
             continue
         here = _sums(trial.whitened[: trial_data.n_rest])

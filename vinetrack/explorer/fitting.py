@@ -23,7 +23,7 @@ from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import SETTLED_DECREASE, Step, Watch
+from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 
 log = logging.getLogger(__name__)
 
@@ -348,7 +348,7 @@ class FitProgress:
     """How far a fit is, as a fraction and in words; `words` is the message where no fit runs.
 
     The number of steps is unknown: progress is measured by the logarithm of the decrease that the next step promises,
-    from its largest value down to `SETTLED_DECREASE`, where a fit stops.
+    from its largest value down to `CONVERGED_DECREASE`, where a fit stops.
     """
 
     def __init__(self) -> None:
@@ -377,9 +377,9 @@ class FitProgress:
         self._step = step
         if math.isfinite(step.predicted_decrease) and step.predicted_decrease > 0:
             self._largest = max(self._largest, step.predicted_decrease)
-            whole = math.log10(max(self._largest, 10 * SETTLED_DECREASE) / SETTLED_DECREASE)
+            whole = math.log10(max(self._largest, 10 * CONVERGED_DECREASE) / CONVERGED_DECREASE)
             done = math.log10(
-                max(self._largest, step.predicted_decrease) / max(step.predicted_decrease, SETTLED_DECREASE)
+                max(self._largest, step.predicted_decrease) / max(step.predicted_decrease, CONVERGED_DECREASE)
             )
             self._share = max(self._share, min(done / whole, 0.97))
 

@@ -99,7 +99,7 @@ def assemble(
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
     beside = smooth.solution.state if smooth else state
     variance = float(np.average(beside.variance, weights=weights)) / (1 - beside.rho**2)
-    felt = [bool(solution.problem.feels[:, k].any()) for k in range(2)]
+    felt = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
     return Fit(
         model=_fitted_model(layout, numbers),
         numbers=numbers,
@@ -158,7 +158,7 @@ def _pooled(predictor: Predictor, solution: Solution, options: Mapping[str, Any]
     held = options.get("held")
     if held is not None and held.noise is not None:
         return None
-    if too_few_clusters(predictor, solution) or not solution.problem.feels.any():
+    if too_few_clusters(predictor, solution) or not solution.problem.has_deviation.any():
         return pool(predictor, solution, len(predictor.layout.free))
     return None
 
@@ -285,7 +285,7 @@ def _own_sigma(solution: Solution, known: Precision) -> Floats:
     total = inverse + lever @ mine @ np.swapaxes(lever, 1, 2)
     sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
     for k, column in enumerate((PRESSURE, DAMPING_DEVIATION)):
-        sigma[~problem.feels[:, k], column] = 0.0
+        sigma[~problem.has_deviation[:, k], column] = 0.0
     return np.asarray(sigma)
 
 
@@ -383,7 +383,7 @@ def _messages(
         messages.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
     messages += _close_pairs(numbers, known)
     for k, name in enumerate(SPREAD_NAMES):
-        if solution.problem.feels[:, k].any() and not solution.estimable[k]:
+        if solution.problem.has_deviation[:, k].any() and not solution.estimable[k]:
             messages.append(
                 f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %"
             )
@@ -397,7 +397,7 @@ def _messages(
 
 def _free_in_trials(solution: Solution) -> str:
     """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
-    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.feels[:, k].any()]
+    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.has_deviation[:, k].any()]
     return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
 
 

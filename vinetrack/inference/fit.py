@@ -3,9 +3,11 @@
     fit = vinetrack.fit(model, experiment)
     print(fit)
 
-Positions are compared, not derivatives. Free are B of each vine, n, the yield pressure within the error the sheet gives
-it, and every parameter of further effects. Each trial has a release, an origin, and deviations of pressure and of B of
-its own, whose spreads are estimated: left out, they would be taken for missing physics.
+The fit compares positions, not derivatives. By default it estimates B of each vine, n, the yield pressure within the
+error that the sheet states, and every parameter of further effects. Each trial also has random effects: release,
+origin, and deviations of pressure and of ln B, whose between-trial standard deviations are estimated. Without them,
+differences between trials would look like missing physics. The statistical model is stated in
+`vinetrack.inference.mixed_effects`.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["FitError", "fit", "predict", "refit"]
 
 STANDSTILL_M = 1e-9
-"""Derived: no camera sees a nanometre; a trajectory that spans less is one of a model that nothing drives."""
+"""Travel below which a simulated trial counts as standing still. Derived: no camera resolves a nanometre."""
 
 
 def fit(
@@ -63,30 +65,31 @@ def fit(
 
     Parameters
     ----------
-    model : sum of effects; its values are those of numbers that are held.
+    model : sum of effects; fixed parameters keep the values they have in it.
     experiment : an experiment or its folder, or pairs of trial and track.
     tracks : mapping, optional
-        Tracks by name of trial, where the experiment brings recordings.
+        Tracks by name of trial, where the experiment consists of recordings.
     fixed, free : iterable of str
-        Parameters to hold at the model's values, or to fit although known beforehand (g). `n` will do for
-        `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
+        Parameters to keep at the model's values; parameters to estimate although they are fixed by default (g). `n` is
+        accepted for `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
     shared : mapping, optional
-        `"all"`, `"vine"` or `"day"` by name of parameter, in place of what the effect says.
+        `"all"`, `"vine"` or `"day"` by name of parameter, in place of the effect's default.
     start : mapping, optional
-        Values of further parameters to begin from, SI; B and n are always looked for.
+        Starting values of further parameters, SI; those of B and n are always searched for.
     spreads : (float, float), optional
-        Relative between-trial standard deviations of pressure and of B, in place of their estimates.
+        Relative between-trial standard deviations of pressure and of B, if they are not to be estimated.
     noise : (float, float), optional
-        Standard deviation of a position, m, and its lag-one correlation, in place of their estimates; all points then
-        count alike.
+        Standard deviation of a position, m, and its lag-one correlation, if they are not to be estimated; all points
+        then have the same weight.
     profile : bool
-        Whether intervals near a bound are found by profile, which costs a few refits each.
+        Whether intervals near a bound are profile-likelihood intervals, which take a few refits each.
     host : Model, optional
-        A larger model whose compiled form serves this one and every `refit` that follows: nothing is compiled anew.
+        A larger model whose compiled form serves this one and every later `refit`, so that nothing is compiled again.
     thorough : bool
-        Whether a poor fit is begun from other starts too. One that will only be questioned for what it lacks need not.
+        Whether a poor fit is repeated from other starting values. Unnecessary for a fit that is only tested for
+        missing effects.
     watch : callable, optional
-        Called with each step of the iterations; what it raises ends the fit.
+        Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
     Returns
     -------
@@ -95,9 +98,9 @@ def fit(
     Raises
     ------
     FitError
-        If there is nothing to fit, or the fit does not begin; the message is one sentence.
+        If no trial can be fitted, or none can be simulated from any starting values; the message is one sentence.
     EffectError
-        If a trial lacks what an effect of the model needs.
+        If a trial lacks a value that an effect of the model needs.
     ExperimentError
         If the experiment cannot be read.
     """
@@ -111,16 +114,16 @@ def fit(
     options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
-    held = _held(spreads, noise, data)
-    solution = solve_from_scratch(predictor, held, watch, thorough=thorough)
+    fixed_terms = _fixed_terms(spreads, noise, data)
+    solution = solve_from_scratch(predictor, fixed_terms, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
-    predictor, solution = with_fitted_trace_errors(predictor, solution, held, watch=watch)
-    fitted = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+    predictor, solution = with_fitted_trace_errors(predictor, solution, fixed_terms, watch=watch)
+    fitted = assemble(predictor, solution, left_out, {**options, "held": fixed_terms}, profile=profile)
     return replace(fitted, pairs=tuple(pairs))
 
 
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
-    """A model in which nothing drives any trial has no trajectories, and so nothing to compare or to add to.
+    """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks.
 
     Raises
     ------
@@ -136,8 +139,8 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     angle, pressure = (_range_in_words(values) for values in (angles, pressures))
     raise FitError(
         f"The model {model} moves no trial: at a growth angle of {angle}° and {pressure} kPa nothing in it drives"
-        " them. Check growth_angle_deg (0 is straight down), pressure_kPa and yield_pressure_kPa, or put the effect"
-        " that drives them in `model:`."
+        " them. Check growth_angle_deg (0 is straight down), pressure_kPa and yield_pressure_kPa, or add the effect"
+        " that drives them to `model:`."
     )
 
 
@@ -145,7 +148,9 @@ def _range_in_words(values: Sequence[float]) -> str:
     return f"{values[0]:g}" if values[0] == values[-1] else f"{values[0]:g} to {values[-1]:g}"
 
 
-def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None, data: list[FitTrial]) -> FixedTerms:
+def _fixed_terms(
+    spreads: tuple[float, float] | None, noise: tuple[float, float] | None, data: list[FitTrial]
+) -> FixedTerms:
     if noise is None:
         return FixedTerms(spreads)
     sigma_m, rho = noise
@@ -172,41 +177,41 @@ def refit(
     goal: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
-    """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
+    """Fit another model, or other parameters of the same model, to the same data, starting from a previous fit.
 
     Parameters
     ----------
-    before : the fit whose data, numbers and trial effects are taken over.
+    before : the previous fit: its data, and its estimates as starting values.
     model : Model, optional
-        The other model; its values are those of the fit where it has the same parameters.
+        The other model; parameters that it has in common with the fit start at the fitted values.
     fixed, free : iterable of str, optional
-        In place of what the fit was told.
+        As of `fit`, in place of the options of the previous fit.
     shared : mapping, optional
-        `"all"`, `"vine"` or `"day"` by name of parameter, beside what the fit was told.
+        `"all"`, `"vine"` or `"day"` by name of parameter, in addition to the options of the previous fit.
     between : sequence of BetweenTerm, optional
-        Differences between trials to fit along, in place of those of the fit.
+        Differences between trials to estimate, in place of those of the previous fit.
     start : mapping, optional
-        Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
+        Starting values of parameters, mainly of a new effect: a time constant that starts at zero stays there.
     yields_Pa : mapping, optional
-        Yield pressures to begin from, Pa, by the name of their number, in place of those that the fit found.
+        Starting values of yield pressures, Pa, by `Number.name`, in place of the fitted ones.
     hold_spreads, hold_noise : bool
-        Keep spreads and noise of the fit instead of estimating them again.
+        Keep the between-trial standard deviations, or the noise, of the previous fit instead of estimating them again.
     profile : bool
-        Whether intervals near a bound are found by profile.
+        Whether intervals near a bound are profile-likelihood intervals.
     most_iterations : int
-        How long to go on: what is only to be ruled out need not settle.
+        Maximum number of steps; a model that only has to be ruled out need not converge.
     thorough : bool
-        Whether a fit far off that takes what it misses for slow noise is led on by what it misses until nothing moves;
-        else it is only led so far that it can be held against others.
+        Whether a poor fit, which has absorbed its misfit as slow noise, is repeated at fixed noise correlation and then
+        iterated to convergence with free noise; otherwise only as far as a comparison with other models needs.
     afresh : bool
-        Whether releases, deviations and noise begin as the tracks show them, and not as the fit left them.
+        Whether release, deviations and noise start from the tracks alone instead of the previous fit.
     led : bool
-        Whether a fit that ends far off is begun again, led by what it misses; where another model explains the tracks
-        already, what stays far off is out of the running.
+        Whether a poor fit is repeated at fixed noise at all; not needed where another model already explains the tracks
+        and a poor fit is rejected anyway.
     goal : float
-        ln L that a fit far off must be able to reach to be led on to the end.
+        A poor fit is abandoned as soon as it can no longer reach this ln L.
     watch : callable, optional
-        Called with each step of the iterations; what it raises ends the fit.
+        Called with every `Step` of the iterations; an exception that it raises ends the fit.
 
     Returns
     -------
@@ -215,7 +220,7 @@ def refit(
     Raises
     ------
     FitError
-        If a name is that of no parameter, or the model cannot be followed.
+        If a name is not that of a parameter, or the model cannot be simulated.
 
     Examples
     --------
@@ -226,19 +231,23 @@ def refit(
     True
     """
     model = model or before.model
-    known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
-    model = model.with_values({**known, **(start or {})})
-    # What another model found of the errors of recorded pressures would hold this one to it.
+    fitted_values = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
+    model = model.with_values({**fitted_values, **(start or {})})
+    # Corrections of recorded pressures that belong to another model would bias this one towards it.
     data = before.predictor.data if model.names == before.model.names else list(map(as_recorded, before.predictor.data))
     names = {*model.parameter_names, "yield_pressure.P_y"}
-    kept = {
-        key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
+    options_used = {
+        key: tuple(name for name in before.options[key] if _names_parameter(name, names))
+        if given is None
+        else tuple(given)
         for key, given in (("fixed", fixed), ("free", free))
     }
-    told = {**before.options["shared"], **(shared or {})}
-    sharing = {name: how for name, how in told.items() if _belongs(name, names)}
+    all_shared = {**before.options["shared"], **(shared or {})}
+    shared_used = {name: how for name, how in all_shared.items() if _names_parameter(name, names)}
     between = before.predictor.layout.between if between is None else tuple(between)
-    layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=sharing, between=between)
+    layout = make_layout(
+        model, data, fixed=options_used["fixed"], free=options_used["free"], shared=shared_used, between=between
+    )
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
@@ -246,8 +255,11 @@ def refit(
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.to_scaled(float(np.clip(values[number.name], number.lower, number.upper)))
-    beside = before.state
-    held = FixedTerms(beside.spread if hold_spreads else None, (beside.rho, beside.variance) if hold_noise else None)
+    previous_state = before.state
+    fixed_terms = FixedTerms(
+        previous_state.spread if hold_spreads else None,
+        (previous_state.rho, previous_state.variance) if hold_noise else None,
+    )
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
@@ -255,7 +267,7 @@ def refit(
                 predictor,
                 theta,
                 trial_effects,
-                held,
+                fixed_terms,
                 most_iterations=most_iterations,
                 watch=watch,
                 search=not thorough,
@@ -265,36 +277,42 @@ def refit(
                 predictor,
                 before.solution,
                 theta,
-                held,
+                fixed_terms,
                 most_iterations=most_iterations,
                 watch=watch,
                 search=not thorough,
             )
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed from this start: {error}") from error
+        raise FitError(f"The model cannot be simulated from these starting values: {error}") from error
     if led:
-        solution = solve_again(predictor, solution, held, watch, thorough=thorough, goal=goal)
+        solution = solve_again(predictor, solution, fixed_terms, watch, thorough=thorough, goal=goal)
     predictor, solution = with_fitted_trace_errors(
-        predictor, solution, held, most_iterations=most_iterations, watch=watch, search=not thorough
+        predictor, solution, fixed_terms, most_iterations=most_iterations, watch=watch, search=not thorough
     )
-    fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
+    fitted = assemble(
+        predictor,
+        solution,
+        before.left_out,
+        {**options_used, "shared": shared_used, "held": fixed_terms},
+        profile=profile,
+    )
     return replace(fitted, pairs=before.pairs)
 
 
-def _belongs(name: str, names: Iterable[str]) -> bool:
+def _names_parameter(name: str, names: Iterable[str]) -> bool:
     return any(name in (full, full.split(".")[1]) for full in names)
 
 
 def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
-    """What a fitted model says of trials that were not in the fit.
+    """Predict trials that were not in the fit.
 
-    Each gets its own release and origin, nothing else: its deviations of pressure and B are zero. `band_m` is by how
-    much it may lie beside that, see `vinetrack.inference.prediction_band`; of a fit to one trial it knows of no scatter
-    between trials but the usual.
+    Only release and origin are fitted to each trial; its deviations of pressure and B are zero. `band_m` is the half
+    width of the 95 % prediction band, see `vinetrack.inference.prediction_band`; after a fit to a single trial it
+    assumes typical between-trial standard deviations.
 
     Parameters
     ----------
-    fitted : a fit.
+    fitted : the fit to predict from.
     pairs : iterable of (Trial, Track)
         Trials to predict.
 

@@ -19,7 +19,7 @@ EXACT_PART = 2e-6
 """Least noise, as part of a trial's travel: the integrator is no better. Measured: the integrator errs by at most 7e-7
 (benchmarks/integrator.py)."""
 
-RELEASE_ROOM_FRAMES, ORIGIN_ROOM_SIGMAS = 10.0, 10.0
+RELEASE_PRIOR_FRAMES, ORIGIN_PRIOR_SIGMAS = 10.0, 10.0
 """Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
 time: that only counts where a wrong model would drag both along. Chosen: ten standard deviations make the prior a
 hundredth of what the frames say."""
@@ -56,14 +56,14 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     vague = np.array(
         [0.0 if trial_data.imprecise_rest is None else trial_data.imprecise_rest.sigma_m for trial_data in data]
     )
-    release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
+    release_sd = np.where(rests, RELEASE_PRIOR_FRAMES * frames, 3 * durations)
     release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = KNOWN_RELEASE_S
     noise = np.array([trial_data.noise_m for trial_data in data])
-    room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
+    room = np.maximum(ORIGIN_PRIOR_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
     origin_sd = np.where(rests, room, 3 * spans)
     return MixedProblem(
         index=layout.index,
-        feels=np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation]),
+        has_deviation=np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation]),
         gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
         release_origin_mean=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
@@ -95,7 +95,7 @@ def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) 
     """
     rho = track_correlation(data)
     variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
-    return FitState(theta, trial_effects, _stated_spreads(data), rho, np.maximum(variance, floor(data)))
+    return FitState(theta, trial_effects, _stated_spreads(data), rho, np.maximum(variance, variance_floor(data)))
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
@@ -127,7 +127,7 @@ def _stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
     return (float(np.mean(relative)) if relative else FIRST_SPREADS[0]), FIRST_SPREADS[1]
 
 
-def floor(data: Sequence[FitTrial]) -> Floats:
+def variance_floor(data: Sequence[FitTrial]) -> Floats:
     """Least variance of a position that the integrator can answer for, m², shape (n_trials,).
 
     Parameters
@@ -153,6 +153,8 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
     (bool, bool)
     """
     needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
-    varied = problem.feels & np.column_stack([problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)])
+    varied = problem.has_deviation & np.column_stack(
+        [problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)]
+    )
     pressure, damping = (bool(np.count_nonzero(varied[:, k]) >= needed) for k in range(2))
     return pressure, damping

@@ -1,7 +1,7 @@
-"""Likelihood of spreads and noise: everything that a trial has of its own, and the shared numbers, integrated out.
+"""Marginal and restricted likelihood of the variance components, trial effects (and parameters) integrated out.
 
-Spreads maximise the restricted likelihood (Patterson & Thompson, Biometrika 58, 545, 1971); so does the noise, once the
-trial effects have been fitted. See `vinetrack.inference.mixed_effects` for the model.
+Between-trial standard deviations and noise maximise the restricted likelihood (REML; Patterson & Thompson, Biometrika
+58, 545, 1971). See `vinetrack.inference.mixed_effects` for the model.
 """
 
 from __future__ import annotations
@@ -20,42 +20,48 @@ from vinetrack.inference.mixed_effects import (
     at_zero_deviations,
     bounded_solve,
     solve_per_trial,
-    spreads,
+    trial_deviation_sd,
     trial_effect_prior,
 )
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
-from vinetrack.inference.variance_kernels import decrease_within_bounds, noise_at_correlations, sums_without_deviations
+from vinetrack.inference.variance_kernels import (
+    decrease_within_bounds,
+    noise_at_correlations,
+    normal_equations_without_deviations,
+)
 from vinetrack.inference.whitening import at_correlation
 
 LARGEST_SPREAD = (0.04, 0.15)
-"""Of pressure and B: four times what a batch of vines shows. Beyond, a trial would bend its own pressure and B until
-they pass for whatever the model lacks. Chosen: a batch of vines scatters by a few per cent of B and one per cent of
-pressure; at half real batches are cut short, at twice spreads soak up missing effects."""
+"""Upper bounds of the between-trial standard deviations of pressure and ln B: four times what a batch of vines shows.
+With more, the pressure and B of each trial would absorb whatever the model lacks. Chosen: a batch of vines varies by a
+few per cent of B and one per cent of pressure; at half, real batches are cut short; at twice, missing effects are
+absorbed."""
 
 SPREAD_GRID = (0.001, 0.004, 0.01, 0.025, 0.06)
-"""Spreads from which the largest likelihood is looked for. Chosen: steps of about 2.5, less than the width of a
-maximum, from below what any batch shows to beyond the largest of pressure."""
+"""Standard deviations from which the maximum of the likelihood is searched. Chosen: steps of a factor of about 2.5,
+less than the width of a maximum, from below what any batch shows to beyond the largest of pressure."""
 
 LARGEST_CORRELATION = 0.9998
-"""Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points.
-Derived: a correlation time of 5000 frames, longer than any recording."""
+"""Upper bound of the noise correlation, nearly 1: the misfit of a wrong model is slow and large, and must not count as
+thousands of independent points. Derived: a correlation time of 5000 frames, longer than any recording."""
 
 CORRELATIONS = np.concatenate(
     [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
 )
 
-LOOSE, WITHIN_LEAST = 1e-9, 1e-6
-"""Precision of a shared number freed in one trial, in units of what that trial tells of it at white noise; least part
-of the residual that stays. Derived: 1e-9 is far below any information at the correlations of the grid, far above
-rounding; a residual of which a millionth stays is a thousand times its noise, all of it disagreement."""
+VAGUE_PRECISION, LEAST_RESIDUAL_PART = 1e-9, 1e-6
+"""Prior precision of a shared parameter that is freed in each trial, relative to that trial's information at white
+noise; least part of the residual sum of squares that remains. Derived: 1e-9 is far below any information at the
+correlations of the grid, far above rounding; a residual of which a millionth remains is a thousand times its noise."""
 
 
 @dataclass(frozen=True)
 class Marginal:
-    """The trials with release and origin eliminated, shape (n_trials, 2 + n_keys + 1) squared: deviations, keys, rest.
+    """Whitened cross products of each trial with release and origin eliminated.
 
-    The last column is what the deviations and a change of the numbers have to explain. `log_constant` is the part of
-    −2 ln L that no spread changes.
+    `blocks`, shape (n_trials, 2 + n_keys + 1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual
+    taken at zero deviations. `log_constant` is the part of −2 ln L that does not depend on the between-trial standard
+    deviations.
     """
 
     blocks: Floats
@@ -63,13 +69,13 @@ class Marginal:
 
 
 def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> Marginal:
-    """Eliminate release and origin, and put back what the deviations explain so far.
+    """Eliminate release and origin, and take the residual at zero deviations.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, k, k)
-        Products of [trial effects, keys, residual], see `whitening`.
-    problem : what does not change during the fit.
+        Of [trial effects, keys, residual], see `whitening`.
+    problem : the constant part of the fit.
     state : where the fit stands.
 
     Returns
@@ -86,24 +92,23 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
 
 
 def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
-    """What every trial says of its keys once all it has of its own is integrated out, and what that took.
-
-    Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
+    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out.
 
     Parameters
     ----------
     part : release and origin eliminated.
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
 
     Returns
     -------
     blocks : array, shape (n_trials, n_keys + 1, n_keys + 1)
+        The last row and column belong to the residual.
     inner : array, shape (n_trials, 2, 2)
-        I + S Z S of the deviations, whose determinant enters ln L.
+        I + S Z S of the deviations, whose determinant enters ln L; S are the standard deviations.
     """
-    root = spreads(problem, spread) * problem.feels
+    root = trial_deviation_sd(problem, spread) * problem.has_deviation
     inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
     side = root[:, :, None] * part.blocks[:, :2, 2:]
     return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner
@@ -112,12 +117,12 @@ def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[f
 def normal_equations(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
-    """Information of the free numbers, its slope, the sum of squares and the log-determinant at these spreads.
+    """Normal equations of the free parameters at given between-trial standard deviations.
 
     Parameters
     ----------
     part : release and origin eliminated.
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
@@ -126,33 +131,35 @@ def normal_equations(
     -------
     information : array, shape (n_free, n_free)
     slope : array, shape (n_free,)
+        Half the negative gradient of the sum of squares.
     square : float
-        Sum of squares at the current numbers.
+        Penalised sum of squares at the current parameters.
     log_det : float
+        Sum over trials of ln det(I + S Z S).
     """
-    root = spreads(problem, spread) * problem.feels
+    root = trial_deviation_sd(problem, spread) * problem.has_deviation
     size = problem.prior_mean.size
-    information, slope, square, log_det = sums_without_deviations(part.blocks, problem.places, root, size)
-    away = state.theta - problem.prior_mean
+    information, slope, square, log_det = normal_equations_without_deviations(part.blocks, problem.places, root, size)
+    deviation = state.theta - problem.prior_mean
     information.flat[:: size + 1] += problem.prior_precision
-    slope -= problem.prior_precision * away
-    return information, slope, square + float(np.sum(problem.prior_precision * away**2)), log_det
+    slope -= problem.prior_precision * deviation
+    return information, slope, square + float(np.sum(problem.prior_precision * deviation**2)), log_det
 
 
 def deviance(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
 ) -> float:
-    """−2 ln of the (restricted) likelihood of the spreads, the free numbers at their best for them.
+    """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters.
 
     Parameters
     ----------
     part : release and origin eliminated.
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
     restricted : bool
-        Whether the fitted numbers are counted (REML).
+        Whether the likelihood is the restricted one (REML).
 
     Returns
     -------
@@ -166,18 +173,18 @@ def deviance(
 def profiled_deviance(
     information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
 ) -> float:
-    """The end of `deviance`: what is left once the free numbers are at their best.
+    """−2 ln L minimised over the free parameters, from their normal equations.
 
     Parameters
     ----------
     information : array, shape (n_free, n_free)
     slope : array, shape (n_free,)
     constant : float
-        −2 ln L at the current numbers.
-    problem : what does not change during the fit.
+        −2 ln L at the current parameters.
+    problem : the constant part of the fit.
     state : where the fit stands.
     restricted : bool
-        Whether the fitted numbers are counted (REML).
+        Whether the likelihood is the restricted one (REML).
 
     Returns
     -------
@@ -188,7 +195,7 @@ def profiled_deviance(
         solved, decrease, log_information = decrease_within_bounds(information, slope, below, above, problem.free)
         if solved:
             return constant - decrease + (log_information if restricted else 0.0)
-    # What would rather lie beyond its bound must not be credited with what it would explain there.
+    # A parameter at its bound must not be credited with the decrease beyond the bound.
     step, moving = bounded_solve(information, slope, problem, state.theta)
     total = constant - float(step @ (2 * slope - information @ step))
     k = np.flatnonzero(moving)
@@ -202,10 +209,10 @@ def profiled_deviance(
 
 
 def _groups_integrated(information: Floats, prior_precision: Floats, random: NDArray[np.bool_]) -> float:
-    """What −2 ln L gains when the random effects w of groups of trials are integrated out: ln det(I + D M D).
+    """Change of −2 ln L when the random effects w of groups of trials are integrated out: ln det(I + D M D).
 
     With w ~ N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is
-    det(D (M + D⁻²) D)^(−½). So a hypothesis with many groups pays for each of them.
+    det(D (M + D⁻²) D)^(−½). So a hypothesis with many groups is penalised for each of them.
     """
     sd = 1 / np.sqrt(prior_precision[random])
     return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
@@ -219,18 +226,18 @@ def estimate_between_trial_sd(
     *,
     restricted: bool = True,
 ) -> tuple[float, float]:
-    """Spreads of pressure and B that maximise the restricted (or plain) likelihood; those not estimable stay.
+    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood.
 
-    The likelihood may have two maxima: what pressure takes upon itself, B need not. So the best of a grid and of where
-    the state stands is followed.
+    The likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from
+    the best of a grid and the current values.
 
     Parameters
     ----------
     part : release and origin eliminated.
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
     estimable : (bool, bool)
-        Which of the two are estimated.
+        Which of the two are estimated; the other keeps its value.
     restricted : bool
         Whether the likelihood is the restricted one.
 
@@ -244,23 +251,23 @@ def estimate_between_trial_sd(
     which = [k for k in range(2) if estimable[k]]
     if not which:
         return state.spread
-    least, largest = math.log(LEAST_BETWEEN_TRIAL_SD), [math.log(most) for most in LARGEST_SPREAD]
+    least, largest = math.log(LEAST_BETWEEN_TRIAL_SD), [math.log(upper) for upper in LARGEST_SPREAD]
 
     def at(logs: Floats) -> tuple[float, float]:
         spread = list(state.spread)
         for k, value in zip(which, logs.tolist(), strict=True):
-            # Clipped before the exponential: on a flat likelihood the simplex walks as far as it likes.
+            # Clipped before the exponential: on a flat likelihood the simplex may go arbitrarily far.
             spread[k] = math.exp(min(max(value, least), largest[k]))
         return spread[0], spread[1]
 
     def cost(logs: Floats) -> float:
         return deviance(part, problem, state, at(logs), restricted=restricted)
 
-    here = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
+    start_point = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
     axes = np.meshgrid(*[np.log(SPREAD_GRID)] * len(which), indexing="ij")
-    points = [here, *np.column_stack([axis.ravel() for axis in axes])]
+    points = [start_point, *np.column_stack([axis.ravel() for axis in axes])]
     start = points[int(np.argmin([cost(point) for point in points]))]
-    # Steps towards smaller spreads: at the largest, a step up would be clipped, and the simplex flat.
+    # The simplex extends towards smaller values: at the upper bound a step up would be clipped and degenerate.
     simplex = np.vstack([start, start - 0.4 * np.eye(len(which))])
     minimum = minimize(
         cost, start, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-3}
@@ -271,22 +278,22 @@ def estimate_between_trial_sd(
 def estimate_noise(
     cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
 ) -> tuple[float, Floats]:
-    """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
+    """Noise correlation, the same for all trials, and innovation variance of each trial, by restricted likelihood.
 
-    Restricted likelihood of what is left once each trial's own numbers have been fitted. A trial's variance is drawn to
-    that of all as far as trials do not differ by more than chance. The correlation is `rho` where given. `within` frees
-    the shared numbers in every trial too, so that what trials disagree by does not pass for noise.
+    The residuals are those after the trial effects have been fitted. Each variance is shrunk towards the common one by
+    as much as the differences between trials are due to chance.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, k, k)
-        Products of [trial effects, keys, residual], see `whitening`.
-    problem : what does not change during the fit.
+        Of [trial effects, keys, residual], see `whitening`.
+    problem : the constant part of the fit.
     state : where the fit stands.
     rho : float, optional
-        Correlation, where it is known.
+        Correlation, if it is fixed.
     within : bool
-        Whether the shared numbers are free in every trial.
+        Whether the shared parameters are free in each trial too, so that disagreement between trials is not taken for
+        noise.
 
     Returns
     -------
@@ -295,50 +302,50 @@ def estimate_noise(
     """
     grid = CORRELATIONS if rho is None else np.array([rho])
     centre, precision = trial_effect_prior(problem, state)
-    stiff = precision * state.variance[:, None]
-    pull_back = stiff * (state.trial_effects - centre)
-    freed = N_TRIAL_EFFECTS + problem.index.shape[1] if within else N_TRIAL_EFFECTS
+    precision_scaled = precision * state.variance[:, None]
+    prior_gradient = precision_scaled * (state.trial_effects - centre)
+    n_freed = N_TRIAL_EFFECTS + problem.index.shape[1] if within else N_TRIAL_EFFECTS
     shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
     if within:
-        stiff = np.concatenate([stiff, _loose(cross_products, freed)], axis=1)
-        pull_back = np.pad(pull_back, ((0, 0), (0, freed - N_TRIAL_EFFECTS)))
-    columns = [*range(freed), cross_products.shape[-1] - 1]
+        precision_scaled = np.concatenate([precision_scaled, _vague_precision(cross_products, n_freed)], axis=1)
+        prior_gradient = np.pad(prior_gradient, ((0, 0), (0, n_freed - N_TRIAL_EFFECTS)))
+    columns = [*range(n_freed), cross_products.shape[-1] - 1]
     scores, squares, degrees = noise_at_correlations(
         np.ascontiguousarray(cross_products[:, :, columns][:, :, :, columns]),
-        stiff,
-        pull_back,
+        precision_scaled,
+        prior_gradient,
         problem.points,
         grid,
         shared,
-        WITHIN_LEAST if within else 0.2,
+        LEAST_RESIDUAL_PART if within else 0.2,
     )
     scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(cross_products, problem, state, _lowest(grid, scores, best), within=within)
-    return rho, _draw_together(squares[0], degrees[0])
+        return estimate_noise(cross_products, problem, state, _parabola_minimum(grid, scores, best), within=within)
+    return rho, _shrink_to_common(squares[0], degrees[0])
 
 
-def _loose(cross_products: Floats, freed: int) -> Floats:
-    """Precision that leaves the shared numbers free in every trial, shape (n_trials, n_keys): tiny beside its own."""
-    told = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:freed]
-    return np.asarray(np.where(told > 0, LOOSE * told, 1.0))
+def _vague_precision(cross_products: Floats, n_freed: int) -> Floats:
+    """Prior precision that leaves the shared parameters free in each trial, shape (n_trials, n_keys)."""
+    information = np.einsum("nkk->nk", cross_products[:, 0])[:, N_TRIAL_EFFECTS:n_freed]
+    return np.asarray(np.where(information > 0, VAGUE_PRECISION * information, 1.0))
 
 
-def _lowest(grid: Floats, scores: Floats, best: int) -> float:
-    """Where the parabola through the best point and its neighbours is lowest."""
+def _parabola_minimum(grid: Floats, scores: Floats, best: int) -> float:
+    """Minimum of the parabola through the lowest grid point and its neighbours."""
     if best in (0, grid.size - 1):
         return float(grid[best])
     curve = np.polyfit(grid[best - 1 : best + 2] - grid[best], scores[best - 1 : best + 2], 2)
     return float(grid[best] - curve[1] / (2 * curve[0]))
 
 
-def _draw_together(square: Floats, dof: Floats) -> Floats:
-    """Variances of the trials, drawn to the common one by as much as their differences can be chance."""
+def _shrink_to_common(square: Floats, dof: Floats) -> Floats:
+    """Variances of the trials, shrunk towards the common one by as much as their differences are due to chance."""
     common = float(np.sum(square) / np.sum(dof))
     if square.size < 2:
         return np.full(square.size, common)
     logs = np.log(square / dof / common)
-    beyond = float(np.average((logs - np.average(logs, weights=dof)) ** 2 - 2 / dof, weights=dof))
-    strength = 2 / beyond if beyond > 1e-6 else 1e6
+    excess = float(np.average((logs - np.average(logs, weights=dof)) ** 2 - 2 / dof, weights=dof))
+    strength = 2 / excess if excess > 1e-6 else 1e6
     return np.asarray((square + strength * common) / (dof + strength))

@@ -1,37 +1,40 @@
-"""The nonlinear mixed-effects model of a fit, and its linear form about the current trajectories.
+"""The nonlinear mixed-effects model of a fit, and its linearisation about the current trajectories.
 
 Point j of trial i, of vine v(i), is measured at time t_ij and lies at
 
     y_ij = o_i + f(t_ij − r_i; θ, ln B_v(i) + b_i + z_iᵀγ, P_i (1 + p_i + z_iᵀγ)) + e_ij
 
 f : position of the leading edge that the equation of motion predicts, m, by time since release.
-θ : shared numbers: ln B of each vine, n and what else the model leaves free, yield pressures where the sheet gives
-    them an error, and γ, the coefficients of differences between trials (`parameters.BetweenTerm`: z_i is 0 without
-    them, and γ acts on ln B or on the pressure). Priors: N(stated value, stated error²) where the sheet states one, and
-    for coefficients of groups that are random; flat between the bounds of a number otherwise.
-u_i = (r_i, o_i, p_i, b_i) : random effects of the trial: release, s; origin, m; relative deviation of the pressure;
-    deviation of ln B. Independent from trial to trial and of each other, normal, with the standard deviations
-    r_i : RELEASE_ROOM_FRAMES frames about the first guess where the rest is seen, three durations of the track where
-          it is not, `fit_problem.KNOWN_RELEASE_S` where the pressure was let in during the recording;
-    o_i : ORIGIN_ROOM_SIGMAS of the noise where the rest is seen, else three spans of the track;
-    p_i : σ_P, one for all trials; the gauge's error where the pressure was measured; 0 where no pressure drives;
-    b_i : σ_B, one for all trials; 0 for bodies without B.
-e_ij : s_ij times stationary AR(1) noise with the correlation ρ of all trials and an innovation variance of each, v_i;
-    independent on either side of a gap. s_ij is the stated noise of a point relative to that of its trial, 1 without.
+θ : fixed effects, called free parameters: ln B of each vine, n and the other parameters of the model, yield pressures
+    for which the sheet states an error, and γ, the coefficients of differences between trials
+    (`parameters.BetweenTerm`: z_i is 0 without them, and γ acts on ln B or on the pressure). Priors: N(stated value,
+    stated error²) where the sheet states an error, and for coefficients of groups that are random; otherwise flat
+    between the bounds.
+u_i = (r_i, o_i, p_i, b_i) : random effects of the trial, called trial effects: release, s; origin, m; relative
+deviation
+    of the pressure; deviation of ln B. Normal, independent of each other and between trials, with standard deviations
+    r_i : RELEASE_PRIOR_FRAMES frames about the initial estimate where frames at rest are recorded, three durations of
+          the track where they are not, `fit_problem.KNOWN_RELEASE_S` where the tube was pressurised in the recording;
+    o_i : ORIGIN_PRIOR_SIGMAS of the noise where frames at rest are recorded, else three spans of the track;
+    p_i : σ_P, the same for all trials; the gauge's error where the pressure was measured; 0 for undriven bodies;
+    b_i : σ_B, the same for all trials; 0 for bodies without B.
+e_ij : s_ij times stationary AR(1) noise, with one correlation ρ for all trials and an innovation variance v_i for each;
+    independent on either side of a gap. s_ij is the stated noise of a point relative to that of its trial, else 1.
 
 About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + Z_i Δu_i + e_i, with the sensitivities of
-`vinetrack.inference.sensitivity`. What is estimated by which likelihood, in turns until nothing moves:
+`vinetrack.inference.sensitivity`. The estimates, repeated in turn until they converge (Lindstrom & Bates, Biometrics
+46, 673, 1990; Pinheiro & Bates, Mixed-Effects Models in S and S-PLUS, Springer 2000, chapter 7):
 
-1. θ and u_i by Gauss–Newton steps at given σ_P, σ_B, ρ, v_i: the mode of the penalised sum of squares, u_i eliminated
-   analytically so that the cost is linear in the number of trials; then new trajectories (Lindstrom & Bates, Biometrics
-   46, 673, 1990).
-2. σ_P and σ_B by the restricted likelihood of the linear model, u_i and θ integrated out
-   (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). One that applies
-   to too few trials stays as stated.
-3. ρ and v_i by the restricted likelihood of what is left once u_i has been fitted, v_i drawn to the common variance as
-   far as trials differ by chance (`marginal_likelihood.estimate_noise`).
-4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ at its best and σ_P, σ_B at
-   theirs for it: the restricted one cannot compare models with other θ (`assemble.log_likelihood`).
+1. θ and u_i by Gauss–Newton steps at given σ_P, σ_B, ρ, v_i: the minimum of the penalised sum of squares. Each u_i is
+   eliminated analytically (Schur complement), so that the cost is linear in the number of trials.
+2. σ_P and σ_B by the restricted likelihood of the linearised model, u_i and θ integrated out
+   (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). A standard
+   deviation that applies to too few trials keeps its stated value.
+3. ρ and v_i by the restricted likelihood of the residuals after u_i has been fitted, each v_i shrunk towards their
+common
+   value by as much as their differences are due to chance (`marginal_likelihood.estimate_noise`).
+4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ, σ_P and σ_B at its maximum: the
+   restricted likelihood cannot compare models with different θ (`assemble.log_likelihood`).
 """
 
 from __future__ import annotations
@@ -48,19 +51,20 @@ from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation
 
 LEAST_BETWEEN_TRIAL_SD = 1e-5
-"""Least between-trial standard deviation. Chosen far below what any rig repeats, so that its logarithm stays
-finite."""
+"""Least between-trial standard deviation. Chosen far below the repeatability of any experiment, so that its logarithm
+stays finite."""
 
 DEVIATION_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
 
 @dataclass(frozen=True)
 class FitState:
-    """Where a fit stands.
+    """Current estimates of a fit.
 
-    `theta`, shape (n_free,), scaled; `trial_effects`, shape (n_trials, 4), see `vinetrack.inference.sensitivity`;
-    `spread` the relative standard deviations of pressure and B from trial to trial; `rho` the lag-one correlation of
-    the noise and `variance`, shape (n_trials,), that of its innovations, m².
+    `theta`, shape (n_free,), are the free parameters, scaled; `trial_effects`, shape (n_trials, 4), are release, origin
+    and deviations, see `vinetrack.inference.sensitivity`; `spread` are the between-trial standard deviations of
+    pressure (relative) and of ln B; `rho` is the lag-one correlation of the noise and `variance`, shape (n_trials,),
+    that of its innovations, m².
     """
 
     theta: Floats
@@ -72,11 +76,11 @@ class FitState:
 
 @dataclass(frozen=True)
 class MixedProblem:
-    """What does not change during a fit.
+    """The constant part of a fit: design, priors and bounds.
 
     `index`, shape (n_trials, n_keys), maps each trial's sensitivity columns to the free parameters, -1 where a trial
-    does not depend on one. `feels`, shape (n_trials, 2), tells which trials have a deviation of pressure and of B.
-    `gauge_error`, shape (n_trials,), is the relative error of a measured pressure, 0 for a set pressure.
+    does not depend on one. `has_deviation`, shape (n_trials, 2), tells which trials have a deviation of pressure and of
+    ln B. `gauge_error`, shape (n_trials,), is the relative error of a measured pressure, 0 for a set pressure.
     `release_origin_mean` and `release_origin_precision`, shape (n_trials, 2), are the prior of release and origin, so
     wide that it matters only where a track leaves them undetermined. `free` marks the parameters that are estimated;
     `points` and `stretches` count those of each trial. `random` marks parameters that are random effects of a group of
@@ -84,7 +88,7 @@ class MixedProblem:
     """
 
     index: NDArray[np.int_]
-    feels: NDArray[np.bool_]
+    has_deviation: NDArray[np.bool_]
     gauge_error: Floats
     release_origin_mean: Floats
     release_origin_precision: Floats
@@ -99,16 +103,16 @@ class MixedProblem:
 
     @cached_property
     def places(self) -> NDArray[np.int_]:
-        """`index` with the place behind all numbers for keys that a trial does not feel."""
+        """`index` with -1 replaced by n_free, one past the last parameter."""
         return np.where(self.index < 0, self.prior_mean.size, self.index)
 
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
-    """Centre and precision of each trial's own numbers, shape (n_trials, 4) each.
+    """Prior mean and precision of the trial effects.
 
     Parameters
     ----------
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
 
     Returns
@@ -118,35 +122,38 @@ def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, 
     n = problem.index.shape[0]
     centre, precision = np.zeros((n, N_TRIAL_EFFECTS)), np.ones((n, N_TRIAL_EFFECTS))
     centre[:, :2], precision[:, :2] = problem.release_origin_mean, problem.release_origin_precision
-    precision[:, DEVIATION_COLUMNS] = 1 / np.maximum(spreads(problem, state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
+    precision[:, DEVIATION_COLUMNS] = (
+        1 / np.maximum(trial_deviation_sd(problem, state.spread), LEAST_BETWEEN_TRIAL_SD) ** 2
+    )
     return centre, precision
 
 
-def spreads(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
-    """Standard deviations of each trial's pressure and B, shape (n_trials, 2): a measured pressure has its own.
+def trial_deviation_sd(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
+    """Standard deviations of the deviations of pressure and ln B of each trial.
 
     Parameters
     ----------
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     spread : (float, float)
         Between-trial standard deviations of pressure, relative, and of ln B.
 
     Returns
     -------
     array, shape (n_trials, 2)
+        The gauge's error in place of the first for a measured pressure.
     """
-    each = np.empty((problem.gauge_error.size, 2))
-    each[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, spread[0])
-    each[:, 1] = spread[1]
-    return each
+    sd = np.empty((problem.gauge_error.size, 2))
+    sd[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, spread[0])
+    sd[:, 1] = spread[1]
+    return sd
 
 
 def shared_penalty(problem: MixedProblem, state: FitState) -> float:
-    """What the priors of the free numbers add to the sum of squares.
+    """Contribution of the priors of the free parameters to the penalised sum of squares.
 
     Parameters
     ----------
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
 
     Returns
@@ -157,11 +164,11 @@ def shared_penalty(problem: MixedProblem, state: FitState) -> float:
 
 
 def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
-    """What the priors of the trials' own numbers add, shape (n_trials,).
+    """Contribution of the priors of each trial's effects to the penalised sum of squares.
 
     Parameters
     ----------
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
 
     Returns
@@ -173,31 +180,31 @@ def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
 
 
 def sum_matrix_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
-    """Sum blocks of the trials' columns, shape (n_trials, n_keys, n_keys), into those of all free numbers.
+    """Add the matrix block of each trial to the rows and columns of its free parameters, over all trials.
 
     Parameters
     ----------
     blocks : array, shape (n_trials, n_keys, n_keys)
-    problem : its `index` places the keys of each trial among the free numbers.
+    problem : its `index` maps the keys of each trial to the free parameters.
 
     Returns
     -------
     array, shape (n_free, n_free)
     """
     p = problem.prior_mean.size
-    among = problem.places
-    flat = among[:, :, None] * (p + 1) + among[:, None, :]
+    columns = problem.places
+    flat = columns[:, :, None] * (p + 1) + columns[:, None, :]
     total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
 
 def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
-    """As `sum_matrix_blocks`, for vectors, shape (n_trials, n_keys).
+    """Add the vector block of each trial to the entries of its free parameters, over all trials.
 
     Parameters
     ----------
     blocks : array, shape (n_trials, n_keys)
-    problem : its `index` places the keys of each trial among the free numbers.
+    problem : its `index` maps the keys of each trial to the free parameters.
 
     Returns
     -------
@@ -210,33 +217,34 @@ def sum_vector_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
 def levenberg_marquardt_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, damping: float
 ) -> tuple[Floats, Floats, float]:
-    """Step of all unknowns towards the minimum of the penalised sum of squares, and the decrease it promises.
+    """Damped Gauss–Newton step of parameters and trial effects, and the decrease that it predicts.
 
-    Numbers at a bound that want to go beyond it stay. `damping` is that of Levenberg and Marquardt.
+    The trial effects are eliminated from the normal equations (Schur complement), the reduced system is solved within
+    the bounds, and the trial effects follow by back-substitution.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, k, k)
-        Products of [trial effects, keys, residual], see `whitening`.
-    problem : what does not change during the fit.
+        Of [trial effects, keys, residual], see `whitening`.
+    problem : the constant part of the fit.
     state : where the fit stands.
     damping : float
-        Of Levenberg and Marquardt; 0 for a Gauss–Newton step.
+        Factor by which the diagonal is raised (Levenberg–Marquardt); 0 for a Gauss–Newton step.
 
     Returns
     -------
     step : array, shape (n_free,)
     trial_effect_step : array, shape (n_trials, 4)
     predicted_decrease : float
-        Decrease of the sum of squares by the linear model.
+        Decrease of the penalised sum of squares by the linear model.
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     centre, precision = trial_effect_prior(problem, state)
-    own_square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
-    own_slope = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
-    damped = own_square * (1 + damping * np.eye(N_TRIAL_EFFECTS))
-    mixed = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
-    solved = solve_per_trial(damped, np.concatenate([mixed, own_slope[:, :, None]], axis=2))
+    effect_information = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
+    effect_gradient = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
+    damped = effect_information * (1 + damping * np.eye(N_TRIAL_EFFECTS))
+    cross = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
+    solved = solve_per_trial(damped, np.concatenate([cross, effect_gradient[:, :, None]], axis=2))
     square = sum_matrix_blocks(white[:, N_TRIAL_EFFECTS:-1, N_TRIAL_EFFECTS:-1], problem) + np.diag(
         problem.prior_precision
     )
@@ -244,28 +252,28 @@ def levenberg_marquardt_step(
         state.theta - problem.prior_mean
     )
     reduced = square * (1 + damping * np.eye(square.shape[0]))
-    reduced = reduced - sum_matrix_blocks(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
-    reduced_slope = slope - sum_vector_blocks(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), problem)
+    reduced = reduced - sum_matrix_blocks(np.swapaxes(cross, 1, 2) @ solved[:, :, :-1], problem)
+    reduced_slope = slope - sum_vector_blocks(np.einsum("nuk,nu->nk", cross, solved[:, :, -1]), problem)
     step, _ = bounded_solve(reduced, reduced_slope, problem, state.theta)
-    spread_out = np.append(step, 0.0)[problem.index]
-    trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], spread_out)
-    predicted_decrease = float(step @ slope + np.sum(trial_effect_step * own_slope))
+    step_of_keys = np.append(step, 0.0)[problem.index]
+    trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], step_of_keys)
+    predicted_decrease = float(step @ slope + np.sum(trial_effect_step * effect_gradient))
     return step, trial_effect_step, predicted_decrease
 
 
 def trial_effect_step(
-    cross_products: Floats, problem: MixedProblem, state: FitState, *, pinned: bool = False
+    cross_products: Floats, problem: MixedProblem, state: FitState, *, fixed_release: bool = False
 ) -> Floats:
-    """Step of the trials' own numbers alone, shape (n_trials, 4); `pinned` leaves the release where it is.
+    """Gauss–Newton step of the trial effects at fixed parameters.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, k, k)
-        Products of [trial effects, keys, residual], see `whitening`.
-    problem : what does not change during the fit.
+        Of [trial effects, keys, residual], see `whitening`.
+    problem : the constant part of the fit.
     state : where the fit stands.
-    pinned : bool
-        Whether the release stays.
+    fixed_release : bool
+        Whether the release stays where it is.
 
     Returns
     -------
@@ -275,7 +283,7 @@ def trial_effect_step(
     centre, precision = trial_effect_prior(problem, state)
     square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
     slope = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
-    if pinned:
+    if fixed_release:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
     return np.asarray(solve_per_trial(square, slope[:, :, None])[:, :, 0])
@@ -284,54 +292,56 @@ def trial_effect_step(
 def bounded_solve(
     square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Solve for the numbers that may move; one that would pass a bound is held there and the rest solved again.
+    """Minimise a quadratic form within bounds by an active-set method, and return the step to the minimum.
 
     Parameters
     ----------
     square : array, shape (n_free, n_free)
-        Information of the free numbers.
+        Information of the free parameters.
     slope : array, shape (n_free,)
         Half the negative gradient of the sum of squares.
-    problem : bounds, and which numbers may move.
+    problem : bounds, and which parameters are estimated.
     theta : array, shape (n_free,)
-        Where they stand, scaled.
+        Current parameters, scaled.
 
     Returns
     -------
     step : array, shape (n_free,)
     moving : array of bool, shape (n_free,)
-        Numbers that are not held: those that end at a bound are.
+        Parameters that do not end at a bound.
     """
     moving = problem.free & (np.diag(square) > 0)
     if moving.all():
-        # Mostly no bound is met: then one solve is all, and this is asked some hundred times a fit.
-        whole = solve_scaled(square, slope)
-        room = np.where(whole > 0, problem.upper - theta, theta - problem.lower)
-        if (np.abs(whole) <= room).all():
-            return whole, moving
+        # In most calls no bound is active, and a single solve suffices. A fit calls this some hundred times.
+        full_step = solve_scaled(square, slope)
+        room = np.where(full_step > 0, problem.upper - theta, theta - problem.lower)
+        if (np.abs(full_step) <= room).all():
+            return full_step, moving
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
         k = np.flatnonzero(moving)
         if not k.size:
             break
-        held = np.flatnonzero(~moving)
-        way = solve_scaled(square[np.ix_(k, k)], slope[k] - square[np.ix_(k, held)] @ step[held]) - step[k]
-        # Only as far as the first bound: every part of the way lowers the sum of squares.
-        here = theta[k] + step[k]
-        room = np.where(way > 0, problem.upper[k] - here, problem.lower[k] - here)
+        at_bound = np.flatnonzero(~moving)
+        remaining_step = (
+            solve_scaled(square[np.ix_(k, k)], slope[k] - square[np.ix_(k, at_bound)] @ step[at_bound]) - step[k]
+        )
+        # Go as far as the first bound, which lowers the sum of squares; fix those parameters and solve for the others.
+        current = theta[k] + step[k]
+        room = np.where(remaining_step > 0, problem.upper[k] - current, problem.lower[k] - current)
         with np.errstate(divide="ignore", invalid="ignore"):
-            part = np.where(way == 0, np.inf, np.maximum(room / way, 0.0))
+            part = np.where(remaining_step == 0, np.inf, np.maximum(room / remaining_step, 0.0))
         first = float(np.min(part))
         if first >= 1:
-            step[k] += way
+            step[k] += remaining_step
             break
-        step[k] += first * way
+        step[k] += first * remaining_step
         moving[k[part <= first]] = False
     return step, moving
 
 
 def solve_scaled(square: Floats, slope: Floats) -> Floats:
-    """Solve a symmetric system brought to a unit diagonal, by least squares where it is singular.
+    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular.
 
     Parameters
     ----------
@@ -344,33 +354,33 @@ def solve_scaled(square: Floats, slope: Floats) -> Floats:
     array, shape (n,)
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-    even = square * scale[:, None] * scale
-    return np.asarray(scale * np.linalg.lstsq(even, scale * slope, rcond=1e-12)[0])
+    scaled = square * scale[:, None] * scale
+    return np.asarray(scale * np.linalg.lstsq(scaled, scale * slope, rcond=1e-12)[0])
 
 
 def inverse_of_block(square: Floats, places: NDArray[np.int_]) -> Floats:
-    """Inverse of a symmetric matrix among these places, 0 elsewhere; directions that nothing fixes are left out.
+    """Pseudo-inverse of the block of a symmetric matrix at these places, 0 elsewhere.
 
     Parameters
     ----------
     square : array, shape (n, n)
         Symmetric, with a positive diagonal at `places`.
     places : array of int
-        Rows and columns that are inverted.
+        Rows and columns of the block.
 
     Returns
     -------
     array, shape (n, n)
     """
     scale = 1 / np.sqrt(np.diag(square)[places])
-    even = square[np.ix_(places, places)] * scale[:, None] * scale
+    scaled = square[np.ix_(places, places)] * scale[:, None] * scale
     inverse = np.zeros_like(square)
-    inverse[np.ix_(places, places)] = np.linalg.pinv(even, rcond=1e-11, hermitian=True) * scale[:, None] * scale
+    inverse[np.ix_(places, places)] = np.linalg.pinv(scaled, rcond=1e-11, hermitian=True) * scale[:, None] * scale
     return inverse
 
 
 def solve_per_trial(square: Floats, right: Floats) -> Floats:
-    """Solve the small system of every trial, shape (n_trials, k, k), brought to unit diagonals.
+    """Solve one small symmetric system per trial, each scaled to a unit diagonal.
 
     Parameters
     ----------
@@ -383,22 +393,20 @@ def solve_per_trial(square: Floats, right: Floats) -> Floats:
     array, shape (n_trials, k, m)
     """
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(square.shape[1])
-    return np.asarray(scale[:, :, None] * np.linalg.solve(even, scale[:, :, None] * right))
+    scaled = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(square.shape[1])
+    return np.asarray(scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * right))
 
 
 def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
-    """Products of keys, residual and what follows in units of the noise, each trial's own numbers integrated out.
-
-    `cross_products` are those of [own numbers, keys, residual, more].
+    """Whitened cross products of keys, residual and further columns with the trial effects integrated out.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, k, k)
-        Products of [trial effects, keys, residual, more].
+        Of [trial effects, keys, residual, further columns].
     n_keys : int
         Number of keys.
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
 
     Returns
@@ -410,19 +418,19 @@ def trial_effects_eliminated(cross_products: Floats, n_keys: int, problem: Mixed
     within_trial = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + trial_effect_prior(problem, state)[1][
         :, :, None
     ] * np.eye(N_TRIAL_EFFECTS)
-    side = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:]
+    cross = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:]
     return np.asarray(
-        white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - np.swapaxes(side, 1, 2) @ solve_per_trial(within_trial, side)
+        white[:, N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:] - np.swapaxes(cross, 1, 2) @ solve_per_trial(within_trial, cross)
     )
 
 
 def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
-    """The products with what the deviations explain so far put back into the column of the residual.
+    """Cross products with the residual taken at zero deviations of pressure and ln B instead of the current ones.
 
     Parameters
     ----------
     white : array, shape (n_trials, k, k)
-        Whitened products, trial effects first.
+        Whitened cross products, trial effects first.
     state : holds the deviations.
     residual : int
         Place of the column of the residual.
@@ -434,9 +442,9 @@ def at_zero_deviations(white: Floats, state: FitState, residual: int) -> Floats:
     columns = list(DEVIATION_COLUMNS)
     effects = state.trial_effects[:, columns, None]
     explained = (white[:, :, columns] @ effects)[:, :, 0]
-    back = white.copy()
-    back[:, :, residual] += explained
-    back[:, residual, :] = back[:, :, residual]
-    # The product of the new column with itself: what it explains of itself counts twice, and its own square.
-    back[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
-    return np.asarray(back)
+    restored = white.copy()
+    restored[:, :, residual] += explained
+    restored[:, residual, :] = restored[:, :, residual]
+    # With r' = r + Z d, the product r'ᵀr' has the cross term rᵀZd twice, and dᵀZᵀZd.
+    restored[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
+    return np.asarray(restored)

@@ -1,4 +1,9 @@
-"""The iterations of a fit: new trajectories, new spreads and noise, one damped Newton step, until nothing moves."""
+"""Maximum-likelihood iterations of the mixed-effects model: variance components and Gauss–Newton steps in turn.
+
+The method is that of Lindstrom & Bates, Biometrics 46, 673 (1990): linearise the model about the current trajectories,
+estimate noise and between-trial standard deviations of the linear model, take a damped Gauss–Newton step, and repeat
+until neither changes.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +15,13 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_problem import estimable, floor, track_correlation
+from vinetrack.inference.fit_problem import estimable, track_correlation, variance_floor
 from vinetrack.inference.marginal_likelihood import estimate_between_trial_sd, estimate_noise, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import (
     ReleaseSearch,
-    limited,
+    limited_step,
     optimise_trial_effects,
     residuals_in,
     trial_costs,
@@ -24,59 +29,60 @@ from vinetrack.inference.trial_effects import (
 from vinetrack.inference.whitening import at_correlation
 
 MOST_ITERATIONS = 60
-"""Chosen as a safeguard against creeping; a fit that reaches it says that it has not settled."""
+"""Maximum number of steps. Chosen as a safeguard against very slow convergence; a fit that reaches it reports that it
+has not converged."""
 
-SETTLED_DECREASE = 1e-2
-"""A step that promises less than this of −2 ln L moves every number by under a twentieth of its error. Derived: −2 ln
-L of 0.01 is 0.1 standard errors for all numbers together."""
+CONVERGED_DECREASE = 1e-2
+"""Predicted decrease of −2 ln L per step below which the parameters have converged. Derived: a decrease of 0.01 is a
+step of 0.1 standard errors, all parameters together."""
 
-SETTLED_SPREAD = 0.02
-"""Relative change of spreads and noise that counts as settled. Chosen: errors follow to 2 %; half costs one or two
-iterations, twice moves intervals by 4 %."""
+CONVERGED_VARIANCES = 0.02
+"""Relative change of noise and between-trial standard deviations that counts as converged. Chosen: standard errors are
+then good to 2 %; half costs one or two iterations, twice changes intervals by 4 %."""
 
-NEARLY_SETTLED, PATIENCE, MOST_LOOKS = 3.0, 4, 8
-"""Where a step promises less, or after so many steps, releases that no frame at rest shows are looked for elsewhere: a
-step only creeps along such a valley. So often at most. Chosen for time: the search of releases costs as much as four
-steps."""
+NEARLY_CONVERGED, RELEASE_SEARCH_INTERVAL, MOST_RELEASE_SEARCHES = 3.0, 4, 8
+"""Releases that no frame at rest determines are searched globally once the predicted decrease of a step falls below the
+first number, or after this many steps (along the valley between two releases Gauss–Newton steps become tiny); and how
+many of these searches may move a release. Chosen for time: one search costs as much as four steps."""
 
-EARLY_ITERATIONS, MOST_EARLY, FAR_OFF = 3, 9, 1e3
-"""Spreads and the correlation of the noise stay those first assumed for three steps, and on while a step still
-promises more than this of −2 ln L: what is only not yet fitted must not pass for noise or scatter. Chosen: a start
-misses by less than that after three steps, or needs more; at half the spreads soak up what the first steps have not
-fitted yet."""
+FIRST_ITERATIONS, MOST_FIRST_ITERATIONS, FAR_FROM_OPTIMUM = 3, 9, 1e3
+"""Steps in which between-trial standard deviations and noise correlation keep their initial values; then up to so many,
+as long as the predicted decrease of −2 ln L exceeds the third number. A misfit that has not been fitted yet must not be
+taken for noise or between-trial variation. Chosen: after three steps most starts are closer than that; at half, the
+standard deviations absorb what the first steps have not fitted yet."""
 
 PROGRESS_STEPS = 4
-"""Steps in which a fit that may end early has to come forward. Chosen: as many as lie between two searches of
-releases, after which −2 ln L may rise for a step or two; at half such a rise would end it, at twice a third of the
-steps is saved instead of more than half. The likelihood of a vine that sticks has corners where more steps stand still,
-so a fit that is asked for by itself is not ended."""
+"""Steps over which progress is measured before a fit is stopped early. Chosen: as many as lie between two searches of
+releases, after which −2 ln L may rise for a step or two; at half, such a rise would stop the fit; at twice, a third of
+the steps is saved instead of more than half. The likelihood of a vine that sticks has corners at which progress pauses
+for longer, so a fit that is not part of a search is never stopped."""
 
-CREEPING = 2e-3
-"""Fall of −2 ln L per point in PROGRESS_STEPS steps below which a fit far off, one of a search, ends. Derived: −2 ln L
-of n points with noise s is n ln s², so what the model misses then changes by less than a thousandth: such a candidate
-is far off, and which of those far off is a little less so decides nothing. At half and at twice it ends a step or two
-later or earlier."""
+STAGNATION_DECREASE = 2e-3
+"""Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped. Derived: for n
+points with noise s, −2 ln L is n ln s², so the residual then changes by less than a thousandth; the ranking among poor
+fits does not matter. At half and at twice, it stops a step or two later or earlier."""
 
-LOST = 3e-3
-"""Part of its growth by which the median trial is missed where a model is far off. Chosen: several times what a
-tracker errs by slowly along the way; it decides whether further starts are tried, so half costs time and twice may
-keep a local minimum."""
+POOR_RELATIVE_RESIDUAL = 3e-3
+"""Residual of the median trial, relative to its growth, above which a fit is poor. Chosen: several times the slowly
+varying error of a tracker; it decides whether further starts are tried, so half costs time and twice may keep a local
+minimum."""
 
 POOR_FIT = 3.0
-"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried. Chosen: half would
+"""χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried. Chosen: half would
 try further starts for most fits (time), twice would keep local minima."""
 
-SHORTER, MOST_DAMPED = (1.0, 0.4, 0.15), 11
-"""Parts of a step that are tried, and how often it is damped further if none of them helps. Chosen: a line search in
-factors of about 0.4, then damping in factors of ten."""
+STEP_FRACTIONS, MOST_DAMPING_INCREASES = (1.0, 0.4, 0.15), 11
+"""Fractions of a step that a line search tries, and how many times the damping is then increased. Chosen: a line search
+in factors of about 0.4, then damping in factors of ten."""
 
 
 @dataclass(frozen=True)
 class FixedTerms:
-    """What a fit is told instead of finding it: spreads of pressure and B, correlation and variances of the noise.
+    """Variance components that are fixed instead of estimated.
 
-    `correlation` alone leaves the size of the noise to be found: what a model misses then counts as noise, but not as
-    slow noise, which could explain anything.
+    `spread` are the between-trial standard deviations of pressure (relative) and of ln B; `noise` is the correlation
+    and the innovation variance of each trial, m². `correlation` alone fixes the correlation but leaves the variance
+    free: the misfit then counts as noise, but not as slow noise, which could absorb any misfit.
     """
 
     spread: tuple[float, float] | None = None
@@ -103,10 +109,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Where the iterations are: the numbers, SI, by name, and by how much the step just found lowers −2 ln L.
+    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts.
 
-    Smooth errors of position (`vinetrack.inference.position_errors`) are fitted after the last step, and move the
-    numbers that the fit reports.
+    Smooth errors of position (`vinetrack.inference.position_errors`) are fitted after the last step and change the
+    reported values slightly.
     """
 
     iteration: int
@@ -115,53 +121,53 @@ class Step:
 
 
 Watch = Callable[[Step], None]
-"""Told of every step; what it raises ends the fit."""
+"""Called with every step; an exception that it raises ends the fit."""
 
 Shortfall = Callable[[Floats, MixedProblem, FitState, float], float]
-"""How far −2 ln L of a fit is behind where it has to get, from its products, problem, state and sum of squares."""
+"""By how much −2 ln L still exceeds the target, given cross products, problem, state and penalised sum of squares."""
 
 
 def solve(
     predictor: Predictor,
     problem: MixedProblem,
     state: FitState,
-    held: FixedTerms | None = None,
+    fixed_terms: FixedTerms | None = None,
     *,
     warm: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
-    least_decrease: float = SETTLED_DECREASE,
+    least_decrease: float = CONVERGED_DECREASE,
     search: bool = False,
-    behind: Shortfall | None = None,
+    shortfall: Shortfall | None = None,
 ) -> Solution:
-    """Iterate to the end. `warm` says that the state is near it already.
+    """Iterate the mixed-effects fit to convergence.
 
-    Method: Lindstrom & Bates, Biometrics 46, 673 (1990), Gauss–Newton steps of the linear mixed model in turns with
-    estimates of noise and spreads, damped after Levenberg and Marquardt.
+    Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton steps for the parameters alternate with estimates
+    of noise and between-trial standard deviations; Levenberg–Marquardt damping where a full step fails.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
-    problem : what does not change during the fit.
-    state : where to begin.
-    held : FixedTerms, optional
-        Spreads and noise that are not estimated.
+    predictor : simulates the trials of the fit.
+    problem : the constant part of the fit.
+    state : starting values.
+    fixed_terms : FixedTerms, optional
+        Variance components that are not estimated.
     warm : bool
-        Whether the state is near the end already.
+        Whether the start is close to the optimum already: no damping, and variances are estimated from the first step.
     most_iterations : int
-        Steps at most.
+        Maximum number of steps.
     watch : callable, optional
-        Called with each step.
+        Called with every step.
     columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
-        Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
+        Sensitivities and residuals at the starting values (`Predictor.linearise`), if already computed.
     least_decrease : float
-        Predicted decrease of −2 ln L per step below which the fit has converged.
+        Predicted decrease of −2 ln L per step below which the parameters have converged.
     search : bool
-        Whether the fit is one of many that are held against each other: far off, it ends where it only creeps.
-    behind : callable, optional
-        A fit ends, unsettled, where it would stay behind even if this step brought all that it promises, and each that
-        is left as much as the last ones.
+        Whether the fit is one of many candidates: it is stopped where it is poor and stagnates.
+    shortfall : callable, optional
+        Stops the fit, unconverged, once the target is out of reach even if this step brings all that it predicts and
+        every remaining one as much as the recent ones.
 
     Returns
     -------
@@ -170,104 +176,124 @@ def solve(
     Raises
     ------
     SimulationError
-        If the trajectories of the start cannot be followed.
+        If the trajectories at the starting values cannot be simulated.
     """
-    held = held or FixedTerms()
-    can = (False, False) if held.spread is not None else estimable(problem)
-    if held.spread is not None:
-        state = replace(state, spread=held.spread)
-    if held.noise is not None:
-        state = replace(state, rho=held.noise[0], variance=held.noise[1])
-    if held.correlation is not None:
-        state = replace(state, rho=held.correlation)
+    fixed_terms = fixed_terms or FixedTerms()
+    estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
+    state = _with_fixed_terms(state, fixed_terms)
     damping, converged, iteration, predicted_decrease = (0.0 if warm else 1e-3), False, 0, math.inf
-    early = not warm
-    columns, cross_products = _about(predictor, state) if columns is None else (columns, predictor.products(columns))
-    looks, looked, in_vain = MOST_LOOKS, 0, False
-    levels: list[float] = []
+    first_phase = not warm
+    columns, cross_products = (
+        _linearise(predictor, state) if columns is None else (columns, predictor.products(columns))
+    )
+    searches_left, last_search, searched_in_vain = MOST_RELEASE_SEARCHES, 0, False
+    deviances: list[float] = []
     releases = ReleaseSearch(predictor, problem)
     for iteration in range(1, most_iterations + 1):
-        near = predicted_decrease < FAR_OFF or iteration > MOST_EARLY
-        early = early and not (iteration > EARLY_ITERATIONS and near)
+        close = predicted_decrease < FAR_FROM_OPTIMUM or iteration > MOST_FIRST_ITERATIONS
+        first_phase = first_phase and not (iteration > FIRST_ITERATIONS and close)
         before = state
-        state = _update_variances(predictor, problem, cross_products, state, can, held, early=early)
-        moved = variances_moved(before, state)
-        step, own_change, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, damping)
+        state = _update_variances(
+            predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
+        )
+        variances_moved = variance_change(before, state)
+        step, effect_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, predicted_decrease))
-        settled = predicted_decrease < least_decrease
-        if looks and (
-            settled or (predicted_decrease < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE
+        small_step = predicted_decrease < least_decrease
+        if searches_left and (
+            small_step
+            or (predicted_decrease < NEARLY_CONVERGED and not searched_in_vain)
+            or iteration >= last_search + RELEASE_SEARCH_INTERVAL
         ):
-            looked, in_vain = iteration, True
-            jumped = releases.look(state, residuals_in(columns))
-            if jumped is not None:
-                state, (columns, cross_products) = jumped, _about(predictor, jumped)
-                looks, in_vain = looks - 1, False
+            last_search, searched_in_vain = iteration, True
+            state_with_moved_releases = releases.likelier(state, residuals_in(columns))
+            if state_with_moved_releases is not None:
+                state, (columns, cross_products) = (
+                    state_with_moved_releases,
+                    _linearise(predictor, state_with_moved_releases),
+                )
+                searches_left, searched_in_vain = searches_left - 1, False
                 continue
-            looks = 0 if settled else looks
-        if settled and moved < SETTLED_SPREAD and not early:
+            searches_left = 0 if small_step else searches_left
+        if small_step and variances_moved < CONVERGED_VARIANCES and not first_phase:
             converged = True
             break
-        now = cost(predictor, problem, state, residuals_in(columns))
-        levels.append(_level(problem, state, now, held))
-        if search and _creeps(levels, CREEPING * float(np.sum(problem.points))):
-            there = Solution(state, problem, cross_products, tuple(columns), can, converged, iteration)
-            if is_poor_fit(predictor, there):
+        penalised_squares = cost(predictor, problem, state, residuals_in(columns))
+        deviances.append(_deviance_of(problem, state, penalised_squares, fixed_terms))
+        if search and _stagnates(deviances, STAGNATION_DECREASE * float(np.sum(problem.points))):
+            reached = Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
+            if is_poor_fit(predictor, reached):
                 break
-        if behind is not None and iteration > EARLY_ITERATIONS:
-            further = (most_iterations - iteration) * _fall_per_step(levels)
-            if behind(cross_products, problem, state, now) > _most_gained(problem, now, predicted_decrease) + further:
+        if shortfall is not None and iteration > FIRST_ITERATIONS:
+            expected_of_remaining_steps = (most_iterations - iteration) * _decrease_per_step(deviances)
+            if (
+                shortfall(cross_products, problem, state, penalised_squares)
+                > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_of_remaining_steps
+            ):
                 break
-        taken, damping = _take_step(predictor, problem, cross_products, state, step, own_change, damping, now)
-        if taken is None:
-            # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
-            converged = moved < SETTLED_SPREAD
+        accepted, damping = _accepted_step(
+            predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
+        )
+        if accepted is None:
+            # No step lowers the cost: the state is at a corner of it, where a frame crosses the end of growth.
+            converged = variances_moved < CONVERGED_VARIANCES
             if converged:
                 break
             continue
         try:
-            columns, cross_products = _about(predictor, taken)
+            columns, cross_products = _linearise(predictor, accepted)
         except SimulationError:
-            # A neighbour of the new place cannot be followed: what was reached before is worth more than nothing.
+            # A perturbed trajectory of the new state cannot be simulated: the last state is still a result.
             break
-        state = taken
-    return Solution(state, problem, cross_products, tuple(columns), can, converged, iteration)
+        state = accepted
+    return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
 
 
-def _level(problem: MixedProblem, state: FitState, now: float, held: FixedTerms) -> float:
-    """−2 ln L but for a constant: where the noise is held, as if it were as large as what is missed."""
-    if held.noise is not None:
-        return float(np.sum(problem.points)) * math.log(max(now, 1e-300))
-    return now + float(np.sum(problem.points * np.log(state.variance)))
+def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:
+    if fixed_terms.spread is not None:
+        state = replace(state, spread=fixed_terms.spread)
+    if fixed_terms.noise is not None:
+        state = replace(state, rho=fixed_terms.noise[0], variance=fixed_terms.noise[1])
+    if fixed_terms.correlation is not None:
+        state = replace(state, rho=fixed_terms.correlation)
+    return state
 
 
-def _most_gained(problem: MixedProblem, now: float, predicted_decrease: float) -> float:
-    """Fall of −2 ln L if a step keeps its promise and the noise is taken for as much less.
+def _deviance_of(problem: MixedProblem, state: FitState, penalised_squares: float, fixed_terms: FixedTerms) -> float:
+    """−2 ln L up to a constant; where the noise is fixed, with the variance profiled out instead."""
+    if fixed_terms.noise is not None:
+        return float(np.sum(problem.points)) * math.log(max(penalised_squares, 1e-300))
+    return penalised_squares + float(np.sum(problem.points * np.log(state.variance)))
 
-    Of n points with noise s it is n ln s²; a step near the end promises all but the noise itself.
+
+def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted_decrease: float) -> float:
+    """Largest decrease of −2 ln L by this step: the predicted decrease, followed by a new estimate of the noise.
+
+    With n points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares
+    except the noise itself.
     """
-    left = 1 - predicted_decrease / max(now, 1e-300)
+    left = 1 - predicted_decrease / max(penalised_squares, 1e-300)
     return -float(np.sum(problem.points)) * math.log(left) if left > 0 else math.inf
 
 
-def _fall_per_step(levels: Sequence[float]) -> float:
-    """By how much each of the last steps lowered the least −2 ln L; infinite where there are too few of them to tell.
+def _decrease_per_step(deviances: Sequence[float]) -> float:
+    """Mean decrease of the lowest −2 ln L over the last PROGRESS_STEPS steps; infinite if there are too few steps.
 
-    Its levels may go up and down in turns, noise and numbers being found in turns.
+    Single values may go up and down, as noise and parameters are estimated in turn.
     """
-    before = levels[:-PROGRESS_STEPS]
-    return (min(before) - min(levels)) / PROGRESS_STEPS if before else math.inf
+    before = deviances[:-PROGRESS_STEPS]
+    return (min(before) - min(deviances)) / PROGRESS_STEPS if before else math.inf
 
 
-def _creeps(levels: Sequence[float], least: float) -> bool:
-    """Whether the last steps lowered −2 ln L by less than `least`; never just after a jump that raised it."""
-    before, last = levels[:-PROGRESS_STEPS], levels[-PROGRESS_STEPS:]
+def _stagnates(deviances: Sequence[float], least: float) -> bool:
+    """Whether the last steps lowered −2 ln L by less than `least`; never right after a jump that raised it."""
+    before, last = deviances[:-PROGRESS_STEPS], deviances[-PROGRESS_STEPS:]
     return bool(before) and last[-1] == min(last) > min(before) - least
 
 
-def _about(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
-    """Sensitivities at a state, and their sums of products."""
+def _linearise(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
+    """Sensitivities and residuals at a state, and their cross products."""
     columns = predictor.linearise(state.theta, state.trial_effects)
     return columns, predictor.products(columns)
 
@@ -280,9 +306,9 @@ def _step_report(predictor: Predictor, state: FitState, iteration: int, predicte
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """What the model leaves against the noise that the tracks show alone, of their correlation.
+    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone.
 
-    Noise below what the integrator can answer for counts as that much, see `fit_problem.floor`.
+    Noise below the accuracy of the integrator is replaced by that accuracy, see `fit_problem.variance_floor`.
 
     Parameters
     ----------
@@ -295,17 +321,17 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     """
     data = predictor.data
     rho = track_correlation(data)
-    noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), floor(data))
+    noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), variance_floor(data))
     left = at_correlation(solution.cross_products, rho)[:, -1, -1]
-    taken = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.feels.any(axis=1)
-    return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - taken, 1.0)))
+    accepted = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.has_deviation.any(axis=1)
+    return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - accepted, 1.0)))
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
-    """Whether a solution is far from the tracks: beyond their noise, and by a visible part of the growth.
+    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth.
 
-    A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
-    noise, and no reason to begin elsewhere.
+    Both are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths.
+    That is far above its noise, but no reason to try other starts.
 
     Parameters
     ----------
@@ -316,11 +342,13 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
     -------
     bool
     """
-    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and missed_fraction(predictor, solution) > LOST)
+    return bool(
+        chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > POOR_RELATIVE_RESIDUAL
+    )
 
 
-def missed_fraction(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square of what is missed, as part of the growth that was seen; of the median trial.
+def relative_residual(predictor: Predictor, solution: Solution) -> float:
+    """Root mean square residual of the median trial, relative to its observed growth.
 
     Parameters
     ----------
@@ -343,24 +371,26 @@ def _update_variances(
     problem: MixedProblem,
     cross_products: Floats,
     state: FitState,
-    can: tuple[bool, bool],
-    held: FixedTerms,
+    estimable_sd: tuple[bool, bool],
+    fixed_terms: FixedTerms,
     *,
-    early: bool,
+    first_phase: bool,
 ) -> FitState:
-    """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
-    if held.noise is None:
-        known = state.rho if early or held.correlation is not None else None
-        rho, variance = estimate_noise(cross_products, problem, state, known)
-        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
-    if not early and any(can):
-        spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, can)
+    """Estimate noise and between-trial standard deviations; in the first phase only the size of the noise."""
+    if fixed_terms.noise is None:
+        fixed_rho = state.rho if first_phase or fixed_terms.correlation is not None else None
+        rho, variance = estimate_noise(cross_products, problem, state, fixed_rho)
+        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
+    if not first_phase and any(estimable_sd):
+        spread = estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable_sd)
         state = replace(state, spread=spread)
     return state
 
 
-def variances_moved(before: FitState, after: FitState) -> float:
-    """Largest relative change among spreads and noise; spreads below a thousandth count as none.
+def variance_change(before: FitState, after: FitState) -> float:
+    """Largest relative change of noise and between-trial standard deviations.
+
+    Between-trial standard deviations well below 0.001 count as zero.
 
     Parameters
     ----------
@@ -375,71 +405,83 @@ def variances_moved(before: FitState, after: FitState) -> float:
     return float(max(*spreads, noise, abs(after.rho - before.rho)))
 
 
-def _take_step(
+def _accepted_step(
     predictor: Predictor,
     problem: MixedProblem,
     cross_products: Floats,
     state: FitState,
     step: Floats,
-    own_change: Floats,
+    effect_step: Floats,
     damping: float,
-    now: float,
+    penalised_squares: float,
 ) -> tuple[FitState | None, float]:
-    """The first of ever shorter, then ever more damped steps that lowers the sum of squares, and the damping to go on.
+    """The first state that lowers the penalised sum of squares, and the damping for the next step.
 
-    A step too long for a curved valley is right in its direction, which damping would turn across the valley. `now` is
-    the sum of squares with what the priors add where the state stands.
+    A line search comes first, then ever more damping: in a curved valley a step that is too long has the right
+    direction, and damping would turn it across the valley. `penalised_squares` is that of the current state. The state
+    is None if no step lowers it.
     """
-    for part in SHORTER:
-        tried = _tried(predictor, problem, state, part * step, part * own_change, now, at_once=True)
-        if tried is not None:
-            return tried, damping * 0.1 if damping > 1e-6 else 0.0
-    for _ in range(MOST_DAMPED):
+    for fraction in STEP_FRACTIONS:
+        candidate = _candidate_state(
+            predictor,
+            problem,
+            state,
+            fraction * step,
+            fraction * effect_step,
+            penalised_squares,
+            reject_by_prediction=True,
+        )
+        if candidate is not None:
+            return candidate, damping * 0.1 if damping > 1e-6 else 0.0
+    for _ in range(MOST_DAMPING_INCREASES):
         damping = max(10 * damping, 1e-4)
-        step, own_change, _ = levenberg_marquardt_step(cross_products, problem, state, damping)
-        tried = _tried(predictor, problem, state, step, own_change, now)
-        if tried is not None:
-            return tried, damping * 0.1
+        step, effect_step, _ = levenberg_marquardt_step(cross_products, problem, state, damping)
+        candidate = _candidate_state(predictor, problem, state, step, effect_step, penalised_squares)
+        if candidate is not None:
+            return candidate, damping * 0.1
     return None, 0.0
 
 
-def _tried(
+def _candidate_state(
     predictor: Predictor,
     problem: MixedProblem,
     state: FitState,
     step: Floats,
-    own_change: Floats,
-    now: float,
+    effect_step: Floats,
+    penalised_squares: float,
     *,
-    at_once: bool = False,
+    reject_by_prediction: bool = False,
 ) -> FitState | None:
-    """The state after a step, if that lowers the sum of squares.
+    """The state after a step and new trial effects, if it lowers the penalised sum of squares; else None.
 
-    One is refused `at_once` where the trials' own numbers cannot make up for it by their linear answer, which is wrong
-    where a release meets a frame: so never the last that are tried.
+    With `reject_by_prediction`, a step is rejected without simulating the new trial effects where their linear
+    prediction cannot make up for it. That prediction fails where a release crosses a frame, so the last candidates are
+    always simulated.
     """
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     try:
-        there = replace(state, theta=theta, trial_effects=limited(predictor, state.trial_effects, own_change))
-        most = now - shared_penalty(problem, there)
-        there, costs = optimise_trial_effects(predictor, problem, there, most if at_once else math.inf)
+        reached = replace(state, theta=theta, trial_effects=limited_step(predictor, state.trial_effects, effect_step))
+        largest_cost = penalised_squares - shared_penalty(problem, reached)
+        reached, costs = optimise_trial_effects(
+            predictor, problem, reached, largest_cost if reject_by_prediction else math.inf
+        )
     except SimulationError:
         return None
-    return there if float(np.sum(costs)) < most else None
+    return reached if float(np.sum(costs)) < largest_cost else None
 
 
 def cost(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
 ) -> float:
-    """Whitened sum of squares of all trials with what the priors add.
+    """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
-    problem : what does not change during the fit.
+    predictor : simulates the trials of the fit.
+    problem : the constant part of the fit.
     state : where the fit stands.
     residuals : sequence of arrays, shape (n_points,), m, optional
-        What is left of each trial there, where it is known.
+        Residuals of each trial at this state, if already computed.
 
     Returns
     -------

@@ -110,7 +110,7 @@ def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, p
     return replace(
         problem,
         index=layout.index,
-        feels=problem.feels[rows],
+        has_deviation=problem.has_deviation[rows],
         gauge_error=problem.gauge_error[rows],
         release_origin_mean=problem.release_origin_mean[rows],
         release_origin_precision=problem.release_origin_precision[rows],

@@ -30,7 +30,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.fit_problem import variance_floor
 from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
     DEVIATION_COLUMNS,
@@ -107,7 +107,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         wide = _with_shapes(columns, shapes, state.theta[shared:])
         cross_products = predictor.products(wide)
         rho, variance = estimate_noise(cross_products, problem, state, within=True)
-        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
+        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
         pooled = _weighed(
             replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(wide)), shared
         )

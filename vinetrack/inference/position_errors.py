@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.fit_problem import variance_floor
 from vinetrack.inference.intervals import LEAST_INFORMATION
 from vinetrack.inference.marginal_likelihood import (
     deviance,
@@ -30,7 +30,7 @@ from vinetrack.inference.marginal_likelihood import (
     normal_equations,
 )
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step
-from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, variances_moved
+from vinetrack.inference.optimiser import CONVERGED_VARIANCES, FixedTerms, Solution, variance_change
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten
 
@@ -192,7 +192,7 @@ def _iterated(
         if reached < level - SETTLED:
             break
         cross_products, moved, state, level = there, moved + change, after, reached
-        if predicted_decrease < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
+        if predicted_decrease < SETTLED and variance_change(before, state) < CONVERGED_VARIANCES:
             break
     return state, cross_products, moved, level
 
@@ -254,7 +254,7 @@ def _variances(
         rho, variance = estimate_noise(cross_products, problem, state, held.correlation)
         if rho > solution.state.rho:
             rho, variance = estimate_noise(cross_products, problem, state, solution.state.rho)
-        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
+        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
     if any(estimable):
         state = replace(
             state, spread=estimate_between_trial_sd(marginal(cross_products, problem, state), problem, state, estimable)

@@ -32,7 +32,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.intervals import student
-from vinetrack.inference.mixed_effects import FitState, inverse_of_block, spreads
+from vinetrack.inference.mixed_effects import FitState, inverse_of_block, trial_deviation_sd
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
@@ -228,7 +228,9 @@ def _design(columns: Floats, index: np.ndarray, size: int) -> Floats:
 
 def _own_spreads(solution: Solution, i: int) -> Floats:
     """Standard deviations of the deviations of pressure and ln B of one trial, shape (2,), 0 where it has none."""
-    return np.asarray(spreads(solution.problem, solution.state.spread)[i] * solution.problem.feels[i])
+    return np.asarray(
+        trial_deviation_sd(solution.problem, solution.state.spread)[i] * solution.problem.has_deviation[i]
+    )
 
 
 def _own_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:

@@ -1,8 +1,8 @@
-"""Solutions of a fit from several starts, and what is tried where one is far off the tracks.
+"""Solve a fit from several starting values, and repeat it with fixed noise where the solution is poor.
 
-A fit estimates the noise along with its numbers. Where a start is far off, what it misses may pass for slow noise, so
-that the likelihood is high and the numbers wrong. Such a solution is recognised by what it misses of the growth
-(`is_poor_fit`), and begun again with the noise held to that of the tracks.
+A fit estimates the noise together with its parameters. From poor starting values it may absorb the whole misfit as slow
+noise: the likelihood is then high and the parameters are wrong. `is_poor_fit` recognises such a solution by its
+residual relative to the growth; the fit is then repeated with the noise fixed at that of the tracks.
 """
 
 from __future__ import annotations
@@ -35,41 +35,47 @@ from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
 
 MOST_STARTS = 3
-"""Starts and iterations at most. Chosen for time: fits that need more are taken up again by the search for a better
+"""Maximum number of starting values. Chosen for time: a fit that needs more is restarted by the search for a better
 minimum."""
 
-ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
-"""Steps of a solution that is taken up again, and of one that is guided. Chosen for time: most settle in half of them;
-at half some stay unsettled and say so, at twice hopeless starts cost twice the time."""
+CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
+"""Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks. Chosen for
+time: most converge in half of them; at half some do not converge and say so, at twice hopeless starts cost twice the
+time."""
 
-BAD_START = 1.5
-"""χ² per point from which a start misses by more than the noise of the fit it came from. Chosen: below it the
-likelihood is nearly quadratic and one descent suffices; it decides time, not results."""
+BAD_START_CHI2 = 1.5
+"""χ² per point, at the noise of the previous fit, above which starting values are bad. Chosen: below it the likelihood
+is nearly quadratic and one descent suffices; it affects time, not results."""
 
 SLOW_NOISE = 0.99
-"""Noise correlation above which a fit has taken misfit for noise. Chosen: a correlation time of a hundred frames."""
+"""Noise correlation above which a fit has absorbed misfit as noise. Chosen: a correlation time of a hundred frames."""
 
-STRICT_ITERATIONS, HOPELESS = 8, 30.0
-"""After so many steps led by the noise of the tracks alone, χ² per degree of freedom above which none will help.
-Chosen for time; a fit given up here is begun from other starts."""
+TRACK_NOISE_ITERATIONS, GIVE_UP_CHI2 = 8, 30.0
+"""Steps at the noise of the tracks, and χ² per degree of freedom after them above which the attempt is given up. Chosen
+for time; a fit given up here is started from other values."""
 
-GUIDING_SPREADS, STRICT_SPREADS = (5e-4, 1e-3), (0.01, 0.03)
-"""Between-trial standard deviations of pressure and ln B while a fit is guided, first nearly none, then those of a
-usual batch of vines (about 1 % of pressure, a few per cent of B). Chosen: they only lead the descent and are estimated
-afterwards."""
+TRACK_CORRELATION_SD, TRACK_NOISE_SD = (5e-4, 1e-3), (0.01, 0.03)
+"""Between-trial standard deviations of pressure and ln B that are fixed while the noise is: nearly zero where only the
+correlation is fixed, those of a typical batch of vines (1 % of pressure, 3 % of B) where the noise is. Chosen: they
+only steer the descent and are estimated afterwards."""
 
 
-def solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | None, *, thorough: bool) -> Solution:
-    """The best of the solutions from the likeliest starts; the first will do where it explains the data.
+def solve_from_scratch(
+    predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
+) -> Solution:
+    """Solve from the likeliest starting values and return the best solution.
+
+    Later starting values are tried only until a fit converges; a poor best solution is repeated at the noise
+    correlation of the tracks.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
-    held : spreads and noise that are not estimated.
+    predictor : simulates the trials of the fit.
+    fixed_terms : variance components that are not estimated.
     watch : callable or None
-        Called with each step.
+        Called with every step.
     thorough : bool
-        Whether a poor solution is begun from other starts.
+        Whether a poor solution is repeated from all starting values.
 
     Returns
     -------
@@ -78,131 +84,147 @@ def solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | No
     Raises
     ------
     FitError
-        If the model cannot be followed from any start.
+        If the model cannot be simulated from any starting values.
     """
     solutions: list[Solution] = []
     reason = ""
     starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
     for _, theta, trial_effects in starts:
         try:
-            most = MOST_ITERATIONS if thorough else ITERATIONS_ONCE_MORE
-            solutions.append(solve_from(predictor, theta, trial_effects, held, most_iterations=most, watch=watch))
+            most_iterations = MOST_ITERATIONS if thorough else CONTINUATION_ITERATIONS
+            solutions.append(
+                solve_from(predictor, theta, trial_effects, fixed_terms, most_iterations=most_iterations, watch=watch)
+            )
         except SimulationError as error:
             reason = str(error)
             continue
         if solutions[-1].converged or not thorough:
             break
     if not solutions:
-        raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
+        raise FitError(
+            f"The model cannot be simulated from any starting values: {reason or 'no trajectory could be simulated'}"
+        )
     best = min(solutions, key=_deviance)
     if not is_poor_fit(predictor, best):
-        return _with_noise_anew(predictor, best, held, watch)
-    guided = [
-        _guided(predictor, theta, trial_effects, held, watch)
+        return _with_noise_refitted(predictor, best, fixed_terms, watch)
+    at_track_correlation = [
+        _solve_at_track_correlation(predictor, theta, trial_effects, fixed_terms, watch)
         for _, theta, trial_effects in (starts if thorough else starts[:1])
     ]
-    return _sane(predictor, best, [solution for solution in guided if solution is not None])
+    return _best_unabsorbed(predictor, best, [solution for solution in at_track_correlation if solution is not None])
 
 
-def _with_noise_anew(predictor: Predictor, best: Solution, held: FixedTerms, watch: Watch | None) -> Solution:
-    """The better of a solution whose noise wanders slowly and of the one led from it by the noise of the tracks.
+def _with_noise_refitted(
+    predictor: Predictor, best: Solution, fixed_terms: FixedTerms, watch: Watch | None
+) -> Solution:
+    """The solution, or a better one found at the noise of the tracks if its noise is slow.
 
-    While numbers are still off by a little, all trials miss by a smooth part of a per cent, which passes for slow noise
-    and lets none of the numbers move on. The likelihood tells: it is far higher where nothing is missed.
+    As long as parameters are slightly wrong, all trials share a smooth misfit of a fraction of a per cent. Taken for
+    slow noise, it stops the parameters from moving on. The likelihood decides: it is far higher where nothing is
+    misfit.
     """
     if best.state.rho < SLOW_NOISE:
         return best
-    other = _strictly(predictor, best.state.theta, best.state.trial_effects, held, watch)
+    other = _solve_at_track_noise(predictor, best.state.theta, best.state.trial_effects, fixed_terms, watch)
     return best if other is None else min((best, other), key=_deviance)
 
 
-def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solution:
-    """The best of solutions of which the first may have taken for slow noise what the others had to fit.
+def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation: list[Solution]) -> Solution:
+    """The best solution at track correlation, preferably one that is not poor; without any, the one at free noise.
 
-    Noise of correlation 1 wanders as it likes, and makes anything likely. So where a solution is lost, likelihood only
-    chooses among those whose noise is as correlated as that of the tracks.
+    A poor solution at free noise may have absorbed its misfit as slow noise, and noise of correlation near 1 makes
+    anything likely. So it never competes by likelihood with those whose noise is as correlated as that of the tracks.
     """
-    sound = [solution for solution in guided if not is_poor_fit(predictor, solution)]
-    return min(sound or guided or [free], key=_deviance)
+    good = [solution for solution in at_track_correlation if not is_poor_fit(predictor, solution)]
+    return min(good or at_track_correlation or [free], key=_deviance)
 
 
-def _guided(
+def _solve_at_track_correlation(
     predictor: Predictor,
     theta: Floats,
     trial_effects: Floats,
-    held: FixedTerms,
+    fixed_terms: FixedTerms,
     watch: Watch | None,
     *,
-    freed: bool = True,
+    then_free: bool = True,
     goal: float = -math.inf,
 ) -> Solution | None:
-    """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
+    """Solve with the noise correlation fixed at that of the tracks, then, with `then_free`, from there with free noise.
 
-    All trials share their B and pressure as good as exactly: what is missed by much more than noise would else bend
-    each trial's own until n means nothing. So it stays where the model turns out to be far off all the same. `goal` is
-    the ln L that it must be able to reach.
+    Between-trial standard deviations are fixed near zero: a misfit far above the noise would otherwise distort the
+    pressure and B of each trial until n is meaningless. If the fit is poor again with free noise, the first solution is
+    returned. The first solve stops as soon as it can no longer reach `goal`, a ln L. None if the caller fixes the
+    noise, or a simulation fails.
     """
-    if held.noise is not None:
+    if fixed_terms.noise is not None:
         return None
-    guide = FixedTerms(spread=held.spread or GUIDING_SPREADS, correlation=track_correlation(predictor.data))
+    correlation_fixed = FixedTerms(
+        spread=fixed_terms.spread or TRACK_CORRELATION_SD, correlation=track_correlation(predictor.data)
+    )
     state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     try:
         first = solve(
             predictor,
             problem,
             state,
-            guide,
+            correlation_fixed,
             warm=True,
-            most_iterations=GUIDED_ITERATIONS,
+            most_iterations=TRACK_CORRELATION_ITERATIONS,
             watch=watch,
-            search=not freed,
-            behind=_behind(goal) if math.isfinite(goal) else None,
+            search=not then_free,
+            shortfall=_shortfall_from(goal) if math.isfinite(goal) else None,
         )
-        if not freed:
+        if not then_free:
             return first
         trial_effects, _ = align(predictor.data, predictor, first.state.theta, initial_trial_effects(predictor.data))
         free = solve_from(
-            predictor, first.state.theta, trial_effects, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+            predictor,
+            first.state.theta,
+            trial_effects,
+            fixed_terms,
+            most_iterations=CONTINUATION_ITERATIONS,
+            watch=watch,
         )
         return first if is_poor_fit(predictor, free) else free
     except SimulationError:
         return None
 
 
-def _behind(goal: float) -> Shortfall:
-    """How far the −2 ln L of a solution, its shared numbers at their best, lies above that of `goal`."""
+def _shortfall_from(goal: float) -> Shortfall:
+    """−2 ln L of a fit, profiled over its shared parameters, minus that of the `goal` (a ln L)."""
 
-    def lacking(cross_products: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
+    def shortfall(cross_products: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
         reached = deviance(marginal(cross_products, problem, state), problem, state, state.spread, restricted=False)
         return reached + 2 * goal
 
-    return lacking
+    return shortfall
 
 
-def _above_hopeless(_: Floats, problem: MixedProblem, __: FitState, now: float) -> float:
-    """By how much −2 ln L has to fall until χ² per point is no longer HOPELESS; its noise is what is missed."""
+def _shortfall_from_giving_up(_: Floats, problem: MixedProblem, __: FitState, penalised_squares: float) -> float:
+    """By how much −2 ln L must fall until χ² per point is GIVE_UP_CHI2, with the noise variance profiled out."""
     points = float(np.sum(problem.points))
-    return points * math.log(max(now, 1e-300) / (HOPELESS * points))
+    return points * math.log(max(penalised_squares, 1e-300) / (GIVE_UP_CHI2 * points))
 
 
-def _strictly(
+def _solve_at_track_noise(
     predictor: Predictor,
     theta: Floats,
     trial_effects: Floats,
-    held: FixedTerms,
+    fixed_terms: FixedTerms,
     watch: Watch | None,
     *,
     search: bool = False,
 ) -> Solution | None:
-    """A solution led by the noise of the tracks, which nothing missed can enlarge, from numbers that are nearly right.
+    """Solve with the noise fixed at that of the tracks, so that misfit cannot enlarge it, then with all terms free.
 
-    Trials whose own pressure or B is far from what was set would else be taken for noise altogether. A `search` gives
-    up what its steps can no longer bring near.
+    For parameters that are nearly right: otherwise trials whose pressure or B is far from the set value would be
+    treated as noise altogether. None if the fit stays poor. A `search` stops as soon as its steps can no longer reach
+    an acceptable χ².
     """
-    if held.noise is not None:
+    if fixed_terms.noise is not None:
         return None
     state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
-    noise = FixedTerms(spread=held.spread or STRICT_SPREADS, noise=(state.rho, state.variance))
+    noise = FixedTerms(spread=fixed_terms.spread or TRACK_NOISE_SD, noise=(state.rho, state.variance))
     try:
         first = solve(
             predictor,
@@ -210,21 +232,27 @@ def _strictly(
             state,
             noise,
             warm=True,
-            most_iterations=STRICT_ITERATIONS,
+            most_iterations=TRACK_NOISE_ITERATIONS,
             watch=watch,
             search=search,
-            behind=_above_hopeless if search else None,
+            shortfall=_shortfall_from_giving_up if search else None,
         )
-        if chi2_per_dof(predictor, first) > HOPELESS:
+        if chi2_per_dof(predictor, first) > GIVE_UP_CHI2:
             return None
         if not first.converged:
             first = solve(
-                predictor, problem, first.state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+                predictor, problem, first.state, noise, warm=True, most_iterations=CONTINUATION_ITERATIONS, watch=watch
             )
         if chi2_per_dof(predictor, first) > POOR_FIT:
             return None
         return solve(
-            predictor, problem, first.state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+            predictor,
+            problem,
+            first.state,
+            fixed_terms,
+            warm=True,
+            most_iterations=CONTINUATION_ITERATIONS,
+            watch=watch,
         )
     except SimulationError:
         return None
@@ -234,28 +262,28 @@ def solve_from(
     predictor: Predictor,
     theta: Floats,
     trial_effects: Floats,
-    held: FixedTerms,
+    fixed_terms: FixedTerms,
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     search: bool = False,
 ) -> Solution:
-    """Solve with the noise and the spreads that are assumed before anything is fitted.
+    """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
+    predictor : simulates the trials of the fit.
     theta : array, shape (n_free,)
-        Numbers to begin from, scaled.
+        Starting values of the parameters, scaled.
     trial_effects : array, shape (n_trials, 4)
-        Trial effects to begin from.
-    held : spreads and noise that are not estimated.
+        Starting values of the trial effects.
+    fixed_terms : variance components that are not estimated.
     most_iterations : int
-        Steps at most.
+        Maximum number of steps.
     watch : callable, optional
-        Called with each step.
+        Called with every step.
     search : bool
-        Whether the fit is one of many, see `solve`.
+        Whether the fit is one of many candidates, see `optimiser.solve`.
 
     Returns
     -------
@@ -263,34 +291,34 @@ def solve_from(
     """
     state = first_state(predictor.data, theta, trial_effects)
     problem = make_problem(predictor, trial_effects)
-    return solve(predictor, problem, state, held, most_iterations=most_iterations, watch=watch, search=search)
+    return solve(predictor, problem, state, fixed_terms, most_iterations=most_iterations, watch=watch, search=search)
 
 
 def solve_onward(
     predictor: Predictor,
     before: Solution,
     theta: Floats,
-    held: FixedTerms,
+    fixed_terms: FixedTerms,
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     search: bool = False,
 ) -> Solution:
-    """Solve from other numbers with the trial effects, spreads and noise of a solution.
+    """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution.
 
     Parameters
     ----------
-    predictor : of the same trials.
-    before : the solution, of the same model or of another.
+    predictor : simulates the same trials.
+    before : the previous solution, of the same model or of another.
     theta : array, shape (n_free,)
-        Numbers to begin from, scaled.
-    held : spreads and noise that are not estimated.
+        Starting values of the parameters, scaled.
+    fixed_terms : variance components that are not estimated.
     most_iterations : int
-        Steps at most.
+        Maximum number of steps.
     watch : callable, optional
-        Called with each step.
+        Called with every step.
     search : bool
-        Whether the fit is one of many, see `solve`.
+        Whether the fit is one of many candidates, see `optimiser.solve`.
 
     Returns
     -------
@@ -299,39 +327,39 @@ def solve_onward(
     Raises
     ------
     SimulationError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
     )
-    state = start_at_held_noise(predictor, problem, replace(before.state, theta=theta), held, search=search)
+    state = start_at_fixed_noise(predictor, problem, replace(before.state, theta=theta), fixed_terms, search=search)
     return solve(
-        predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch, search=search
+        predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations, watch=watch, search=search
     )
 
 
 def solve_again(
     predictor: Predictor,
     solution: Solution,
-    held: FixedTerms,
+    fixed_terms: FixedTerms,
     watch: Watch | None,
     *,
     thorough: bool,
     goal: float = -math.inf,
 ) -> Solution:
-    """A solution, or, where it is lost, the one led from its numbers by what is missed.
+    """The solution, or, if it is poor, one found from its parameters with the noise of the tracks.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
+    predictor : simulates the trials of the fit.
     solution : where the iterations ended.
-    held : spreads and noise that are not estimated.
+    fixed_terms : variance components that are not estimated.
     watch : callable or None
-        Called with each step.
+        Called with every step.
     thorough : bool
-        Whether a guided solution is freed again.
+        Whether a fit at the noise correlation of the tracks is continued with free noise.
     goal : float
-        ln L that a guided solution must be able to reach, or it ends early.
+        ln L; a fit at track correlation ends as soon as it can no longer reach it.
 
     Returns
     -------
@@ -344,11 +372,13 @@ def solve_again(
         trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    strict = _strictly(predictor, theta, trial_effects, held, watch, search=not thorough)
-    if strict is not None and not is_poor_fit(predictor, strict):
-        return strict
-    guided = _guided(predictor, theta, trial_effects, held, watch, freed=thorough, goal=goal)
-    return solution if guided is None else _sane(predictor, solution, [guided])
+    at_track_noise = _solve_at_track_noise(predictor, theta, trial_effects, fixed_terms, watch, search=not thorough)
+    if at_track_noise is not None and not is_poor_fit(predictor, at_track_noise):
+        return at_track_noise
+    at_track_correlation = _solve_at_track_correlation(
+        predictor, theta, trial_effects, fixed_terms, watch, then_free=thorough, goal=goal
+    )
+    return solution if at_track_correlation is None else _best_unabsorbed(predictor, solution, [at_track_correlation])
 
 
 def _deviance(solution: Solution) -> float:
@@ -356,32 +386,36 @@ def _deviance(solution: Solution) -> float:
     return deviance(part, solution.problem, solution.state, solution.state.spread)
 
 
-def start_at_held_noise(
-    predictor: Predictor, problem: MixedProblem, state: FitState, held: FixedTerms, *, search: bool = False
+def start_at_fixed_noise(
+    predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool = False
 ) -> FitState:
-    """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.
+    """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed.
 
-    With the noise to be found as well, all that a bad start misses would pass for noise, and hold the fit there.
+    With free noise, the misfit of bad starting values would be absorbed as noise and stall the optimiser.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
-    problem : what does not change during the fit.
-    state : where a warm start would begin.
-    held : spreads and noise that are not estimated.
+    predictor : simulates the trials of the fit.
+    problem : the constant part of the fit.
+    state : the proposed starting values.
+    fixed_terms : variance components that are not estimated.
     search : bool
-        Whether the fit is one of many, see `solve`.
+        Whether the fit is one of many candidates, see `optimiser.solve`.
 
     Returns
     -------
     FitState
     """
-    if held.noise is not None or cost(predictor, problem, state) < BAD_START * float(np.sum(problem.points)):
+    if fixed_terms.noise is not None or cost(predictor, problem, state) < BAD_START_CHI2 * float(
+        np.sum(problem.points)
+    ):
         return state
-    # What was taken for a late release may be what the new effect holds back: every trial begins where it fits best.
+    # An apparently late release may be the action of the new effect: each trial starts at the release that fits best.
     aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
-    ways = [state, replace(state, trial_effects=aligned)]
-    best = np.argmin([trial_costs(predictor, problem, way) for way in ways], axis=0)
-    state = replace(state, trial_effects=np.array([ways[way].trial_effects[i] for i, way in enumerate(best)]))
-    noise = FixedTerms(held.spread or state.spread, (state.rho, state.variance))
-    return solve(predictor, problem, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS, search=search).state
+    options = [state, replace(state, trial_effects=aligned)]
+    best = np.argmin([trial_costs(predictor, problem, option) for option in options], axis=0)
+    state = replace(state, trial_effects=np.array([options[option].trial_effects[i] for i, option in enumerate(best)]))
+    noise = FixedTerms(fixed_terms.spread or state.spread, (state.rho, state.variance))
+    return solve(
+        predictor, problem, state, noise, warm=True, most_iterations=TRACK_CORRELATION_ITERATIONS, search=search
+    ).state

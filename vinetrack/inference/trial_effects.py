@@ -71,11 +71,14 @@ def optimise_trial_effects(
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     cross_products = predictor.products(columns)
-    steps = [trial_effect_step(cross_products, problem, state, pinned=pinned) for pinned in (False, True)]
+    steps = [
+        trial_effect_step(cross_products, problem, state, fixed_release=fixed_release)
+        for fixed_release in (False, True)
+    ]
     here = trial_costs(predictor, problem, state, residuals_in(columns))
     if float(np.sum(here - _promised(cross_products, problem, state, steps[0]))) >= most:
         return state, here
-    moved = [limited(predictor, state.trial_effects, step) for step in steps]
+    moved = [limited_step(predictor, state.trial_effects, step) for step in steps]
     ways = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved)]
     there = zip(ways[1:], predictor.residuals_of_each(state.theta, moved), strict=True)
     costs = np.array([here, *(trial_costs(predictor, problem, way, left_m) for way, left_m in there)])
@@ -91,7 +94,7 @@ def _promised(cross_products: Floats, problem: MixedProblem, state: FitState, st
     return np.asarray(np.sum(step * (told - precision * (state.trial_effects - centre)), axis=1))
 
 
-def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
+def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
     """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3.
 
     Parameters
@@ -210,7 +213,7 @@ class ReleaseSearch:
         self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
         self.numbers = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
-    def look(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
+    def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with likelier releases; None if none is.
 
         Trials into which the pressure was let while it was recorded are left alone, since the trace tells when, and

@@ -1,6 +1,6 @@
-"""Compiled loops over trials behind the likelihoods of spreads and noise, which a fit asks for some thousand times.
+"""Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some thousand times.
 
-Each trial takes a handful of columns, so that most of the time of array operations goes into calling them.
+Each trial has only a handful of columns, so that with array operations most of the time would go into calling them.
 """
 
 from __future__ import annotations
@@ -14,141 +14,142 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 
 RIDGE = 1e-13
-"""Added to systems of unit diagonal before they are solved. Derived: a few hundred roundings of a double."""
+"""Added to the diagonal of systems with a unit diagonal before they are solved. Derived: a few hundred roundings of a
+double."""
 
-WELL_KNOWN = 1e-9
-"""Part of its information that every number keeps once those before it are known, where a system is solved by its
-factors; one of a smaller pivot is left to least squares, which drops what is singular. Derived: a step is then good to
-1e-7, and the decrease by it, of second order, to 1e-14."""
+LEAST_PIVOT = 1e-9
+"""Least pivot of a factorised system of unit diagonal, the part of its information that a parameter keeps once the
+previous ones are eliminated; below it the system is left to least squares, which drop what is singular. Derived: a step
+is then good to 1e-7, and the decrease by it, of second order, to 1e-14."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def decrease_within_bounds(
-    square: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
+    matrix: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
 ) -> tuple[bool, float, float]:
-    """Decrease by the step to the minimum of a quadratic form within bounds, as `mixed_effects.bounded_solve` takes it.
+    """Decrease of a quadratic form by the step to its minimum within bounds, found as in `mixed_effects.bounded_solve`.
 
     Parameters
     ----------
-    square : array, shape (n, n)
+    matrix : array, shape (n, n)
         Information.
     slope : array, shape (n,)
     below, above : arrays, shape (n,)
-        Room to the bounds.
+        Distances to the bounds.
     free : array of bool, shape (n,)
-        Numbers that may move.
+        Parameters that are estimated.
 
     Returns
     -------
     solved : bool
-        Whether every pivot is of weight; else the other two say nothing.
+        Whether every pivot is large enough; if not, the other two values are meaningless.
     decrease : float
     log_det : float
-        Of the information among the numbers that no bound holds.
+        Of the information of the parameters that are not at a bound.
     """
     size = len(slope)
     moving, step = np.empty(size, np.bool_), np.zeros(size)
     for u in range(size):
-        moving[u] = free[u] and square[u, u] > 0
-    among, scale = np.empty(size, np.int64), np.empty(size)
-    log_det, bounded = 0.0, True
-    while bounded:
+        moving[u] = free[u] and matrix[u, u] > 0
+    places, scale = np.empty(size, np.int64), np.empty(size)
+    log_det, bound_met = 0.0, True
+    while bound_met:
         count = 0
         for u in range(size):
             if moving[u]:
-                among[count] = u
-                scale[count] = 1 / math.sqrt(square[u, u])
+                places[count] = u
+                scale[count] = 1 / math.sqrt(matrix[u, u])
                 count += 1
-        even, lower, way = np.empty((count, count)), np.empty((count, count)), np.empty(count)
-        log_det, first = 0.0, np.inf
+        scaled, lower, remaining = np.empty((count, count)), np.empty((count, count)), np.empty(count)
+        log_det, fraction_to_bound = 0.0, np.inf
         for i in range(count):
-            u = among[i]
+            u = places[i]
             for j in range(i + 1):
-                even[i, j] = scale[i] * square[u, among[j]] * scale[j]
-            left = slope[u]
+                scaled[i, j] = scale[i] * matrix[u, places[j]] * scale[j]
+            remaining_slope = slope[u]
             for v in range(size):
                 if not moving[v]:
-                    left -= square[u, v] * step[v]
-            way[i] = scale[i] * left
-        _factor(even, 0.0, lower)
+                    remaining_slope -= matrix[u, v] * step[v]
+            remaining[i] = scale[i] * remaining_slope
+        _factor(scaled, 0.0, lower)
         for i in range(count):
-            if not lower[i, i] > WELL_KNOWN:
+            if not lower[i, i] > LEAST_PIVOT:
                 return False, 0.0, 0.0
             log_det += math.log(lower[i, i]) - 2 * math.log(scale[i])
-        _solve(lower, way)
+        _solve(lower, remaining)
         for i in range(count):
-            u = among[i]
-            way[i] = scale[i] * way[i] - step[u]
-            room = above[u] - step[u] if way[i] > 0 else -below[u] - step[u]
-            if way[i] != 0:
-                first = min(first, max(room / way[i], 0.0))
-        bounded = first < 1
+            u = places[i]
+            remaining[i] = scale[i] * remaining[i] - step[u]
+            room = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
+            if remaining[i] != 0:
+                fraction_to_bound = min(fraction_to_bound, max(room / remaining[i], 0.0))
+        bound_met = fraction_to_bound < 1
         for i in range(count):
-            u = among[i]
-            room = above[u] - step[u] if way[i] > 0 else -below[u] - step[u]
-            if bounded and way[i] != 0 and max(room / way[i], 0.0) <= first:
+            u = places[i]
+            room = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
+            if bound_met and remaining[i] != 0 and max(room / remaining[i], 0.0) <= fraction_to_bound:
                 moving[u] = False
-            step[u] += min(first, 1.0) * way[i]
+            step[u] += min(fraction_to_bound, 1.0) * remaining[i]
     decrease = 0.0
     for u in range(size):
         along = 0.0
         for v in range(size):
-            along += square[u, v] * step[v]
+            along += matrix[u, v] * step[v]
         decrease += step[u] * (2 * slope[u] - along)
     return True, decrease, log_det
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sums_without_deviations(
-    blocks: Floats, places: NDArray[np.int_], roots: Floats, size: int
+def normal_equations_without_deviations(
+    blocks: Floats, places: NDArray[np.int_], deviation_sd: Floats, size: int
 ) -> tuple[Floats, Floats, float, float]:
-    """What all trials say of the free numbers once the two deviations of each are integrated out.
+    """Normal equations of the free parameters with the two deviations of each trial integrated out, summed over trials.
 
     Parameters
     ----------
     blocks : array, shape (n_trials, 2 + n_keys + 1, 2 + n_keys + 1)
-        Products of deviations, keys, residual.
+        Cross products of deviations, keys, residual.
     places : array of int, shape (n_trials, n_keys)
-        Of the keys among the free numbers; `size` for one that a trial does not feel.
-    roots : array, shape (n_trials, 2)
-        Standard deviations of pressure and ln B, 0 where a trial does not feel one.
+        Free parameter of each key; `size` for one that a trial does not depend on.
+    deviation_sd : array, shape (n_trials, 2)
+        Standard deviations of pressure and ln B, 0 where a trial has no such deviation.
     size : int
-        Number of free numbers.
+        Number of free parameters.
 
     Returns
     -------
     information : array, shape (size, size)
     slope : array, shape (size,)
     square : float
-        Sum of squares that is left of the residuals.
+        Residual sum of squares.
     log_det : float
-        Of I + S Z S of all trials, S the standard deviations and Z the products of deviations.
+        Sum over trials of ln det(I + S Z S), S the standard deviations and Z the cross products of deviations.
     """
     last = blocks.shape[1] - 1
     information, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     square, log_det = 0.0, 0.0
     of_pressure, of_damping = np.empty(last + 1), np.empty(last + 1)
     for i in range(len(blocks)):
-        block, of = blocks[i], places[i]
-        s, t = roots[i, 0], roots[i, 1]
-        # One after the other, by the Cholesky factor of I + S Z S: the two are nearly the same where speed is steady,
-        # and its inverse, written out, takes from the squares of precise positions more than is left of them.
-        first = 1.0 + s * s * block[0, 0]
+        block, places_of_trial = blocks[i], places[i]
+        sd_pressure, sd_damping = deviation_sd[i, 0], deviation_sd[i, 1]
+        # Eliminated one after the other, by the Cholesky factor of I + S Z S. At steady speed its two columns are
+        # nearly collinear, and the explicit inverse would lose the residual of precise positions to cancellation.
+        pivot_pressure = 1.0 + sd_pressure * sd_pressure * block[0, 0]
         for u in range(1, last + 1):
-            of_pressure[u] = s * block[0, u] / math.sqrt(first)
-        second = 1.0 + t * t * (block[1, 1] - of_pressure[1] * of_pressure[1])
+            of_pressure[u] = sd_pressure * block[0, u] / math.sqrt(pivot_pressure)
+        pivot_damping = 1.0 + sd_damping * sd_damping * (block[1, 1] - of_pressure[1] * of_pressure[1])
         for u in range(2, last + 1):
-            of_damping[u] = t * (block[1, u] - of_pressure[1] * of_pressure[u]) / math.sqrt(second)
-        log_det += math.log(first) + math.log(second)
+            of_damping[u] = sd_damping * (block[1, u] - of_pressure[1] * of_pressure[u]) / math.sqrt(pivot_damping)
+        log_det += math.log(pivot_pressure) + math.log(pivot_damping)
         for u in range(2, last + 1):
             for v in range(2, u + 1):
                 left = block[u, v] - of_pressure[u] * of_pressure[v] - of_damping[u] * of_damping[v]
                 if u < last:
-                    information[of[u - 2], of[v - 2]] += left
+                    information[places_of_trial[u - 2], places_of_trial[v - 2]] += left
                     if v < u:
-                        information[of[v - 2], of[u - 2]] += left
+                        information[places_of_trial[v - 2], places_of_trial[u - 2]] += left
                 elif v < last:
-                    slope[of[v - 2]] += left
+                    slope[places_of_trial[v - 2]] += left
                 else:
                     square += left
     return information[:size, :size].copy(), slope[:size].copy(), square, log_det
@@ -156,79 +157,85 @@ def sums_without_deviations(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def noise_at_correlations(
-    cross_products: Floats, stiff: Floats, pull_back: Floats, points: Floats, rhos: Floats, shared: float, least: float
+    cross_products: Floats,
+    prior_precision: Floats,
+    prior_gradient: Floats,
+    points: Floats,
+    rhos: Floats,
+    shared: float,
+    least: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """What every trial leaves at each correlation of the noise once its own numbers are fitted.
+    """Restricted likelihood and residual sums of squares of all trials at each noise correlation, trial effects fitted.
 
     Parameters
     ----------
     cross_products : array, shape (n_trials, 3, m + 1, m + 1)
-        Products of the trial's own numbers and the residual, see `whitening`.
-    stiff, pull_back : arrays, shape (n_trials, m)
-        Precision of the own numbers, and that times how far they are from their centre, in units of the noise.
+        Of the trial effects and the residual, see `whitening`.
+    prior_precision, prior_gradient : arrays, shape (n_trials, m)
+        Precision of the trial effects, and that times their distance from the prior mean, in units of the noise.
     points : array, shape (n_trials,)
     rhos : array, shape (n_rhos,)
     shared : float
-        Degrees of freedom that the shared numbers take of each trial.
+        Degrees of freedom that the shared parameters take from each trial.
     least : float
-        Least part of the sum of squares that is left.
+        Least part of the sum of squares that remains as residual.
 
     Returns
     -------
     scores : array, shape (n_rhos,)
-        −2 ln of the restricted likelihood, variances at their best, without what gaps add.
+        −2 ln of the restricted likelihood, profiled over the variances, without the term of the gaps.
     squares, degrees : arrays, shape (n_rhos, n_trials)
-        Sums of squares left and their degrees of freedom.
+        Residual sums of squares and their degrees of freedom.
     """
-    trials, m = stiff.shape
+    trials, m = prior_precision.shape
     scores = np.zeros(len(rhos))
     squares, degrees = np.empty((len(rhos), trials)), np.empty((len(rhos), trials))
-    white, even, lower = np.empty((m + 1, m + 1)), np.empty((m, m)), np.empty((m, m))
-    scale, way = np.empty(m), np.empty(m)
+    white, scaled, lower = np.empty((m + 1, m + 1)), np.empty((m, m)), np.empty((m, m))
+    scale, solution = np.empty(m), np.empty(m)
     for k in range(len(rhos)):
         rho = rhos[k]
         for i in range(trials):
-            plain, mixed, shifted = cross_products[i, 0], cross_products[i, 1], cross_products[i, 2]
+            lag_zero, lag_one, inner = cross_products[i, 0], cross_products[i, 1], cross_products[i, 2]
             for u in range(m + 1):
                 for v in range(m + 1):
-                    white[u, v] = plain[u, v] - rho * mixed[u, v] + rho * rho * shifted[u, v]
+                    white[u, v] = lag_zero[u, v] - rho * lag_one[u, v] + rho * rho * inner[u, v]
             log_det = 0.0
             for u in range(m):
-                scale[u] = 1 / math.sqrt(white[u, u] + stiff[i, u])
+                scale[u] = 1 / math.sqrt(white[u, u] + prior_precision[i, u])
                 log_det -= 2 * math.log(scale[u])
             for u in range(m):
                 for v in range(m):
-                    even[u, v] = scale[u] * white[u, v] * scale[v]
-                even[u, u] += scale[u] * stiff[i, u] * scale[u]
-            _factor(even, 0.0, lower)
+                    scaled[u, v] = scale[u] * white[u, v] * scale[v]
+                scaled[u, u] += scale[u] * prior_precision[i, u] * scale[u]
+            _factor(scaled, 0.0, lower)
             for u in range(m):
                 log_det += math.log(abs(lower[u, u]))
-            _factor(even, RIDGE, lower)
-            taken, gain = shared, 0.0
+            _factor(scaled, RIDGE, lower)
+            dof_taken, explained = shared, 0.0
             for v in range(m):
                 for u in range(m):
-                    way[u] = scale[u] * white[u, v] * scale[v]
-                _solve(lower, way)
-                taken += way[v]
+                    solution[u] = scale[u] * white[u, v] * scale[v]
+                _solve(lower, solution)
+                dof_taken += solution[v]
             for u in range(m):
-                way[u] = scale[u] * (white[u, m] - pull_back[i, u])
-            _solve(lower, way)
+                solution[u] = scale[u] * (white[u, m] - prior_gradient[i, u])
+            _solve(lower, solution)
             for u in range(m):
-                gain += scale[u] * (white[u, m] - pull_back[i, u]) * way[u]
-            dof = max(points[i] - taken, 1.0)
-            square = max(white[m, m] - gain, least * white[m, m])
-            scores[k] += dof * math.log(square / dof) + log_det
-            squares[k, i], degrees[k, i] = square, dof
+                explained += scale[u] * (white[u, m] - prior_gradient[i, u]) * solution[u]
+            dof = max(points[i] - dof_taken, 1.0)
+            residual_square = max(white[m, m] - explained, least * white[m, m])
+            scores[k] += dof * math.log(residual_square / dof) + log_det
+            squares[k, i], degrees[k, i] = residual_square, dof
     return scores, squares, degrees
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _factor(square: Floats, ridge: float, lower: Floats) -> None:
-    """L and D of a symmetric matrix L D Lᵀ, D on the diagonal of `lower`; `ridge` is added to its diagonal."""
-    size = len(square)
+def _factor(matrix: Floats, ridge: float, lower: Floats) -> None:
+    """LDLᵀ factorisation of a symmetric matrix with `ridge` added to its diagonal; D is the diagonal of `lower`."""
+    size = len(matrix)
     for u in range(size):
         for v in range(u + 1):
-            left = square[u, v] + (ridge if u == v else 0.0)
+            left = matrix[u, v] + (ridge if u == v else 0.0)
             for w in range(v):
                 left -= lower[u, w] * lower[v, w] * lower[w, w]
             lower[u, v] = left if u == v else left / lower[v, v]

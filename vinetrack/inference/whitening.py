@@ -1,15 +1,15 @@
-"""Sums of products of a trial's columns under AR(1) noise, as a polynomial of its correlation.
+"""Cross products of a trial's columns under AR(1) noise, as a polynomial of the noise correlation; and whitening.
 
 With noise e_k = ρ e_{k−1} + s ε_k, the columns c_k enter every quantity of a fit through
 
     Σ (c_k − ρ c_{k−1})(c_k − ρ c_{k−1})ᵀ + (1 − ρ²) Σ_first c cᵀ = G₀ − ρ G₁ + ρ² G₂
 
-so three small matrices a trial stand for all its points, whatever ρ turns out to be. `first` are the points that begin
-a stretch without gaps; the noise of stretches is independent. Where noise varies from point to point, columns are
-divided by each point's relative standard deviation first: what is left is AR(1) of one variance.
+so three small matrices per trial replace all its points, for any ρ. `first` marks the points that begin a stretch
+without gaps; the noise of different stretches is independent. Where the noise varies from point to point, columns are
+first divided by the relative standard deviation of each point, which leaves AR(1) noise of constant variance.
 
-A step far off may take a trajectory beyond what numbers hold. Its sums are then infinite, or no numbers, and the step
-is refused: nothing is said of it.
+A long step of a fit may give a trajectory that overflows. Its cross products are then infinite or NaN and the step is
+rejected, so no warning is raised.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from vinetrack.core.records import Floats
 
 @np.errstate(over="ignore", invalid="ignore")
 def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | None = None) -> Floats:
-    """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k).
-
-    `relative_sd`, shape (n_points,), is the noise of every point relative to that of the trial, see `FitTrial`.
+    """G₀, G₁, G₂ of one trial.
 
     Parameters
     ----------
@@ -34,7 +32,7 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     first : array of bool, shape (n_points,)
         Points that begin a stretch.
     relative_sd : array, shape (n_points,), optional
-        Noise of every point relative to that of the trial, see `FitTrial`.
+        Noise of each point relative to that of the trial, see `FitTrial`.
 
     Returns
     -------
@@ -43,17 +41,21 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
     if np.count_nonzero(first) == 1:
-        now, before = columns[1:], columns[:-1]
-        begin, end = columns[:1], columns[-1:]
+        later, earlier = columns[1:], columns[:-1]
+        firsts, lasts = columns[:1], columns[-1:]
     else:
-        follows = np.flatnonzero(~first)
-        now, before = columns[follows], columns[follows - 1]
-        begin, end = columns[first], columns[np.append(first[1:], True)]
-    whole, cross = columns.T @ columns, now.T @ before
-    sums = np.empty((3, *whole.shape))
-    # What has a follower is all but the last point of each stretch.
-    sums[0], sums[1], sums[2] = whole, cross + cross.T, whole - end.T @ end - begin.T @ begin
-    return sums
+        with_predecessor = np.flatnonzero(~first)
+        later, earlier = columns[with_predecessor], columns[with_predecessor - 1]
+        firsts, lasts = columns[first], columns[np.append(first[1:], True)]
+    all_points, lag_one = columns.T @ columns, later.T @ earlier
+    matrices = np.empty((3, *all_points.shape))
+    # The points with a successor are all but the last of each stretch.
+    matrices[0], matrices[1], matrices[2] = (
+        all_points,
+        lag_one + lag_one.T,
+        all_points - lasts.T @ lasts - firsts.T @ firsts,
+    )
+    return matrices
 
 
 def all_products(
@@ -61,7 +63,7 @@ def all_products(
     first: Sequence[NDArray[np.bool_]],
     relative_sd: Sequence[Floats | None] | None = None,
 ) -> Floats:
-    """`products` of every trial, shape (n_trials, 3, k, k).
+    """`products` of every trial.
 
     Parameters
     ----------
@@ -79,7 +81,7 @@ def all_products(
 
 @np.errstate(over="ignore", invalid="ignore")
 def at_correlation(cross_products: Floats, rho: float) -> Floats:
-    """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1.
+    """Whitened cross products at a given correlation, for innovations of variance 1.
 
     Parameters
     ----------
@@ -96,9 +98,7 @@ def at_correlation(cross_products: Floats, rho: float) -> Floats:
 
 
 def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: Floats | None = None) -> Floats:
-    """Residuals freed of their correlation, same variance at the first point of a stretch as at the others.
-
-    They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` and `relative_sd` (n_points,).
+    """Whiten residuals or columns under AR(1) noise; the first point of a stretch has the same variance as others.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: 
     rho : float
         Lag-one correlation.
     relative_sd : array, shape (n_points,), optional
-        Noise of every point relative to that of the trial.
+        Noise of each point relative to that of the trial.
 
     Returns
     -------
@@ -118,8 +118,8 @@ def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: 
     if relative_sd is not None:
         residual = residual / (relative_sd if residual.ndim == 1 else relative_sd[:, None])
     white = residual.copy()
-    along, before = (np.swapaxes(values, 0, 1) if values.ndim == 3 else values for values in (white, residual))
-    follows = np.flatnonzero(~first)
-    along[follows] -= rho * before[follows - 1]
-    along[first] *= np.sqrt(1 - rho**2)
+    rows, earlier = (np.swapaxes(values, 0, 1) if values.ndim == 3 else values for values in (white, residual))
+    with_predecessor = np.flatnonzero(~first)
+    rows[with_predecessor] -= rho * earlier[with_predecessor - 1]
+    rows[first] *= np.sqrt(1 - rho**2)
     return white
