@@ -202,10 +202,10 @@ def test_a_fit_ends_where_the_steps_that_are_left_cannot_bring_it_far_enough(onl
     theta = solution.state.theta.copy()
     theta[0] += 0.3
     start = replace(solution.state, theta=theta)
-    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, behind=lambda *_: 0.0)
+    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, shortfall=lambda *_: 0.0)
     assert led.converged
     assert log_likelihood(led) == pytest.approx(log_likelihood(solution), abs=0.5)
-    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, behind=lambda *_: math.inf)
+    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, shortfall=lambda *_: math.inf)
     assert not given_up.converged
     assert given_up.iterations < led.iterations
 
