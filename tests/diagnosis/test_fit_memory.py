@@ -15,7 +15,7 @@ from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import relative_residual
+from vinetrack.inference.goodness_of_fit import relative_residual
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import FitError, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import POOR_FIT, is_poor_fit
+from vinetrack.inference.goodness_of_fit import POOR_FIT, is_poor_fit
 
 Report = Callable[[str], None]
 """Called with a few words on what is being done."""

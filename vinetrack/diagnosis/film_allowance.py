@@ -11,8 +11,9 @@ from __future__ import annotations
 from vinetrack.diagnosis.between_gain import with_errors
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
-from vinetrack.inference.optimiser import Solution, is_poor_fit
+from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.systematics import film_errors
 

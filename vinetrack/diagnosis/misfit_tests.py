@@ -26,7 +26,7 @@ from vinetrack.diagnosis.trial_effect_tests import between_conditions_p, noise_i
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import track_correlation
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import is_poor_fit, relative_residual
+from vinetrack.inference.goodness_of_fit import is_poor_fit, relative_residual
 from vinetrack.inference.systematics import systematics_of
 
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4

@@ -22,8 +22,9 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.marginal_likelihood import deviance, marginal
-from vinetrack.inference.optimiser import STAGNATION_DECREASE, FixedTerms, is_poor_fit, solve
+from vinetrack.inference.optimiser import STAGNATION_DECREASE, FixedTerms, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.inference.solving import SLOW_NOISE

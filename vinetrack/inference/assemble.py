@@ -15,10 +15,11 @@ from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model, values_by_key
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
+from vinetrack.inference.goodness_of_fit import chi2_per_dof
 from vinetrack.inference.intervals import Precision, first_parameters, near_bound, precision, profile_interval, student
 from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, marginal
 from vinetrack.inference.mixed_effects import trial_effect_prior
-from vinetrack.inference.optimiser import Solution, chi2_per_dof
+from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors

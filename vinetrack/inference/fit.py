@@ -26,8 +26,9 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.goodness_of_fit import POOR_FIT
 from vinetrack.inference.left_out import predict_trials, prepared_pairs
-from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch
 from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.prepared_trials import prepare

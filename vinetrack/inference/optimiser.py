@@ -15,7 +15,8 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_problem import estimable, track_correlation, variance_floor
+from vinetrack.inference.fit_problem import estimable, variance_floor
+from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.marginal_likelihood import estimate_between_trial_sd, estimate_noise, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
@@ -26,7 +27,6 @@ from vinetrack.inference.trial_effects import (
     residuals_in,
     trial_costs,
 )
-from vinetrack.inference.whitening import at_correlation
 
 MOST_ITERATIONS = 60
 """Maximum number of steps. Chosen as a safeguard against very slow convergence; a fit that reaches it reports that it
@@ -61,15 +61,6 @@ STAGNATION_DECREASE = 2e-3
 """Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped. Derived: for n
 points with noise s, −2 ln L is n ln s², so the residual then changes by less than a thousandth; the ranking among poor
 fits does not matter. At half and at twice, it stops a step or two later or earlier."""
-
-POOR_RELATIVE_RESIDUAL = 3e-3
-"""Residual of the median trial, relative to its growth, above which a fit is poor. Chosen: several times the slowly
-varying error of a tracker; it decides whether further starts are tried, so half costs time and twice may keep a local
-minimum."""
-
-POOR_FIT = 3.0
-"""χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried. Chosen: half would
-try further starts for most fits (time), twice would keep local minima."""
 
 STEP_FRACTIONS, MOST_DAMPING_INCREASES = (1.0, 0.4, 0.15), 11
 """Fractions of a step that a line search tries, and how many times the damping is then increased. Chosen: a line search
@@ -303,67 +294,6 @@ def _step_report(predictor: Predictor, state: FitState, iteration: int, predicte
     return Step(
         iteration, dict(zip([number.name for number in predictor.layout.free], values, strict=True)), predicted_decrease
     )
-
-
-def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone.
-
-    Noise below the accuracy of the integrator is replaced by that accuracy, see `fit_problem.variance_floor`.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    float
-    """
-    data = predictor.data
-    rho = track_correlation(data)
-    noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), variance_floor(data))
-    left = at_correlation(solution.cross_products, rho)[:, -1, -1]
-    accepted = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.has_deviation.any(axis=1)
-    return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - accepted, 1.0)))
-
-
-def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
-    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth.
-
-    Both are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths.
-    That is far above its noise, but no reason to try other starts.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    bool
-    """
-    return bool(
-        chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > POOR_RELATIVE_RESIDUAL
-    )
-
-
-def relative_residual(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square residual of the median trial, relative to its observed growth.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    float
-    """
-    parts = [
-        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
-        for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
-    ]
-    return float(np.median(parts))
 
 
 def _update_variances(

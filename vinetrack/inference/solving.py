@@ -16,20 +16,10 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
+from vinetrack.inference.goodness_of_fit import POOR_FIT, chi2_per_dof, is_poor_fit
 from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem
-from vinetrack.inference.optimiser import (
-    MOST_ITERATIONS,
-    POOR_FIT,
-    FixedTerms,
-    Shortfall,
-    Solution,
-    Watch,
-    chi2_per_dof,
-    cost,
-    is_poor_fit,
-    solve,
-)
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Shortfall, Solution, Watch, cost, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs

@@ -19,6 +19,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.mixed_effects import (
     bounded_solve,
     solve_per_trial,
@@ -26,7 +27,7 @@ from vinetrack.inference.mixed_effects import (
     sum_vector_blocks,
     trial_effects_eliminated,
 )
-from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, is_poor_fit
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures
