@@ -177,7 +177,7 @@ def test_what_replicates_without_noise_do_alike_is_simulated_once(
     six: MisfitTests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     predictor, state = six.fit.predictor, six.fit.solution.state
-    assert predictor.twins.tolist() == [0, 0, 2, 2, 4, 4]
+    assert predictor.identical_trials.tolist() == [0, 0, 2, 2, 4, 4]
     counted: list[int] = []
     laid_out = sensitivity.lay_out
     monkeypatch.setattr(

@@ -73,7 +73,7 @@ def test_nor_does_it_matter_where_they_begin_with_a_gauge_on_the_chamber(
     begin = replace(solution.state, trial_effects=away)
     elsewhere = solve(predictor, solution.problem, begin, FixedTerms(), warm=True)
     # Each trial stays where another release would lower its −2 ln L by less than WORTH_MOVING.
-    within = 0.5 * trial_effects.WORTH_MOVING * len(predictor.data)
+    within = 0.5 * trial_effects.LEAST_DECREASE * len(predictor.data)
     assert log_likelihood(elsewhere) == pytest.approx(log_likelihood(solution), abs=within)
 
 
@@ -109,10 +109,10 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
     def cost(_predictor: object, _problem: object, state: FitState, *_: object) -> np.ndarray:
         return np.full(len(there), missed[0] if state is elsewhere else 0.0)
 
-    monkeypatch.setattr(trial_effects, "_levels", level)
+    monkeypatch.setattr(trial_effects, "_trial_deviances", level)
     monkeypatch.setattr(trial_effects, "trial_costs", cost)
     monkeypatch.setattr(trial_effects, "optimise_trial_effects", lambda *given: (given[-1], None))
-    monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_: elsewhere)
+    monkeypatch.setattr(trial_effects.ReleaseSearch, "_by_linear_model", lambda *_: elsewhere)
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
 
     def looked(missed_there: float) -> object:
@@ -135,10 +135,10 @@ def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_t
     there = solution.state.trial_effects.copy()
     there[:, 0] -= 0.004
     elsewhere = replace(solution.state, trial_effects=there)
-    monkeypatch.setattr(trial_effects.ReleaseSearch, "_borne_out", lambda *given: given[-1])
+    monkeypatch.setattr(trial_effects.ReleaseSearch, "_confirmed", lambda *given: given[-1])
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
     for begins, likelier in ((solution.state, elsewhere), (elsewhere, None), (solution.state, None)):
-        monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_, at=likelier: at)
+        monkeypatch.setattr(trial_effects.ReleaseSearch, "_by_linear_model", lambda *_, at=likelier: at)
         search.likelier(begins, residuals)
     assert search.returned.all()
 
@@ -191,7 +191,7 @@ def test_where_releases_are_looked_for_the_other_trials_stay(only_in_motion: Fit
     tried = off.copy()
     tried[[2, 5]] = solution.state.trial_effects[[2, 5]]
     search = trial_effects.ReleaseSearch(predictor, solution.problem)
-    kept = search._borne_out(state, replace(state, trial_effects=tried)).trial_effects
+    kept = search._confirmed(state, replace(state, trial_effects=tried)).trial_effects
     others = np.delete(np.arange(len(off)), [2, 5])
     assert np.array_equal(kept[others], off[others])
     assert np.allclose(kept[[2, 5], 0], solution.state.trial_effects[[2, 5], 0], atol=1e-4)

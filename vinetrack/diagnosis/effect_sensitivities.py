@@ -130,7 +130,7 @@ def _response(fit: Fit, change: Sequence[Floats]) -> float:
 def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> list[Floats]:
     """By how much the positions of every trial change with the step put in, m."""
     predictor, state = fit.predictor, fit.solution.state
-    jobs = predictor.together(state.theta, state.trial_effects).with_effect(shape.values)
+    jobs = predictor.job_arrays(state.theta, state.trial_effects).with_effect(shape.values)
     shared = shape.size.shared if shape.group else ""
     felt = [i for i, trial in enumerate(fit.trials) if trial.trial.group(shared) == shape.group]
     moved = predictor.run_as(predictor.layout.model + shape.effect, jobs.take(np.array(felt)))

@@ -95,7 +95,7 @@ def noiseless_start(fit: Fit) -> NoiselessStart:
     state = replace(fit.state, trial_effects=trial_effects)
     predictor = _predictor_of(fit.predictor, fit.predictor.data)
     columns = predictor.linearise(state.theta, trial_effects)
-    return NoiselessStart(state, predictor, predictor.together(state.theta, trial_effects), columns)
+    return NoiselessStart(state, predictor, predictor.job_arrays(state.theta, trial_effects), columns)
 
 
 def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:

@@ -48,7 +48,7 @@ class Batch:
     starts: NDArray[np.int64]
     times: Floats
     on: NDArray[np.bool_]
-    rigs: Floats
+    inputs: Floats
     thetas: Floats
     trace_starts: NDArray[np.int64]
     trace_time: Floats
@@ -93,7 +93,7 @@ class Batch:
             self.starts[a : b + 1],
             self.times,
             self.on[a:b],
-            self.rigs[a:b],
+            self.inputs[a:b],
             self.thetas[a:b],
             self.trace_starts[a : b + 1],
             self.trace_time,
@@ -118,7 +118,7 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
 
 def lay_out(
     model: Model,
-    rigs: Floats,
+    inputs: Floats,
     bends: Sequence[Sequence[tuple[float, float, float]]],
     stamps: Floats,
     starts: NDArray[np.int64],
@@ -132,7 +132,7 @@ def lay_out(
     Parameters
     ----------
     model, traces, parameters, host : as those of `simulate_many`
-    rigs : shape (n_trials, n_fields of `TrialInputs`), SI
+    inputs : shape (n_trials, n_fields of `TrialInputs`), SI
     bends : by trial, as `bends_of` returns them
     stamps : shape (n_times,), instants of all trials end to end, s
     starts : shape (n_trials + 1,), where each trial's instants begin, as `starts_of` has it
@@ -142,7 +142,7 @@ def lay_out(
     Batch
         Ready to be run.
     """
-    count = len(rigs)
+    count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
     if host is not None and host.names != model.names:
         resting = np.array([name not in model for name in host.names])
@@ -150,18 +150,18 @@ def lay_out(
         on = effects_on(model, thetas) & ~resting
     else:
         on = effects_on(model, thetas)
-    breakpoints, stops = _limits(model, rigs, thetas, on, bends)
-    times = _true_times(model, rigs, thetas, on, stamps, starts)
-    traces = _true_traces(model, rigs, thetas, on, traces) if traces is not None else [None] * count
+    breakpoints, stops = _limits(model, inputs, thetas, on, bends)
+    times = _true_times(model, inputs, thetas, on, stamps, starts)
+    traces = _true_traces(model, inputs, thetas, on, traces) if traces is not None else [None] * count
     given = [trace for trace in traces if trace is not None]
-    tail_free = bool(rigs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
+    tail_free = bool(inputs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
     return Batch(
         integrate_many=kernel(model.effects, tail_free).integrate_many,
         stamps=stamps,
         starts=starts,
         times=times,
         on=on,
-        rigs=rigs,
+        inputs=inputs,
         thetas=thetas,
         trace_starts=starts_of([() if trace is None else trace[0] for trace in traces] if given else [()] * count),
         trace_time=np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0),
@@ -191,7 +191,7 @@ def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
 
 def _limits(
     model: Model,
-    rigs: Floats,
+    inputs: Floats,
     thetas: Floats,
     on: NDArray[np.bool_],
     bends: Sequence[Sequence[tuple[float, float, float]]],
@@ -201,11 +201,11 @@ def _limits(
     Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
     bends begin and end, and what effects say of theirs.
     """
-    rig = TrialInputs(*rigs.T)
-    film = np.ones(len(rigs))
+    rig = TrialInputs(*inputs.T)
+    film = np.ones(len(inputs))
     for effect, function, place in asked(model, "film_gain"):
         for k in np.flatnonzero(on[:, effect]).tolist():
-            film[k] *= function(_NOTHING, TrialInputs(*rigs[k]), *thetas[k, place])
+            film[k] *= function(_NOTHING, TrialInputs(*inputs[k]), *thetas[k, place])
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
     left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
     loss = np.asarray(rig.mass_loss)
@@ -220,11 +220,11 @@ def _limits(
         known: dict[tuple[bytes, bytes], list[float]] = {}
         for k in np.flatnonzero(on[:, i]).tolist():
             # A difference moves one number of a trial at a time, and most of them no breakpoint.
-            key = rigs[k].tobytes(), thetas[k, model.places[i]].tobytes()
+            key = inputs[k].tobytes(), thetas[k, model.places[i]].tobytes()
             if key not in known:
-                known[key] = list(of_effect(TrialInputs(*rigs[k]), *thetas[k, model.places[i]]))
+                known[key] = list(of_effect(TrialInputs(*inputs[k]), *thetas[k, model.places[i]]))
             positions_m[k] += known[key]
-    breakpoints = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
+    breakpoints = np.full((len(inputs), 1 + max(map(len, positions_m), default=0)), math.inf)
     breakpoints[:, 0] = floor
     for k, positions in enumerate(positions_m):
         breakpoints[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
@@ -232,7 +232,7 @@ def _limits(
 
 
 def _true_times(
-    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats, starts: NDArray[np.int64]
+    model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats, starts: NDArray[np.int64]
 ) -> Floats:
     """When what the camera stamps really happened, of all trials end to end, shape (n_times,)."""
     true_times = stamps
@@ -241,12 +241,12 @@ def _true_times(
         for i in np.flatnonzero(on[:, effect]):
             of_trial = slice(starts[i], starts[i + 1])
             state = _NOTHING._replace(time=true_times[of_trial])  # type: ignore[arg-type]
-            true_times[of_trial] = function(state, TrialInputs(*rigs[i]), *thetas[i, place])
+            true_times[of_trial] = function(state, TrialInputs(*inputs[i]), *thetas[i, place])
     return true_times
 
 
 def _true_traces(
-    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
+    model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
 ) -> list[Trace | None]:
     """Measured pressures at the times at which they were really measured, by trial."""
     in_time = list(traces)
@@ -255,5 +255,5 @@ def _true_traces(
             if (trace := in_time[i]) is None:
                 continue
             state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
-            in_time[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
+            in_time[i] = np.asarray(function(state, TrialInputs(*inputs[i]), *thetas[i, place]), dtype=float), trace[1]
     return in_time

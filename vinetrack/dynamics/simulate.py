@@ -188,7 +188,7 @@ def prepare(
         If a trial lacks what an effect needs, or the host does not hold the model.
     """
     check_needs(model, *trials)
-    rigs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
+    inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
         len(trials), len(TrialInputs._fields)
     )
     if parameters is None:
@@ -198,7 +198,7 @@ def prepare(
     bends = [bends_of(trial) for trial in trials]
     given = [np.asarray(t, dtype=float) for t in times_s]
     stamps = np.concatenate(given) if given else np.empty(0)
-    return lay_out(model, rigs, bends, stamps, starts_of(given), traces=traces, parameters=parameters, host=host)
+    return lay_out(model, inputs, bends, stamps, starts_of(given), traces=traces, parameters=parameters, host=host)
 
 
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:

@@ -58,12 +58,12 @@ def trial_inputs(trial: Trial) -> TrialInputs:
     )
 
 
-def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
+def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
     """The same trials at other pressures; the gas in them weighs as much more.
 
     Parameters
     ----------
-    rigs : rows of `TrialInputs`, shape (n_trials, n_fields), SI.
+    inputs : rows of `TrialInputs`, shape (n_trials, n_fields), SI.
     set_pressure_Pa, yield_pressure_Pa : shape (n_trials,); a yield pressure that is NaN leaves that of the row.
 
     Returns
@@ -72,9 +72,9 @@ def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Flo
         A changed copy.
     """
     place = {name: k for k, name in enumerate(TrialInputs._fields)}
-    changed = rigs.copy()
-    denser = (set_pressure_Pa - rigs[:, place["set_pressure"]]) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
-    volume = rigs[:, place["area"]] * rigs[:, place["length"]] / rigs[:, place["travel_ratio"]] ** 2
+    changed = inputs.copy()
+    denser = (set_pressure_Pa - inputs[:, place["set_pressure"]]) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    volume = inputs[:, place["area"]] * inputs[:, place["length"]] / inputs[:, place["travel_ratio"]] ** 2
     changed[:, place["set_pressure"]] = set_pressure_Pa
     changed[:, place["least_mass"]] += denser * volume
     known = ~np.isnan(yield_pressure_Pa)

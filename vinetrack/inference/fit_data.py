@@ -1,4 +1,4 @@
-"""What a fit sees of an experiment: for every trial the measured positions, their instants and the pressure trace."""
+"""The data of a fit: for each trial the positions used, their times, their noise, and the recorded pressure."""
 
 from __future__ import annotations
 
@@ -25,50 +25,49 @@ FEWEST_POINTS = 5
 """A trial with fewer points is refused. Derived: release, origin, speed and curvature take four."""
 
 FEWEST_MOVING = 4
-"""A trial with fewer points in motion is refused. Derived: release, speed and curvature take three; with them alone any
-motion is explained, and what a door did in two frames passes for one."""
+"""A trial with fewer points in motion is refused. Derived: release, speed and curvature take three; with only those,
+any motion fits exactly, and two disturbed frames at a door count as motion."""
 
 GAP_FRAMES = 1.5
-"""A point later than this many frames after the one before begins a new stretch of noise, independent of the last.
-Derived: halfway between one frame and two."""
+"""A point later than this many frames after the previous one begins a new stretch, whose noise is independent of the
+previous one's. Derived: halfway between one frame and two."""
 
 MOVES_SIGMAS = 8.0
 """Standard deviations by which the edge must move for a trial to be fitted. Chosen: medians of three points differ by
-that with a chance below 1e-14 under normal noise, and still below 1e-4 with heavy tails; twice would refuse short
+that with a probability below 1e-14 under normal noise, and still below 1e-4 with heavy tails; twice would refuse short
 growth."""
 
 
-RISEN = 0.5
-"""A trace that begins below this part of its median while the recording runs has been let in then and there. Chosen: a
-trace that was settled stays within a few per cent, one let in begins near zero; anything between 0.2 and 0.8 tells
-them apart."""
+SETTLED_PRESSURE_PART = 0.5
+"""Where a trace begins below this part of its median, the tube was pressurised during the recording. Chosen: a settled
+trace stays within a few per cent, a pressurisation begins near zero; anything between 0.2 and 0.8 separates them."""
 
 END_FRACTION = 0.95
-"""The last part of the growth is left out: there the mass of a bare vine goes to nothing, its speed diverges, and one
-frame across the end of growth is a corner that no sensitivity describes. What lies behind the end is kept. Chosen as
-the place where the speed of a bare vine is quoted; 0.9 loses a tenth of the data, 0.975 comes twice as near the
-singularity."""
+"""The growth beyond this fraction of the length is left out. There the mass of a bare vine goes to zero and its speed
+diverges, and a frame across the end of growth is a corner at which no sensitivity exists. Points after the end are
+used. Chosen as the place at which the speed of a bare vine is quoted; 0.9 loses a tenth of the data, 0.975 comes twice
+as near to the singularity."""
 
 FRAMES_BEHIND_END = 2
-"""Frames left out behind the end of growth. Derived: the frame in which growth ends and one for the exposure across
+"""Frames left out after the end of growth. Derived: the frame in which growth ends and one for the exposure across
 it."""
 
 
-VAGUE, FEWEST_CLEAR, MOSTLY = 3.0, 0.3, 0.5
-"""A point is left out whose stated error exceeds that of the better half by this factor, as long as this part stays;
-the whole rest before the motion, where more than the last part of it is left out. Chosen: a point of three times the
-error carries a ninth of the information; it is left out because a single noise holds for all points. At half many good
-points go, at twice blurred ones stay."""
+IMPRECISE_FACTOR, LEAST_PRECISE_PART, REST_DISCARD_PART = 3.0, 0.3, 0.5
+"""A point is left out if its stated error exceeds the median of the better half by this factor, provided that at least
+the second fraction of points remains. The whole rest before the motion is left out if more than the third fraction of
+it is. Chosen: a point of three times the error carries a ninth of the information, yet would get full weight, since one
+noise holds for all points of a trial. At half, many good points go; at twice, blurred ones stay."""
 
 
-AT_MOST_TWO = 1.5
-"""Range of rounded positions at rest, in steps of the rounding, up to which they hide their noise. Derived: two
-neighbouring values are a step apart, three are two; noise of a third of a step shows three of them in twenty frames,
+QUANTISED_REST_STEPS = 1.5
+"""Range of rounded positions at rest, in rounding steps, up to which rounding hides their noise. Derived: two
+neighbouring values are one step apart, three are two; noise of a third of a step shows three values in twenty frames,
 and the mean is then good to a twentieth of a step."""
 
 
 class FitError(UserError, ValueError):
-    """A fit cannot be made; the message is one sentence with a remedy.
+    """The fit cannot be made; the message is one sentence with a remedy.
 
     Examples
     --------
@@ -81,7 +80,7 @@ class FitError(UserError, ValueError):
 
 @dataclass(frozen=True)
 class ImpreciseRest:
-    """A rest before the motion seen only vaguely, such as behind a door: when it ended, where it was, how surely."""
+    """A rest before the motion with large stated errors, such as behind a door: its end, position and error."""
 
     release_s: float
     origin_m: float
@@ -131,12 +130,12 @@ class FitTrial:
 
     @cached_property
     def frame_s(self) -> float:
-        """Spacing of the points, s."""
+        """Median spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
 
     @cached_property
     def window(self) -> tuple[Floats, Floats]:
-        """Instants about each point that it is a mean of, s, and their weights; one where it was not smoothed."""
+        """Times relative to each point over which it is averaged, s, and their weights; one entry if not smoothed."""
         if self.smoothing is None:
             return np.zeros(1), np.ones(1)
         places = np.arange(self.smoothing.window) - self.smoothing.window // 2
@@ -144,7 +143,7 @@ class FitTrial:
 
     @property
     def point_sd(self) -> Floats:
-        """`relative_sd`, ones where all points are equally noisy, shape (n_points,)."""
+        """`relative_sd`, or ones where all points are equally noisy, shape (n_points,)."""
         return np.ones(self.time_s.size) if self.relative_sd is None else self.relative_sd
 
     @property
@@ -156,23 +155,23 @@ class FitTrial:
 
     @property
     def shows_rest(self) -> bool:
-        """Whether anything is seen of the rest before the motion, be it only vaguely."""
+        """Whether the rest before the motion was recorded, precisely or not."""
         return self.n_rest > 0 or self.imprecise_rest is not None
 
     @property
     def rest_origin_m(self) -> float:
-        """Where the edge rests before the motion, m; the mean of its points where they are in the fit."""
+        """Position of the edge at rest before the motion, m: the mean of its points where they are in the fit."""
         if self.imprecise_rest is not None:
             return self.imprecise_rest.origin_m
         return float(np.mean(self.lead_position_m[: self.n_rest]))
 
     @cached_property
     def pressurised_in_recording(self) -> bool:
-        """Whether the pressure was let in while it was recorded: then the trace says what started the growth, and when.
+        """Whether the tube was pressurised during the recording; the trace then shows when the growth was started.
 
-        Nothing else holds the vine, and a release of its own would pass for a threshold.
+        Nothing else holds such a vine, and a free release would stand in for a threshold of the pressure.
         """
-        return self.trace is not None and bool(self.trace[1][0] < RISEN * np.median(self.trace[1]))
+        return self.trace is not None and bool(self.trace[1][0] < SETTLED_PRESSURE_PART * np.median(self.trace[1]))
 
 
 Pairs = Iterable[tuple[Trial, Track]]
@@ -185,18 +184,18 @@ def prepare_trial(
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
 ) -> FitTrial:
-    """The usable points of a track, rest included, with what they say of their own noise.
+    """The data of one trial: its usable points, rest included, and the noise that they show.
 
     Parameters
     ----------
     trial : row of the sheet.
     track : its positions.
     quiet : QuietTrace, optional
-        Its recorded pressure without noise, from `quiet_traces`, where traces of other trials tell of it too.
+        Its denoised pressure from `quiet_traces` of the whole campaign; by default from this track alone.
     smoothing : Smoothing, optional
-        How its positions were smoothed: of those that are alike one is kept.
+        How its positions were smoothed; of the points that a window correlates, one is kept.
     rounding_m : float, m
-        Standard deviation of the error that rounding leaves in positions of the campaign, 0 where they are not rounded.
+        Standard deviation of the rounding error of positions of the campaign, 0 where they are not rounded.
 
     Returns
     -------
@@ -206,21 +205,21 @@ def prepare_trial(
     ------
     FitError
         Fewer than five usable points, or four in motion; times that do not increase; a leading edge that never moves,
-        or one that moves although its pressure cannot do it.
+        or one that moves although its pressure cannot move it.
     """
-    usable = track.usable & ~_nearing_end(trial, track)
-    vague, imprecise_rest = _vague(track, usable)
-    usable &= ~vague
+    usable = track.usable & ~_near_end_of_growth(trial, track)
+    imprecise, imprecise_rest = _imprecise_points(track, usable)
+    usable &= ~imprecise
     smoothing, rounding_m = (smoothing, rounding_m) if trial.video is None else (None, 0.0)
     if rounding_m > 0 and imprecise_rest is None:
-        alike, imprecise_rest = _rounded_alike(track, usable, rounding_m)
-        usable &= ~alike
+        quantised, imprecise_rest = _quantised_points(track, usable, rounding_m)
+        usable &= ~quantised
     smoothed_frame_s = 0.0
     if smoothing is not None:
-        # At either end a filter has no full window, and everybody fills it up in another way.
+        # Near both ends the filter has no full window, and programs differ in how they pad it.
         places = np.flatnonzero(usable)[smoothing.window // 2 : -(smoothing.window // 2)]
         smoothed_frame_s = float(np.median(np.diff(track.time_s[places])))
-        usable = np.isin(np.arange(usable.size), places[:: smoothing.alike])
+        usable = np.isin(np.arange(usable.size), places[:: smoothing.quantised])
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
         raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
@@ -229,7 +228,7 @@ def prepare_trial(
         raise FitError("its times do not increase: sort the rows or drop repeated ones")
     noise_m, correlation = position_noise(time_s, position_m)
     noise_m = max(noise_m, rounding_m)
-    if track.pressure_Pa is None and _undriven(trial):
+    if track.pressure_Pa is None and _cannot_be_driven(trial):
         raise FitError(
             f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
             f" {trial.yield_pressure_Pa / 1e3:g} kPa, yet it moves: correct the sheet"
@@ -272,119 +271,120 @@ def prepare_trial(
 
 
 def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
-    """The tracker's slow error at the usable points, m; between those that state one where others do not.
+    """The tracker's slowly varying error at the usable points, m, interpolated where a point states none.
 
-    Where a track states one error in all, as results of 0.1.0 do, it is taken for the slow one, by which it errs most.
+    A track with a single stated error, as in results of 0.1.0, is taken to state the slow one, which is the larger.
     """
     for slow_m in (track.lead_position_systematic_m, track.lead_position_sigma_m):
         if slow_m is not None and np.isfinite(slow_m[usable]).any():
-            known = usable & np.isfinite(slow_m)
-            return np.interp(np.flatnonzero(usable), np.flatnonzero(known), slow_m[known])
+            stated = usable & np.isfinite(slow_m)
+            return np.interp(np.flatnonzero(usable), np.flatnonzero(stated), slow_m[stated])
     return None
 
 
 def _position_systematic_m(trial: Trial) -> float:
-    """Smooth error of the positions of a trial, standard deviation, m: as stated, else that of imported tracks."""
+    """Standard deviation of a trial's smooth position error, m: as stated, else that of imported tracks."""
     if math.isfinite(trial.position_systematic_m):
         return trial.position_systematic_m
     return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
 def _gauge_error(quiet: QuietTrace, moving_s: Floats) -> float:
-    """By what part of the pressure a trace freed of noise is wrong all along the motion."""
-    told = (quiet.time_s >= moving_s[0]) & (quiet.time_s <= moving_s[-1])
-    typical_Pa = abs(float(np.median(quiet.pressure_Pa[told]))) if told.any() else math.nan
+    """Relative error of the denoised pressure that is constant over the motion."""
+    in_motion = (quiet.time_s >= moving_s[0]) & (quiet.time_s <= moving_s[-1])
+    typical_Pa = abs(float(np.median(quiet.pressure_Pa[in_motion]))) if in_motion.any() else math.nan
     if not typical_Pa > 0:
         return 0.0
-    # Noise averages out over what is seen of the motion alone.
-    return quiet.mean_error_Pa * math.sqrt(told.size / np.count_nonzero(told)) / typical_Pa
+    # The noise averages out over the samples during the motion only.
+    return quiet.mean_error_Pa * math.sqrt(in_motion.size / np.count_nonzero(in_motion)) / typical_Pa
 
 
-def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points whose own stated error is several times that of the others, such as an edge half behind the door.
+def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
+    """Points whose stated error is several times that of the others, such as an edge half behind the door.
 
-    And what the rest before the motion still says where it is among them.
-    They would tell a tenth of what another tells, and count as much: one noise holds for all points of a trial.
+    Also the position and end of the rest before the motion, where it consists of such points.
     """
     sigma_m = track.lead_position_sigma_m
     if track.lead_position_systematic_m is not None:
         sigma_m = np.hypot(sigma_m, np.nan_to_num(track.lead_position_systematic_m))
-    known = usable & np.isfinite(sigma_m)
-    if not known.any():
+    stated = usable & np.isfinite(sigma_m)
+    if not stated.any():
         return np.zeros(usable.size, dtype=bool), None
-    better_m = sigma_m[known & (sigma_m <= np.median(sigma_m[known]))]
-    vague = known & (sigma_m > VAGUE * np.median(better_m))
-    places = np.flatnonzero(usable)
-    at_rest = places[: rest_points(track.lead_position_m[places])]
+    precise_half_m = sigma_m[stated & (sigma_m <= np.median(sigma_m[stated]))]
+    imprecise = stated & (sigma_m > IMPRECISE_FACTOR * np.median(precise_half_m))
+    usable_points = np.flatnonzero(usable)
+    at_rest = usable_points[: rest_points(track.lead_position_m[usable_points])]
     imprecise_rest = None
-    if 0 < at_rest.size < places.size and np.mean(vague[at_rest]) > MOSTLY:
-        # The few that are left of such a rest would hold the origin alone.
-        vague[at_rest] = True
+    if 0 < at_rest.size < usable_points.size and np.mean(imprecise[at_rest]) > REST_DISCARD_PART:
+        # The few remaining points of such a rest would determine the origin alone.
+        imprecise[at_rest] = True
         imprecise_rest = ImpreciseRest(
             release_s=float(track.time_s[at_rest[-1]]),
             origin_m=float(np.median(track.lead_position_m[at_rest])),
             sigma_m=float(np.median(sigma_m[at_rest])),
         )
-    enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
-    return (vague, imprecise_rest) if enough else (np.zeros(usable.size, dtype=bool), None)
+    enough_precise = np.count_nonzero(usable & ~imprecise) >= max(
+        FEWEST_POINTS, LEAST_PRECISE_PART * np.count_nonzero(usable)
+    )
+    return (imprecise, imprecise_rest) if enough_precise else (np.zeros(usable.size, dtype=bool), None)
 
 
-def _rounded_alike(
+def _quantised_points(
     track: Track, usable: NDArray[np.bool_], rounding_m: float
 ) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points at standstill whose noise is too small to tell them from one another once they are rounded.
+    """Points at standstill that rounding makes identical, because their noise is smaller than the rounding step.
 
-    All of them err by the same then: they tell no more than one of them does. What the rest before the motion says of
-    the origin is kept with the error of one point, of a standstill at the end its first point.
+    They all have the same error, so that together they are worth one point. The rest before the motion is replaced by
+    its mean with the error of one point; of a standstill at the end the first point is kept.
     """
     places = np.flatnonzero(usable)
     y = track.lead_position_m[places]
-    alike = np.zeros(usable.size, dtype=bool)
+    quantised = np.zeros(usable.size, dtype=bool)
     n_rest = rest_points(y)
-    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > AT_MOST_TWO * math.sqrt(12) * rounding_m:
-        return alike, None
-    alike[places[:n_rest]] = True
-    stands = int(np.flatnonzero(y != y[-1])[-1]) + 1
-    alike[places[stands + 1 :]] = True
-    return alike, ImpreciseRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
+    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > QUANTISED_REST_STEPS * math.sqrt(12) * rounding_m:
+        return quantised, None
+    quantised[places[:n_rest]] = True
+    standstill_start = int(np.flatnonzero(y != y[-1])[-1]) + 1
+    quantised[places[standstill_start + 1 :]] = True
+    return quantised, ImpreciseRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
 
 
-def _undriven(trial: Trial) -> bool:
-    """Whether no error that the sheet admits lets the pressure move a bare vine; gravity alone may move a payload."""
+def _cannot_be_driven(trial: Trial) -> bool:
+    """Whether the pressure cannot move a bare vine within the errors of the sheet; gravity alone may move a payload."""
     room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
     return trial.travel_ratio != 1 and trial.payload_kg == 0 and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa
 
 
-def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
-    """Frames on the last twentieth of the growth and the first two behind its end."""
-    near = np.zeros(track.time_s.size, dtype=bool)
-    use = np.flatnonzero(track.usable)
-    if not np.isfinite(trial.length_m) or use.size < FEWEST_POINTS:
-        return near
-    y = track.lead_position_m[use]
+def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
+    """Frames on the last twentieth of the growth, and the first two after its end."""
+    excluded = np.zeros(track.time_s.size, dtype=bool)
+    points = np.flatnonzero(track.usable)
+    if not np.isfinite(trial.length_m) or points.size < FEWEST_POINTS:
+        return excluded
+    y = track.lead_position_m[points]
     noise_m = rough_noise(y) + 1e-9
     n_rest = rest_points(y)
     n_rest = n_rest if n_rest < y.size else 0
     begin_m = float(np.mean(y[: max(n_rest, 1)]))
-    # A track that stands still at its end, after a last step far above its noise, has seen the end of growth.
+    # A track that stands still at its end, after a last step far above its noise, includes the end of growth.
     still = np.abs(y - np.median(y[-2:])) < 5 * noise_m
     moving = np.flatnonzero(~still)
     end = int(moving[-1]) + 1 if moving.size else y.size
-    reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
-    last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if reached else np.inf
-    late = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
-    if reached:
-        # Noise hides the end for as long as the last steps are no larger; behind it the model must have stopped too.
+    end_reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
+    last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if end_reached else np.inf
+    near_end = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
+    if end_reached:
+        # While steps are below the noise, the end is uncertain by as many frames; after them the model has stopped too.
         step_m = max(float(np.median(np.diff(y[max(end - 10, 0) : end]))), 1e-9)
-        late[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
-    near[use[late]] = True
-    return near
+        near_end[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
+    excluded[points[near_end]] = True
+    return excluded
 
 
 def pairs_of(
     experiment: Experiment | Path | str | Pairs, tracks: Mapping[str, Track] | None = None
 ) -> tuple[list[tuple[Trial, Track]], dict[str, str]]:
-    """Trials and their tracks, and why some trials have none.
+    """Trials and their tracks, and the reason for each trial without one.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def pairs_of(
 
 
 def _read(trial: Trial) -> Track:
-    """The track that an experiment brings along, frames that repeat or jump put right."""
+    """The track of an experiment, with repeated and dropped frames corrected."""
     from vinetrack.tracks.frame_timing import correct_frames
     from vinetrack.tracks.importers import TrackError, load_track
 

@@ -1,4 +1,4 @@
-"""What does not change during a fit, and the state from which it begins: priors, bounds, first noise and spreads."""
+"""The constant part of a fit (priors, bounds) and its initial state (noise, between-trial standard deviations)."""
 
 from __future__ import annotations
 
@@ -13,34 +13,35 @@ from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import initial_trial_effects
 
 FIRST_SPREADS = (0.01, 0.03)
-"""Chosen as a usual batch of vines: one per cent of pressure and three of B."""
+"""Initial between-trial standard deviations of pressure (relative) and ln B. Chosen as those of a typical batch of
+vines."""
 
-EXACT_PART = 2e-6
-"""Least noise, as part of a trial's travel: the integrator is no better. Measured: the integrator errs by at most 7e-7
-(benchmarks/integrator.py)."""
+INTEGRATOR_ERROR = 2e-6
+"""Least noise, relative to a trial's travel, because the integrator is not more accurate. Measured: the integrator errs
+by at most 7e-7 (benchmarks/integrator.py)."""
 
 RELEASE_PRIOR_FRAMES, ORIGIN_PRIOR_SIGMAS = 10.0, 10.0
-"""Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
-time: that only counts where a wrong model would drag both along. Chosen: ten standard deviations make the prior a
-hundredth of what the frames say."""
+"""Prior standard deviations of release, frames, and of origin, in standard deviations of the noise, where the rest was
+recorded. Its points already determine both, so the prior matters only where a wrong model would drag them along.
+Chosen: ten standard deviations give the prior a hundredth of the information of the frames."""
 
 KNOWN_RELEASE_S = 1e-6
-"""The release of a vine whose pressure was let in while it was recorded: nothing to find. Chosen far below any
-frame."""
+"""Prior standard deviation of the release of a vine that was pressurised during the recording: it is known. Chosen far
+below any frame."""
 
 FEWEST_TO_SPARE = 3
-"""A spread is estimated where this many more trials feel it than there are numbers without a prior. Chosen: with fewer
-degrees of freedom a variance is known to worse than a factor of two."""
+"""A between-trial standard deviation is estimated where it applies to this many more trials than there are parameters
+without a prior. Chosen: with fewer degrees of freedom a variance is known to worse than a factor of two."""
 
 
 def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
-    """What stays the same during the iterations; `own` holds the first guess of releases and origins.
+    """The constant part of a fit.
 
     Parameters
     ----------
-    predictor : of the trials to fit.
+    predictor : simulates the trials of the fit.
     trial_effects : array, shape (n_trials, 4)
-        First guess of releases and origins.
+        Initial estimates of releases and origins; prior means where no rest was recorded.
 
     Returns
     -------
@@ -52,20 +53,20 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
     frames = np.array([trial_data.frame_s for trial_data in data])
     rests = np.array([trial_data.shows_rest for trial_data in data])
-    known = rests | np.array([trial_data.pressurised_in_recording for trial_data in data])
-    vague = np.array(
+    release_known = rests | np.array([trial_data.pressurised_in_recording for trial_data in data])
+    rest_sigma_m = np.array(
         [0.0 if trial_data.imprecise_rest is None else trial_data.imprecise_rest.sigma_m for trial_data in data]
     )
     release_sd = np.where(rests, RELEASE_PRIOR_FRAMES * frames, 3 * durations)
     release_sd[[trial_data.pressurised_in_recording for trial_data in data]] = KNOWN_RELEASE_S
     noise = np.array([trial_data.noise_m for trial_data in data])
-    room = np.maximum(ORIGIN_PRIOR_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
-    origin_sd = np.where(rests, room, 3 * spans)
+    origin_room_m = np.maximum(ORIGIN_PRIOR_SIGMAS * np.maximum(noise, rest_sigma_m), 1e-4 * spans)
+    origin_sd = np.where(rests, origin_room_m, 3 * spans)
     return MixedProblem(
         index=layout.index,
         has_deviation=np.column_stack([predictor.has_pressure_deviation, predictor.has_damping_deviation]),
         gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
-        release_origin_mean=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
+        release_origin_mean=np.where(release_known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         release_origin_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
@@ -79,15 +80,15 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
 
 
 def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) -> FitState:
-    """A state to begin from: noise of the tracks alone, spreads as the sheet and experience say.
+    """Initial state: noise of the tracks alone, between-trial standard deviations as stated in the sheet or typical.
 
     Parameters
     ----------
     data : sequence of FitTrial
     theta : array, shape (n_free,)
-        Numbers to begin from, scaled.
+        Starting values of the parameters, scaled.
     trial_effects : array, shape (n_trials, 4)
-        Trial effects to begin from.
+        Starting values of the trial effects.
 
     Returns
     -------
@@ -95,11 +96,13 @@ def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) 
     """
     rho = track_correlation(data)
     variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
-    return FitState(theta, trial_effects, _stated_spreads(data), rho, np.maximum(variance, variance_floor(data)))
+    return FitState(
+        theta, trial_effects, _stated_between_trial_sd(data), rho, np.maximum(variance, variance_floor(data))
+    )
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
-    """Lag-one correlation of the noise as the tracks alone show it.
+    """Lag-one correlation of the noise, estimated from the tracks without a model.
 
     Parameters
     ----------
@@ -117,8 +120,8 @@ def track_correlation(data: Sequence[FitTrial]) -> float:
     )
 
 
-def _stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
-    """Spread of pressure that the sheet states, and 3 % for B."""
+def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
+    """Between-trial standard deviation of pressure as the sheet states it, and the typical one of ln B."""
     relative = [
         trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
         for trial_data in data
@@ -128,7 +131,7 @@ def _stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
 
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
-    """Least variance of a position that the integrator can answer for, m², shape (n_trials,).
+    """Least variance of the noise of each trial, given the accuracy of the integrator.
 
     Parameters
     ----------
@@ -138,23 +141,23 @@ def variance_floor(data: Sequence[FitTrial]) -> Floats:
     -------
     array, shape (n_trials,), m²
     """
-    return np.array([(EXACT_PART * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
+    return np.array([(INTEGRATOR_ERROR * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
 
 
 def estimable(problem: MixedProblem) -> tuple[bool, bool]:
-    """Whether there are trials enough to estimate the spread of pressure, and that of B.
+    """Whether there are enough trials to estimate the between-trial standard deviations of pressure and of ln B.
 
     Parameters
     ----------
-    problem : what does not change during the fit.
+    problem : the constant part of the fit.
 
     Returns
     -------
     (bool, bool)
     """
     needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
-    varied = problem.has_deviation & np.column_stack(
+    has_estimated_sd = problem.has_deviation & np.column_stack(
         [problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)]
     )
-    pressure, damping = (bool(np.count_nonzero(varied[:, k]) >= needed) for k in range(2))
+    pressure, damping = (bool(np.count_nonzero(has_estimated_sd[:, k]) >= needed) for k in range(2))
     return pressure, damping

@@ -270,7 +270,7 @@ def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: 
 def _sums(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
     """Whitened products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
     jobs = predictor.jobs(np.empty(0), trial_effects)
-    later = [row for row in rows.tolist() if not predictor.plain_release[row]]
+    later = [row for row in rows.tolist() if not predictor.release_is_shift[row]]
     steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
     moved = predictor.run(
         [jobs[row] for row in rows] + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in later]

@@ -1,6 +1,6 @@
-"""The trials of a campaign as a fit sees them, and what only all of them together say of their noise.
+"""The data of all trials of a campaign, including properties of the noise that only the trials together show.
 
-One track may not show how far its points err: whether positions are rounded, smoothed, or err with their speed.
+A single track may not show whether its positions are rounded, smoothed, or have an error that grows with speed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from vinetrack.tracks.smoothed_positions import detect_smoothing
 
 
 def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
-    """Trials that can be fitted, and for the others the reason why not, by name.
+    """Data of the trials that can be fitted, and the reason for each that cannot, by name.
 
     Parameters
     ----------
     pairs : iterable of (Trial, Track)
     weighted : bool
-        Whether points are weighted where the noise of positions varies from one to the next.
+        Whether points are weighted where the noise of positions varies from point to point.
 
     Returns
     -------
@@ -34,7 +34,7 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
     """
     data, left_out = [], {}
     pairs = list(pairs)
-    # A track of few points, or at one speed, may happen to show nothing of it.
+    # Estimated from all tracks: one with few points, or at constant speed, may not show it.
     rounding_m = common_rounding_noise(
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
@@ -44,25 +44,27 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
             data.append(prepare_trial(trial, track, quiet, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)
-    return _with_noise_shape(data) if weighted else data, left_out
+    return _with_weighted_points(data) if weighted else data, left_out
 
 
-def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
-    """The trials with their points weighted, where the noise of positions that somebody else measured varies.
+def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
+    """The trials with weighted points, where the noise of imported positions varies from point to point.
 
-    A tracker's own points are left as they are: it states what each errs by, and leaves out the worst.
+    Points of this package's tracker keep equal weights: it states the error of each and leaves out the worst.
     """
-    places = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
+    imported = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
     shape = noise_shape(
-        [data[i].time_s for i in places], [data[i].lead_position_m for i in places], [data[i].stated_m for i in places]
+        [data[i].time_s for i in imported],
+        [data[i].lead_position_m for i in imported],
+        [data[i].stated_m for i in imported],
     )
     if shape is None:
         return data
-    # One correlation for all, as in a fit: that of a single track with unequal noise is hardly known.
-    correlation = np.average([data[i].correlation for i in places], weights=[data[i].time_s.size for i in places])
+    # One correlation for all trials, as in a fit: a single track with unequal noise hardly determines it.
+    correlation = np.average([data[i].correlation for i in imported], weights=[data[i].time_s.size for i in imported])
     gain = correlated_gain(float(correlation))
     weighted = list(data)
-    for i, sd_m in zip(places, shape.sd_m, strict=True):
+    for i, sd_m in zip(imported, shape.sd_m, strict=True):
         typical_m = math.exp(float(np.mean(np.log(sd_m))))
         weighted[i] = replace(
             data[i],

@@ -23,7 +23,7 @@ from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.position_change import clip_at_end, position_change
-from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Motions
+from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Motions, first_identical_trials
 from vinetrack.inference.whitening import all_products
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
@@ -53,10 +53,12 @@ class Predictor:
 
     `has_pressure_deviation`, shape (n_trials,), tells which trials have a pressure that may deviate: one that was set,
     or measured by a noisy gauge. `has_damping_deviation` tells which have a B. `host` is a larger model whose compiled
-    form serves this one. `divisible` tells whether a predictor of a subset of the trials gives the same results.
+    form serves this one. `separable` tells whether a predictor of a subset of the trials gives the same results.
+    `release_is_shift` tells where a later release only shifts the trajectory in time, so that its sensitivity is minus
+    the speed; a recorded pressure and a transformed time or position need a finite difference.
     """
 
-    divisible = True
+    separable = True
 
     def __init__(self, layout: ParameterMap, data: Sequence[FitTrial], host: Model | None = None) -> None:
         self.layout, self.data, self.host = layout, data, host
@@ -75,38 +77,38 @@ class Predictor:
             [self.damping_column >= 0 and trial_data.trial.travel_ratio != 1 for trial_data in data], dtype=bool
         )
         check_needs(model, *(trial_data.trial for trial_data in data))
-        self.rigs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
+        self.inputs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
         self.bends = [bends_of(trial_data.trial) for trial_data in data]
-        measured_otherwise = any(
+        transformed = any(
             {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model
         )
         smoothed = any(trial_data.smoothing is not None for trial_data in data)
-        self.averages = [Average.of(known.time_s, *known.window) for known in data] if smoothed else []
-        measured_otherwise |= smoothed
-        self.plain_release = np.array([trial_data.trace is None and not measured_otherwise for trial_data in data])
-        self.twins = _twins(data, self.rigs, self.bends)
-        self.has_twins = bool(np.any(self.twins != np.arange(self.twins.size)))
+        self.averages = [Average.of(trial_data.time_s, *trial_data.window) for trial_data in data] if smoothed else []
+        transformed |= smoothed
+        self.release_is_shift = np.array([trial_data.trace is None and not transformed for trial_data in data])
+        self.identical_trials = first_identical_trials(data, self.inputs, self.bends)
+        self.any_identical = bool(np.any(self.identical_trials != np.arange(self.identical_trials.size)))
         self.ratios = [trial_data.trial.travel_ratio for trial_data in data]
         self.times_s = [np.asarray(trial_data.time_s, dtype=float) for trial_data in data]
         self.starts = starts_of(self.times_s)
         self.lead_position_m = np.concatenate([trial_data.lead_position_m for trial_data in data])
         self.spans_m = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
         self.first = np.concatenate([trial_data.first for trial_data in data])
-        uneven = any(trial_data.relative_sd is not None for trial_data in data)
-        self.relative_sd = np.concatenate([trial_data.point_sd for trial_data in data]) if uneven else None
+        unequal_noise = any(trial_data.relative_sd is not None for trial_data in data)
+        self.relative_sd = np.concatenate([trial_data.point_sd for trial_data in data]) if unequal_noise else None
         self.frames_s = np.array([trial_data.frame_s for trial_data in data])
         self.with_trace = np.array([trial_data.trace is not None for trial_data in data], dtype=bool)
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
     def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate at the instants of each job's trial, or at those of `times_s`, one array a job.
+        """Simulate at the times of each job's trial, or at `times_s`.
 
         Parameters
         ----------
         jobs : sequence of Job
         times_s : sequence of arrays, optional
-            Instants on the clock of the recording, s, one array a job.
+            Times on the clock of the recording, s, one array per job.
 
         Returns
         -------
@@ -122,7 +124,7 @@ class Predictor:
         model : simulated in place of the fit's.
         jobs : with the parameters of that model.
         times_s : sequence of arrays, optional
-            Instants, s, one array a job.
+            Times, s, one array per job.
 
         Returns
         -------
@@ -131,23 +133,23 @@ class Predictor:
         return self._simulated(model, jobs, times_s).trajectories()
 
     def _simulated(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> Motions:
-        """What jobs come to; what replicates of a planned campaign do alike is simulated once."""
-        like = np.arange(len(jobs))
-        if times_s is None and self.has_twins:
-            first, like = jobs.distinct(self.twins)
+        """Trajectories of the jobs; identical replicates of a planned campaign are simulated once."""
+        trajectory_of = np.arange(len(jobs))
+        if times_s is None and self.any_identical:
+            first, trajectory_of = jobs.distinct(self.identical_trials)
             jobs = jobs.take(first)
         trials = jobs.trial
-        rigs = with_pressures(
-            self.rigs[trials], self.rigs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
+        inputs = with_pressures(
+            self.inputs[trials], self.inputs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
         )
-        rigs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
+        inputs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
         averages = [self.averages[i] for i in trials] if times_s is None and self.averages else []
         if times_s is None:
             times_s = [average.instants_s for average in averages] or [self.times_s[i] for i in trials]
         starts = starts_of(times_s)
         batch = lay_out(
             model,
-            rigs,
+            inputs,
             [self.bends[i] for i in trials],
             np.concatenate(times_s) - np.repeat(jobs.release_s, np.diff(starts)),
             starts,
@@ -155,11 +157,11 @@ class Predictor:
             parameters=jobs.row,
             host=self.host,
         )
-        motions = Motions.of(batch, [self.data[i].trial for i in trials], like)
+        motions = Motions.of(batch, [self.data[i].trial for i in trials], trajectory_of)
         return motions.averaged(averages) if averages else motions
 
     def _traces(self, jobs: Jobs) -> list[Trace | None]:
-        """Recorded pressures on the clock of each job."""
+        """Recorded pressures by time since the release of each job."""
         traces = (self.data[i].trace for i in jobs.trial)
         return [
             None if trace is None else (trace[0] - release_s, trace[1] * (1 + deviation))
@@ -167,28 +169,28 @@ class Predictor:
         ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
-        """Simulation jobs at scaled parameters `theta` and the given trial effects, one a trial.
+        """Simulation jobs at given parameters and trial effects.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
+            Free parameters, scaled.
         trial_effects : array, shape (n_trials, 4)
 
         Returns
         -------
         list of Job
-            One a trial.
+            One per trial.
         """
-        return self.together(theta, trial_effects).single()
+        return self.job_arrays(theta, trial_effects).as_list()
 
-    def together(self, theta: Floats, trial_effects: Floats) -> Jobs:
-        """`jobs` as arrays.
+    def job_arrays(self, theta: Floats, trial_effects: Floats) -> Jobs:
+        """As `jobs`, in the form of arrays.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
+            Free parameters, scaled.
         trial_effects : array, shape (n_trials, 4)
 
         Returns
@@ -196,15 +198,15 @@ class Predictor:
         Jobs
         """
         rows, yields = self.layout.rows(theta)
-        trial_effects = self._deviations(theta, trial_effects)
+        trial_effects = self._total_deviations(theta, trial_effects)
         if self.damping_column >= 0:
             rows[:, self.damping_column] *= np.exp(trial_effects[:, DAMPING_DEVIATION])
         count = len(self.data)
         pressure, release = trial_effects[:, PRESSURE], trial_effects[:, RELEASE]
         return Jobs(np.arange(count), rows, yields, pressure, release, np.ones(count))
 
-    def _deviations(self, theta: Floats, trial_effects: Floats) -> Floats:
-        """The trials' own numbers, their deviations with what trials differ by systematically put in."""
+    def _total_deviations(self, theta: Floats, trial_effects: Floats) -> Floats:
+        """Trial effects with the systematic differences between trials added to the deviations."""
         if not self.layout.between:
             return trial_effects
         whole = trial_effects.copy()
@@ -212,61 +214,66 @@ class Predictor:
         return whole
 
     def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
-        """The trajectories with nothing moved.
+        """Trajectories at given parameters and trial effects.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
+            Free parameters, scaled.
         trial_effects : array, shape (n_trials, 4)
 
         Returns
         -------
         list of Trajectory
-            One a trial.
+            One per trial.
         """
-        return self.run_as(self.layout.model, self.together(theta, trial_effects))
+        return self.run_as(self.layout.model, self.job_arrays(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted position of every trial, m.
+        """Measured minus predicted positions of every trial.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
+            Free parameters, scaled.
         trial_effects : array, shape (n_trials, 4)
 
         Returns
         -------
-        list of arrays, shape (n_points,)
+        list of arrays, shape (n_points,), m
         """
         return self.residuals_of_each(theta, [trial_effects])[0]
 
-    def residuals_of_each(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
-        """`residuals` for several sets of the trials' own numbers, simulated in one call.
+    def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
+        """As `residuals`, for several sets of trial effects, simulated in one call.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            Free numbers, scaled.
-        ways : sequence of arrays, shape (n_trials, 4)
+            Free parameters, scaled.
+        effect_sets : sequence of arrays, shape (n_trials, 4)
 
         Returns
         -------
-        list of lists of arrays, shape (n_points,)
-            One list a way.
+        list of lists of arrays, shape (n_points,), m
+            One list per set.
         """
         count = len(self.data)
-        motions = self._simulated(self.layout.model, Jobs.joined([self.together(theta, way) for way in ways]))
-        observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(ways))]
-        return [self.by_trial(self._left(left_m, way)) for left_m, way in zip(observed_m, ways, strict=True)]
+        motions = self._simulated(
+            self.layout.model, Jobs.concatenated([self.job_arrays(theta, effects) for effects in effect_sets])
+        )
+        observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(effect_sets))]
+        return [
+            self.by_trial(self._residuals(left_m, effects))
+            for left_m, effects in zip(observed_m, effect_sets, strict=True)
+        ]
 
-    def _left(self, observed_m: Floats, trial_effects: Floats) -> Floats:
-        """Measured minus predicted positions of all trials, end to end."""
+    def _residuals(self, observed_m: Floats, trial_effects: Floats) -> Floats:
+        """Measured minus predicted positions of all trials, concatenated."""
         return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
 
     def by_trial(self, values: Floats) -> list[Floats]:
-        """What all trials have end to end, as an array for each.
+        """Split an array over the points of all trials into one per trial.
 
         Parameters
         ----------
@@ -302,43 +309,45 @@ class Predictor:
             Derivatives of the predicted position, m per unit of the column (trial effects SI, keys scaled); the last
             column is the residual, m.
         """
-        plain, whole = self.together(theta, trial_effects), self._deviations(theta, trial_effects)
-        moves = list(self._variations(plain, theta, whole, trial_effects_only))
-        motions = self._simulated(self.layout.model, Jobs.joined([plain, *(varied for _, _, varied in moves)]))
+        unperturbed, total = self.job_arrays(theta, trial_effects), self._total_deviations(theta, trial_effects)
+        perturbations = list(self._perturbations(unperturbed, theta, total, trial_effects_only))
+        motions = self._simulated(
+            self.layout.model, Jobs.concatenated([unperturbed, *(perturbed for _, _, perturbed in perturbations)])
+        )
         count = len(self.data)
         rows = motions.rows(0, count)
         table = np.zeros((rows.shape[0], N_TRIAL_EFFECTS + len(self.layout.keys) + 1))
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
-        table[:, -1] = self._left(rows[:, OBSERVED], trial_effects)
-        every = motions.trajectories() if past_end else []
+        table[:, -1] = self._residuals(rows[:, OBSERVED], trial_effects)
+        trajectories = motions.trajectories() if past_end else []
         first = count
-        for place, steps, varied in moves:
-            jobs, first = slice(first, first + len(varied)), first + len(varied)
-            points = self._points_of(varied.trial)
+        for place, steps, perturbed in perturbations:
+            jobs, first = slice(first, first + len(perturbed)), first + len(perturbed)
+            points = self._points_of(perturbed.trial)
             if past_end:
-                pairs = zip(varied.trial, every[jobs], strict=True)
-                change = np.concatenate([position_change(every[i], moved) for i, moved in pairs])
+                pairs = zip(perturbed.trial, trajectories[jobs], strict=True)
+                change = np.concatenate([position_change(trajectories[i], moved) for i, moved in pairs])
             else:
                 change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
-                self._clip(change, motions, varied.trial, jobs)
-            table[points, place] = change / np.repeat(steps, np.diff(self.starts)[varied.trial])
+                self._clip_after_end(change, motions, perturbed.trial, jobs)
+            table[points, place] = change / np.repeat(steps, np.diff(self.starts)[perturbed.trial])
         columns = self.by_trial(table)
-        self._share_damping(columns)
-        self._share_deviations(columns)
+        self._copy_damping_column(columns)
+        self._fill_between_columns(columns)
         if not (trial_effects_only or past_end):
-            self._adapt(table)
+            self._adapt_steps(table)
         return columns
 
     def _points_of(self, trials: NDArray[np.int_]) -> slice | NDArray[np.int_]:
-        """Rows of some trials among those of all, end to end."""
+        """Rows of some trials among the concatenated points of all."""
         if trials.size == len(self.data):
             return slice(None)
         return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in trials])
 
-    def _clip(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
-        """End what positions move by where the growth ends."""
-        ends = motions.ends[motions.like]
+    def _clip_after_end(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
+        """Set the changes of position after the end of growth, see `position_change.clip_at_end`."""
+        ends = motions.ends[motions.trajectory_of]
         if not np.any(ends[trials, 0] == ENDED):
             return
         starts = starts_of([self.times_s[i] for i in trials])
@@ -348,7 +357,7 @@ class Predictor:
                 clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=moved[0] == ENDED)
 
     def products(self, columns: Sequence[Floats]) -> Floats:
-        """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`.
+        """Cross products of the columns of every trial under its noise, see `whitening`.
 
         Parameters
         ----------
@@ -364,56 +373,58 @@ class Predictor:
             [trial_data.relative_sd for trial_data in self.data],
         )
 
-    def _variations(
-        self, plain: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
+    def _perturbations(
+        self, unperturbed: Jobs, theta: Floats, trial_effects: Floats, trial_effects_only: bool
     ) -> Iterator[tuple[int, Floats, Jobs]]:
-        """What to simulate for the differences: place of the column, the trials' steps, and the moved trajectories."""
-        if len(measured := np.flatnonzero(~self.plain_release)):
-            steps, varied = RELEASE_STEP_FRAMES * self.frames_s[measured], plain.take(measured)
-            yield RELEASE, steps, replace(varied, release_s=varied.release_s + steps)
-        if len(driven := np.flatnonzero(self.has_pressure_deviation)):
-            steps, varied = self.pressure_step[driven], plain.take(driven)
-            yield PRESSURE, steps, replace(varied, pressure_deviation=varied.pressure_deviation + steps)
-        if DAMPING not in self.layout.keys and len(damped := np.flatnonzero(self.has_damping_deviation)):
-            varied = plain.take(damped)
-            varied.row[:, self.damping_column] *= np.exp(DAMPING_STEP)
-            yield DAMPING_DEVIATION, np.full(damped.size, DAMPING_STEP), varied
+        """For each column to be differenced: its place, the step of each trial, and the perturbed jobs."""
+        if len(shifted_trials := np.flatnonzero(~self.release_is_shift)):
+            steps, perturbed = RELEASE_STEP_FRAMES * self.frames_s[shifted_trials], unperturbed.take(shifted_trials)
+            yield RELEASE, steps, replace(perturbed, release_s=perturbed.release_s + steps)
+        if len(pressure_trials := np.flatnonzero(self.has_pressure_deviation)):
+            steps, perturbed = self.pressure_step[pressure_trials], unperturbed.take(pressure_trials)
+            yield PRESSURE, steps, replace(perturbed, pressure_deviation=perturbed.pressure_deviation + steps)
+        if DAMPING not in self.layout.keys and len(damping_trials := np.flatnonzero(self.has_damping_deviation)):
+            perturbed = unperturbed.take(damping_trials)
+            perturbed.row[:, self.damping_column] *= np.exp(DAMPING_STEP)
+            yield DAMPING_DEVIATION, np.full(damping_trials.size, DAMPING_STEP), perturbed
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
-            feels = np.flatnonzero(self.layout.index[:, column] >= 0)
-            if not feels.size or (trial_effects_only and key != DAMPING) or self.layout.term(key) is not None:
+            trials_of_key = np.flatnonzero(self.layout.index[:, column] >= 0)
+            if not trials_of_key.size or (trial_effects_only and key != DAMPING) or self.layout.term(key) is not None:
                 continue
-            places = self.layout.index[feels, column]
+            places = self.layout.index[trials_of_key, column]
             step = float(self.steps[column])
             steps = np.where(theta[places] + step > upper[places], -step, step)
-            varied = plain.take(feels)
-            free = [self.layout.free[place] for place in places]
-            there = theta[places] + steps
+            perturbed = unperturbed.take(trials_of_key)
+            parameters = [self.layout.parameters[place] for place in places]
+            perturbed_theta = theta[places] + steps
             if key == YIELD_PRESSURE:
-                varied.yield_pressure_Pa[:] = [number.from_scaled(x) for number, x in zip(free, there, strict=True)]
+                perturbed.yield_pressure_Pa[:] = [
+                    number.from_scaled(x) for number, x in zip(parameters, perturbed_theta, strict=True)
+                ]
             elif key == DAMPING:
-                there = there + trial_effects[feels, DAMPING_DEVIATION]
-                varied.row[:, self.damping_column] = [
-                    number.from_scaled(x) for number, x in zip(free, there, strict=True)
+                perturbed_theta = perturbed_theta + trial_effects[trials_of_key, DAMPING_DEVIATION]
+                perturbed.row[:, self.damping_column] = [
+                    number.from_scaled(x) for number, x in zip(parameters, perturbed_theta, strict=True)
                 ]
             else:
-                here_and_there = zip(free, theta[places], there, strict=True)
+                pairs = zip(parameters, theta[places], perturbed_theta, strict=True)
                 k = self.layout.model.parameter_names.index(key)
-                varied.row[:, k] += [
-                    number.from_scaled(x) - number.from_scaled(here) for number, here, x in here_and_there
-                ]
-            yield N_TRIAL_EFFECTS + column, steps, varied
+                perturbed.row[:, k] += [number.from_scaled(x) - number.from_scaled(base) for number, base, x in pairs]
+            yield N_TRIAL_EFFECTS + column, steps, perturbed
 
-    def _share_damping(self, columns: list[Floats]) -> None:
-        """A trial's deviation of B and ln B itself are one sensitivity."""
+    def _copy_damping_column(self, columns: list[Floats]) -> None:
+        """Copy the sensitivity to ln B to the deviation of ln B: they are the same."""
         if DAMPING not in self.layout.keys:
             return
         column = self.layout.keys.index(DAMPING)
         for i in np.flatnonzero(self.has_damping_deviation):
             columns[i][:, DAMPING_DEVIATION] = columns[i][:, N_TRIAL_EFFECTS + column]
 
-    def _share_deviations(self, columns: list[Floats]) -> None:
-        """What trials differ by systematically moves them as their own deviation does, times its regressor."""
+    def _fill_between_columns(self, columns: list[Floats]) -> None:
+        """Sensitivities to the coefficients of differences between trials: that to the deviation times the
+        regressor.
+        """
         for term in self.layout.between:
             if term.key not in self.layout.keys:
                 continue
@@ -421,30 +432,19 @@ class Predictor:
             for i in np.flatnonzero(self.layout.index[:, column] >= 0):
                 columns[i][:, N_TRIAL_EFFECTS + column] = term.scale * term.regressor[i] * columns[i][:, source]
 
-    def _adapt(self, table: Floats) -> None:
-        """Steps for the next time, from how far these moved the trajectories."""
-        answers = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
+    def _adapt_steps(self, table: Floats) -> None:
+        """Adapt the step sizes for the next call to how far these steps moved the trajectories."""
+        responses = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
         for column in range(len(self.layout.keys)):
-            self.steps[column] = _step(float(np.max(answers[:, N_TRIAL_EFFECTS + column])), float(self.steps[column]))
+            self.steps[column] = _adapted_step(
+                float(np.max(responses[:, N_TRIAL_EFFECTS + column])), float(self.steps[column])
+            )
         for i in np.flatnonzero(self.has_pressure_deviation):
-            self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
+            self.pressure_step[i] = _adapted_step(float(responses[i, PRESSURE]), float(self.pressure_step[i]))
 
 
-def _twins(
-    data: Sequence[FitTrial], rigs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
-) -> NDArray[np.int_]:
-    """Of every trial the first of the same settings and instants, shape (n_trials,)."""
-    first: dict[tuple[object, ...], int] = {}
-    twins = np.arange(len(data))
-    for i, trial_data in enumerate(data):
-        if trial_data.trace is None:
-            key = (rigs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
-            twins[i] = first.setdefault(key, i)
-    return twins
-
-
-def _step(answer: float, before: float) -> float:
-    """Step that moves a trajectory as far as aimed at, given how far a unit step would."""
-    if not answer > 0:
-        return before
-    return float(np.clip(TARGET_RESPONSE / answer, SMALLEST_STEP, LARGEST_STEP))
+def _adapted_step(response: float, previous: float) -> float:
+    """Step that gives the target response, from the response to a unit step."""
+    if not response > 0:
+        return previous
+    return float(np.clip(TARGET_RESPONSE / response, SMALLEST_STEP, LARGEST_STEP))

@@ -1,4 +1,4 @@
-"""Trajectories to simulate, as arrays: a fit asks for a hundred at a time, thousands of times over."""
+"""Jobs of trajectories to simulate, as arrays: a fit needs a hundred at a time, thousands of times."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.batch import Batch, starts_of
 from vinetrack.dynamics.simulate import Trajectory, check_completed, trajectories
+from vinetrack.inference.fit_data import FitTrial
 
 OBSERVED = 3
-"""Column of `Motions.rows` that holds the position of the edge as the camera reports it. Defined by the kernel."""
+"""Column of `Motions.rows` with the position of the edge as the camera reports it. Defined by the kernel."""
 
 
 class Job(NamedTuple):
-    """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
+    """One trajectory to simulate: its trial, parameters, pressures and release, and a factor on its payload."""
 
     trial: int
     row: Floats
@@ -31,7 +32,7 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True)
 class Jobs:
-    """Trajectories to simulate, an entry of every array for each; `row` has shape (n_jobs, n_parameters), SI."""
+    """Trajectories to simulate, one entry of each array per job; `row` has shape (n_jobs, n_parameters), SI."""
 
     trial: NDArray[np.int_]
     row: Floats
@@ -42,7 +43,7 @@ class Jobs:
 
     @classmethod
     def of(cls, jobs: Sequence[Job]) -> Jobs:
-        """Single jobs together.
+        """Combine single jobs.
 
         Parameters
         ----------
@@ -57,12 +58,12 @@ class Jobs:
         return cls(np.array(trials, dtype=int), np.array(rows).reshape(len(jobs), -1), *others)
 
     def with_effect(self, values: Sequence[float]) -> Jobs:
-        """The same trajectories of a model with one effect more.
+        """The same trajectories for a model with one more effect.
 
         Parameters
         ----------
         values : sequence of float
-            Its parameters, SI, alike for all.
+            Its parameters, SI, the same for all.
 
         Returns
         -------
@@ -74,7 +75,7 @@ class Jobs:
         return self.trial.size
 
     def take(self, places: NDArray[np.int_]) -> Jobs:
-        """Some of them, copied.
+        """A copy of some of the jobs.
 
         Parameters
         ----------
@@ -87,8 +88,8 @@ class Jobs:
         trial, *numbers = self._columns
         return Jobs(trial[places], *(values[places] for values in numbers))
 
-    def single(self) -> list[Job]:
-        """Each of them.
+    def as_list(self) -> list[Job]:
+        """The jobs as a list.
 
         Returns
         -------
@@ -98,8 +99,8 @@ class Jobs:
         return [Job(i, row, *numbers) for i, row, *numbers in zip(self.trial.tolist(), rows, *columns, strict=True)]
 
     @classmethod
-    def joined(cls, parts: Sequence[Jobs]) -> Jobs:
-        """All of several, one after the other.
+    def concatenated(cls, parts: Sequence[Jobs]) -> Jobs:
+        """Concatenate several sets of jobs.
 
         Parameters
         ----------
@@ -116,29 +117,54 @@ class Jobs:
     def _columns(self) -> tuple[NDArray[Any], ...]:
         return tuple(vars(self).values())
 
-    def distinct(self, twins: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Which of them are the first of their kind, and of each which of those is like it.
+    def distinct(self, identical_trials: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Indices of distinct jobs, and for each job its index among the distinct ones.
 
         Parameters
         ----------
-        twins : array of int, shape (n_trials,)
-            Of every trial the first of the same settings and instants.
+        identical_trials : array of int, shape (n_trials,)
+            For each trial the first one with the same settings and times.
 
         Returns
         -------
         first : array of int, shape (n_distinct,)
-        like : array of int, shape (n_jobs,)
+        inverse : array of int, shape (n_jobs,)
         """
-        numbers = np.column_stack([twins[self.trial].astype(float), *self._columns[1:]])
+        numbers = np.column_stack([identical_trials[self.trial].astype(float), *self._columns[1:]])
         first: dict[bytes, int] = {}
-        like = [first.setdefault(numbers[k].tobytes(), k) for k in range(len(numbers))]
-        return np.unique(like, return_inverse=True)
+        trajectory_of = [first.setdefault(numbers[k].tobytes(), k) for k in range(len(numbers))]
+        return np.unique(trajectory_of, return_inverse=True)
+
+
+def first_identical_trials(
+    data: Sequence[FitTrial], inputs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
+) -> NDArray[np.int_]:
+    """For each trial the first one with the same settings and times.
+
+    Parameters
+    ----------
+    data : sequence of FitTrial
+    inputs : array, shape (n_trials, n_fields of `TrialInputs`), SI
+    bends : of each trial
+
+    Returns
+    -------
+    array of int, shape (n_trials,)
+    """
+    first: dict[tuple[object, ...], int] = {}
+    identical_trials = np.arange(len(data))
+    for i, trial_data in enumerate(data):
+        if trial_data.trace is None:
+            key = (inputs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
+            identical_trials[i] = first.setdefault(key, i)
+    return identical_trials
 
 
 class Average(NamedTuple):
-    """Positions that are means over instants about a point: all instants, s, those that each mean takes, its weights.
+    """Weighted averages of positions over times around each point.
 
-    `instants_s` increases; `place` has shape (n_points, n_weights).
+    `instants_s` are all times needed, increasing; `place`, shape (n_points, n_weights), are the indices of those that
+    each average uses; `weights` are the weights.
     """
 
     instants_s: Floats
@@ -147,7 +173,7 @@ class Average(NamedTuple):
 
     @classmethod
     def of(cls, time_s: Floats, offsets_s: Floats, weights: Floats) -> Average:
-        """About points at these times.
+        """Averages around points at these times.
 
         Parameters
         ----------
@@ -159,28 +185,28 @@ class Average(NamedTuple):
         -------
         Average
         """
-        about_s = np.add.outer(time_s, offsets_s)
-        order = np.argsort(about_s, axis=None, kind="stable")
+        instants_s = np.add.outer(time_s, offsets_s)
+        order = np.argsort(instants_s, axis=None, kind="stable")
         place = np.empty(order.size, dtype=int)
         place[order] = np.arange(order.size)
-        return cls(about_s.ravel()[order], place.reshape(about_s.shape), weights)
+        return cls(instants_s.ravel()[order], place.reshape(instants_s.shape), weights)
 
 
 @dataclass(frozen=True)
 class Motions:
-    """What was simulated for jobs: rows of `out` and `ends` as `Batch.run` returns them, for distinct trajectories.
+    """Simulated trajectories of jobs: `out` and `ends` as `Batch.run` returns them, one entry per distinct trajectory.
 
-    `ratios` are the travel ratios of their trials; `like`, shape (n_jobs,), tells of each job which is its own.
+    `ratios` are the travel ratios of their trials; `trajectory_of`, shape (n_jobs,), is the trajectory of each job.
     """
 
     batch: Batch
     out: Floats
     ends: Floats
     ratios: list[float]
-    like: NDArray[np.int_]
+    trajectory_of: NDArray[np.int_]
 
     @classmethod
-    def of(cls, batch: Batch, trials: Sequence[Trial], like: NDArray[np.int_]) -> Motions:
+    def of(cls, batch: Batch, trials: Sequence[Trial], trajectory_of: NDArray[np.int_]) -> Motions:
         """Integrate a batch.
 
         Parameters
@@ -188,9 +214,9 @@ class Motions:
         batch : Batch
             Distinct trajectories.
         trials : sequence of Trial
-            One a trajectory.
-        like : array of int, shape (n_jobs,)
-            Of each job its trajectory.
+            One per trajectory.
+        trajectory_of : array of int, shape (n_jobs,)
+            Trajectory of each job.
 
         Returns
         -------
@@ -199,19 +225,19 @@ class Motions:
         Raises
         ------
         SimulationError
-            If the integration does not get through.
+            If an integration fails.
         """
         out, ends = batch.run()
         check_completed(ends, [trial.name for trial in trials])
-        return cls(batch, out, ends, [trial.travel_ratio for trial in trials], like)
+        return cls(batch, out, ends, [trial.travel_ratio for trial in trials], trajectory_of)
 
     def averaged(self, averages: Sequence[Average]) -> Motions:
-        """The same at the points that were asked for, their reported positions averaged over the instants about them.
+        """The motions at the requested points, their reported positions averaged over the times around them.
 
         Parameters
         ----------
         averages : sequence of Average
-            One a trajectory, whose instants it was followed at.
+            One per trajectory, which was simulated at its times.
 
         Returns
         -------
@@ -230,7 +256,7 @@ class Motions:
         return replace(self, batch=batch, out=np.concatenate(out))
 
     def rows(self, first: int, last: int) -> Floats:
-        """Rows of `out` of jobs `first` up to `last`, end to end.
+        """Rows of `out` of jobs `first` up to `last`, concatenated.
 
         Parameters
         ----------
@@ -241,13 +267,17 @@ class Motions:
         array, shape (n_times, 4)
             Position, velocity and acceleration of the tail, position of the edge as the camera reports it.
         """
-        starts, like = self.batch.starts, self.like[first:last]
-        if like.size and like[-1] - like[0] == like.size - 1 and np.all(np.diff(like) == 1):
-            return self.out[starts[like[0]] : starts[like[-1] + 1]]
-        return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in like])
+        starts, trajectory_of = self.batch.starts, self.trajectory_of[first:last]
+        if (
+            trajectory_of.size
+            and trajectory_of[-1] - trajectory_of[0] == trajectory_of.size - 1
+            and np.all(np.diff(trajectory_of) == 1)
+        ):
+            return self.out[starts[trajectory_of[0]] : starts[trajectory_of[-1] + 1]]
+        return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in trajectory_of])
 
     def stamps(self, job: int) -> Floats:
-        """Instants of a job since its release, s, as the camera has them.
+        """Times of a job since its release, s, on the camera's clock.
 
         Parameters
         ----------
@@ -257,14 +287,16 @@ class Motions:
         -------
         array, shape (n_times,)
         """
-        return self.batch.stamps[self.batch.starts[self.like[job]] : self.batch.starts[self.like[job] + 1]]
+        return self.batch.stamps[
+            self.batch.starts[self.trajectory_of[job]] : self.batch.starts[self.trajectory_of[job] + 1]
+        ]
 
     def trajectories(self) -> list[Trajectory]:
-        """A trajectory for each job.
+        """One trajectory per job.
 
         Returns
         -------
         list of Trajectory
         """
-        known = trajectories(self.batch, self.out, self.ends, self.ratios)
-        return [known[k] for k in self.like]
+        distinct_trajectories = trajectories(self.batch, self.out, self.ends, self.ratios)
+        return [distinct_trajectories[k] for k in self.trajectory_of]

@@ -45,7 +45,7 @@ one draw in thousands leaves the range where a linear answer holds."""
 class PartlyLinear(Predictor):
     """Simulates new trials; the old ones answer by the sensitivities that their fit ended with."""
 
-    divisible = False
+    separable = False
 
     def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
         super().__init__(layout, [*old.data, *new], old.host)
