@@ -396,7 +396,7 @@ class Predictor:
             step = float(self.steps[column])
             steps = np.where(theta[places] + step > upper[places], -step, step)
             perturbed = unperturbed.take(trials_of_key)
-            parameters = [self.layout.parameters[place] for place in places]
+            parameters = [self.layout.free[place] for place in places]
             perturbed_theta = theta[places] + steps
             if key == YIELD_PRESSURE:
                 perturbed.yield_pressure_Pa[:] = [
@@ -422,9 +422,7 @@ class Predictor:
             columns[i][:, DAMPING_DEVIATION] = columns[i][:, N_TRIAL_EFFECTS + column]
 
     def _fill_between_columns(self, columns: list[Floats]) -> None:
-        """Sensitivities to the coefficients of differences between trials: that to the deviation times the
-        regressor.
-        """
+        """Sensitivities to coefficients of differences between trials: that to the deviation, times the regressor."""
         for term in self.layout.between:
             if term.key not in self.layout.keys:
                 continue
