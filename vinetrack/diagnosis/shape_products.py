@@ -172,7 +172,15 @@ def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
 
 def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
     """Problem and state of a part of the trials."""
-    arrays = ("index", "feels", "gauge_error", "release_origin_mean", "release_origin_precision", "points", "stretches")
+    arrays = (
+        "index",
+        "has_deviation",
+        "gauge_error",
+        "release_origin_mean",
+        "release_origin_precision",
+        "points",
+        "stretches",
+    )
     return (
         replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
         replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),
