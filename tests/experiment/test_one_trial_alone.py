@@ -85,6 +85,6 @@ def test_either_of_two_point_masses_of_a_real_project() -> None:
     common = min(third.time_s.size, seventh.time_s.size) - 1
     assert seventh.time_s[common] == pytest.approx(third.time_s[common])
     assert np.ptp(seventh.lead_position_m[: common + 1]) > np.ptp(third.lead_position_m[: common + 1])
-    assert not any("left aside" in note for note in seventh.notes)
+    assert not any("not used:" in note for note in seventh.notes)
     part = read_track(path, point_mass="cup 3", frames_used=(2, 8))
     assert 5 <= part.time_s.size < third.time_s.size

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from vine_truth import Vine, ar1, record
 
-from vinetrack.tracks.noise_shape import NoiseShape, correlated_gain, noise_shape
+from vinetrack.tracks.noise_shape import NoiseShape, ar1_difference_gain, noise_shape
 
 BLUR_S = 60e-6
 NOISE_M = 6e-5
@@ -72,4 +72,4 @@ def test_the_gain_of_correlated_noise_is_that_of_long_series():
     for rho in (0.3, 0.7):
         noise = ar1(200_000, 1.0, rho, np.random.default_rng(20400))
         fourth = np.diff(noise, 4) / np.sqrt(70)
-        assert fourth.std() == pytest.approx(correlated_gain(rho), rel=0.02)
+        assert fourth.std() == pytest.approx(ar1_difference_gain(rho), rel=0.02)

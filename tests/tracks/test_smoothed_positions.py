@@ -43,7 +43,7 @@ def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
 def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
     found = detect_smoothing(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
     assert found is not None
-    assert (found.window, found.degree, found.alike) == (frames, 0, frames)
+    assert (found.window, found.degree, found.decimation) == (frames, 0, frames)
     assert f"a moving average over {frames} frames" in found.note
 
 
@@ -52,7 +52,7 @@ def test_a_polynomial_is_told_from_a_moving_average(frames: int) -> None:
     found = detect_smoothing(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
     assert found is not None
     assert (found.window, found.degree) == (frames, 2)
-    assert 1 < found.alike < frames
+    assert 1 < found.decimation < frames
 
 
 def test_digits_that_were_rounded_afterwards_hide_nothing() -> None:

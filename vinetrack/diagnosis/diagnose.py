@@ -47,7 +47,7 @@ from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.narrative.verdict_text import explain
-from vinetrack.tracks.wild_points import rejected_points_note
+from vinetrack.tracks.outliers import rejected_points_note
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment

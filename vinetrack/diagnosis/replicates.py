@@ -17,8 +17,8 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.left_out import FEWEST_AT_REST, scaled_least_squares
+from vinetrack.tracks.outliers import FEWEST_POINTS, local_fit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
-from vinetrack.tracks.wild_points import FEWEST_POINTS, local_fit
 
 MIN_SINGULAR_VALUE = 0.05
 """Of a shift in time and one in position, the least singular value by which both are found. Chosen: below it the motion

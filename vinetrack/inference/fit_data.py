@@ -219,7 +219,7 @@ def prepare_trial(
         # Near both ends the filter has no full window, and programs differ in how they pad it.
         places = np.flatnonzero(usable)[smoothing.window // 2 : -(smoothing.window // 2)]
         smoothed_frame_s = float(np.median(np.diff(track.time_s[places])))
-        usable = np.isin(np.arange(usable.size), places[:: smoothing.alike])
+        usable = np.isin(np.arange(usable.size), places[:: smoothing.decimation])
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
         raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")

@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_trial
 from vinetrack.inference.gauge_noise import quiet_traces
-from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
+from vinetrack.tracks.noise_shape import ar1_difference_gain, noise_shape
 from vinetrack.tracks.position_noise import common_rounding_noise
 from vinetrack.tracks.smoothed_positions import detect_smoothing
 
@@ -62,7 +62,7 @@ def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
         return data
     # One correlation for all trials, as in a fit: a single track with unequal noise hardly determines it.
     correlation = np.average([data[i].correlation for i in imported], weights=[data[i].time_s.size for i in imported])
-    gain = correlated_gain(float(correlation))
+    gain = ar1_difference_gain(float(correlation))
     weighted = list(data)
     for i, sd_m in zip(imported, shape.sd_m, strict=True):
         typical_m = math.exp(float(np.mean(np.log(sd_m))))

@@ -231,7 +231,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
     -------
     mapping of JSON types
         Without a scale positions are in pixels, without a rate times are in frames: `scaled` and `timed` tell. Flags
-        are those of the tracker alone: wild points and frames that only `tracks.frame_timing.correct_frames` finds,
+        are those of the tracker alone: outliers and frames that only `tracks.frame_timing.correct_frames` finds,
         which needs the noise of positions, are marked where the trial is analysed.
 
     Raises

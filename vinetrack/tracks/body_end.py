@@ -1,4 +1,4 @@
-"""Where the way of a body that moves as a whole ends in an imported track: it turns back (a bounce), or stops dead."""
+"""Find where the motion of a body in an imported track ends: it turns back (a bounce) or stops abruptly."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from vinetrack.core.records import Floats, Track, join_flags
 from vinetrack.tracks.position_noise import rough_noise
 
-BACK_SIGMAS, BACK_PART = 8.0, 0.02
-"""A body this far behind where it was, in standard deviations of a position and as a part of its way, has turned back.
-Chosen: two such points in a row never come by chance. By reasoning: at half wild points end tracks; at twice the first
-points of a bounce stay."""
+BACK_SIGMAS, BACK_TRAVEL_PART = 8.0, 0.02
+"""Distance behind its furthest place, in standard deviations of a position and as a part of its travel, at which a body
+has turned back. Chosen: two such points in a row never come by chance. By reasoning: at half outliers end tracks; at
+twice the first points of a bounce stay."""
 STILL_SIGMAS, FEWEST_STILL = 5.0, 3
-"""Points at the end that stand, to within so many standard deviations, and how many show a stop. Chosen as in the fit
-of growing vines. By reasoning: at half noise hides the stop; at twice slow motion passes for one."""
-DEAD_STOP = 0.5
-"""Part of the usual step that the last step before a dead stop still has. Chosen: friction brings a body to rest over
-many steps. By reasoning: at half a body that slides to rest loses its end; at twice impacts between frames are
-missed."""
+"""Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop. Chosen as in the
+fit of growing vines. By reasoning: at half noise hides the stop; at twice slow motion passes for one."""
+ABRUPT_STEP_PART = 0.5
+"""Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt. Chosen: friction
+brings a body to rest over many steps. By reasoning: at half a body that slides to rest loses its end; at twice impacts
+between frames are missed."""
 FEWEST_LEFT = 5
-"""Points that must be left. Derived: those that a track needs."""
+"""Fewest points that must be left. Derived: those that a track needs."""
 
 
 def flag_end_of_body(track: Track) -> Track:
-    """The track with points after the end of the body's way flagged `after_end`, and the end told in its notes.
+    """Flag points after the end of the body's motion `after_end`, and report the end in the notes.
 
     Parameters
     ----------
@@ -54,18 +54,18 @@ def flag_end_of_body(track: Track) -> Track:
 
 def _turns_back(y: Floats, noise_m: float) -> int | None:
     """Furthest point before the body comes back; None where it does not."""
-    back = np.maximum.accumulate(y) - y > max(BACK_SIGMAS * noise_m, BACK_PART * float(np.ptp(y)))
-    turned = np.flatnonzero(back[:-1] & back[1:])
+    is_back = np.maximum.accumulate(y) - y > max(BACK_SIGMAS * noise_m, BACK_TRAVEL_PART * float(np.ptp(y)))
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     return int(np.argmax(y[: turned[0] + 1])) if turned.size else None
 
 
 def _stops_dead(y: Floats, noise_m: float) -> int | None:
     """First point of a standstill that lasts to the end and begins within a frame; None where there is none."""
-    near = max(STILL_SIGMAS * noise_m, 1e-9)
-    moving = np.flatnonzero(np.abs(y - np.median(y[-FEWEST_STILL:])) > near)
+    tolerance_m = max(STILL_SIGMAS * noise_m, 1e-9)
+    moving = np.flatnonzero(np.abs(y - np.median(y[-FEWEST_STILL:])) > tolerance_m)
     if not moving.size or y.size - moving[-1] - 1 < FEWEST_STILL or moving[-1] < FEWEST_LEFT:
         return None
     last = int(moving[-1])
-    usual = float(np.median(np.diff(y[last - FEWEST_LEFT : last + 1])))
-    before = float(y[last] - y[last - 1])
-    return last + 1 if usual > near and before > DEAD_STOP * usual else None
+    median_step = float(np.median(np.diff(y[last - FEWEST_LEFT : last + 1])))
+    last_step = float(y[last] - y[last - 1])
+    return last + 1 if median_step > tolerance_m and last_step > ABRUPT_STEP_PART * median_step else None

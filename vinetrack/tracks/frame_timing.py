@@ -1,19 +1,19 @@
-"""Frames that a camera repeated or dropped: found from the motion itself, flagged, and the times put right.
+"""Find frames that a camera repeated or dropped from the motion itself, flag them, and correct the times.
 
-A repeated frame shows as a step of nothing in steady motion. Is the next step double, the copy replaced a frame (a
-*stale* copy: the times are right); is it single, the copy was *inserted* and everything after it is one frame late. A
+A repeated frame shows as a zero step in steady motion. If the next step is double, the copy replaced a frame (a *stale*
+copy: the times are right); if it is single, the copy was *inserted* and everything after it is one frame late. A
 dropped frame shows as one step of double length, and everything after it is one frame early.
 
-A jump is judged against the jump that a smooth motion with the track's own noise could show: by least squares of a
-parabola with a step on the nearest points on both sides. Times are moved only where one wild point would not explain
-it as well and points farther away agree: noise may have heavy tails. Points far off the motion around them are rejected
-first (`wild_points`): a dropped frame displaces all later points, a wild point comes back. One that comes to lie where
-the point before does is a copy's double, and waits until copies were judged. Nothing is called where the
-motion is slow beside the noise, where it speeds up so fast that a long step may be the motion itself (release), or
-where the times are irregular.
+A jump is tested against the jump that a smooth motion with the track's own noise could show: by least squares of a
+parabola with a step on the nearest points on both sides. Times are changed only where a single outlier would not
+explain the jump as well and points farther away agree: noise may have heavy tails. Outliers are rejected first
+(`outliers`): a dropped frame displaces all later points, an outlier does not. An outlier that lies where the point
+before lies may be a copy, and is examined again once copies have been judged. No fault is reported where the motion is
+slow compared with the noise, where it accelerates so fast that a long step may be the motion itself (release), or where
+the times are irregular.
 
-The tracker of recordings looks at single steps with `step_gaps`, before positions are in metres; what that has marked
-as a gap is not told again by `correct_frames`.
+The tracker of recordings examines single steps with `step_gaps`, before positions are in metres; what that has marked
+as a gap is not reported again by `correct_frames`.
 """
 
 from __future__ import annotations
@@ -25,76 +25,77 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags, with_flag
-from vinetrack.tracks.position_noise import THIRD_DIFFERENCE, robust_position_noise
-from vinetrack.tracks.wild_points import local_noise, reject_wild_points
+from vinetrack.tracks.outliers import local_noise, reject_outliers
+from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, robust_position_noise
 
 CLEAR_STEP_SIGMAS = 8.0
-"""Motion is well above noise where one frame's step exceeds this many standard deviations of a position."""
+"""Step of a frame, in standard deviations of a position, above which motion is well above the noise. Chosen: 5.7
+standard errors of a step, which is the difference of two positions."""
 
 DROP_RATIO = 1.6
-"""A step above this many times its neighbours is a dropped frame. Chosen between 1, a steady step, and 2, a step over
-one dropped frame, nearer to 2 since speed rises from frame to frame at release. By reasoning: at half every step is a
-suspect, at twice (3.2) only two dropped frames in a row are found."""
+"""Ratio of a step to its neighbours above which frames were dropped. Chosen between 1, a steady step, and 2, a step
+over one dropped frame, nearer to 2 since speed rises from frame to frame at release. By reasoning: at half every step
+is a suspect, at twice (3.2) only two dropped frames in a row are found."""
 
 JUMP_SIGMAS = 5.5
-"""Least significance of a jump: 4e-8 by chance, 1e-4 over a long campaign's frames. Derived from the normal
-distribution, two-sided. By reasoning: at half (2.8) one step in 170 passes; at twice, steps below eleven standard
-errors of a jump are left in."""
+"""Least significance of a jump, in standard errors: 4e-8 by chance, 1e-4 over a long campaign's frames. Derived from
+the normal distribution, two-sided. By reasoning: at half (2.8) one step in 170 passes; at twice, steps below eleven
+standard errors of a jump remain."""
 
-STILL, STILL_SIGMAS = 0.25, 5.0
-"""A copy stands still to within this part of a step, which must be this significant; a copy is nearly exact. Chosen.
-By reasoning: at half, positions rounded to a tenth of a step hide copies; at twice, slow frames of a motion that stops
-and goes pass for copies."""
+STILL_PART, STILL_SIGMAS = 0.25, 5.0
+"""A copy stands still to within this part of a step, and the step must be this significant; a copy is nearly exact.
+Chosen. By reasoning: at half, positions rounded to a tenth of a step hide copies; at twice, slow frames of a motion
+that stops and goes pass for copies."""
 
-LONG_BEFORE_COPY = 1.4
-"""A step so many times those around it, just before what looks like an inserted copy, is one point seen ahead. Chosen
-between a usual step, 1, and a step ahead, 2. By reasoning: near 1 real copies in motion that speeds up are kept as
-points ahead; beyond 2 no point ahead is recognised."""
+AHEAD_RATIO = 1.4
+"""Ratio of the step just before an apparent inserted copy to those around it, above which the point before the copy was
+seen ahead of its time. Chosen between a usual step, 1, and a step ahead, 2. By reasoning: near 1 real copies in
+accelerating motion are kept as points ahead; beyond 2 no point ahead is recognised."""
 
 COPY_SIGMAS = 3.5
 """Least significance of the step back after an inserted copy. Chosen: 2e-4 by chance, for steps that already stand
-still. By reasoning: at half one in 25 such steps moves the times; at twice copies in noisy tracks stay."""
+still. By reasoning: at half one in 25 such steps changes the times; at twice copies in noisy tracks stay."""
 
 SIDE_POINTS = (8, 5, 3)
-"""Points taken on either side, fewer where release or the end of growth is near. Chosen: a parabola with a step has
-four numbers, so that 2 × 3 points are the fewest that show scatter, and over 2 × 8 the speed changes little. By
+"""Points used on either side, fewer where release or the end of growth is near. Chosen: a parabola with a step has four
+parameters, so that 2 × 3 points are the fewest that show scatter, and over 2 × 8 the speed changes little. By
 reasoning: half as many find fewer jumps in noise; twice as many leave no parabola near release."""
 
-SLOWEST_SIDE = 0.75
-"""Each side alone moves at least this part of a clear step. Chosen. By reasoning: at half, jumps are looked for where
-one step hardly stands out of the noise; at twice (1.5), only where motion is 12 standard deviations a frame."""
+LEAST_SIDE_PART = 0.75
+"""Least motion of each side, as a part of a clear step. Chosen. By reasoning: at half, jumps are looked for where one
+step hardly stands out of the noise; at twice (1.5), only where motion is 12 standard deviations a frame."""
 
-SIMILAR_SIDES = 1.8
+LARGEST_SPEED_RATIO = 1.8
 """Largest ratio of the speeds just before and just after: beyond it a long step may be the motion itself. Chosen just
 below 2, the ratio of a double step. By reasoning: at half nothing passes; at twice a release passes for a dropped
 frame."""
 
-LARGEST_MISFIT = 0.1
+LARGEST_MISFIT_PART = 0.1
 """Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump. Chosen: a jump of
 one step is then ten times the scatter. By reasoning: at half, tracks with noise of 5 % of a step are not corrected; at
 twice, stop-and-go motion is."""
 
-WILD_RATIO, WILD_SIGMAS = 3.0, 4.0
-"""A single wild point must leave so many times the squares of a jump, and so many squared deviations more. Chosen. By
-reasoning: at half, wild points move times; at twice, dropped frames in noisy tracks stay."""
+OUTLIER_RATIO, OUTLIER_SIGMAS = 3.0, 4.0
+"""A single outlier must leave this many times the sum of squares that a jump leaves, and this many squared standard
+deviations more, to be ruled out. Chosen. By reasoning: at half, outliers change times; at twice, dropped frames in
+noisy tracks stay."""
 
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
-"""Points on either side that must see at least this part of the jump too, where they can tell. Chosen: 48 points know
-a step three times better than 16, and one cubic still follows them away from release. By reasoning: at half they
-repeat the nearest points; at twice few motions follow one cubic, and the test says nothing."""
+"""Points on either side that must show at least this part of the jump too, where they are conclusive. Chosen: 48 points
+know a step three times better than 16, and one cubic still follows them away from release. By reasoning: at half they
+repeat the nearest points; at twice few motions follow one cubic, and the test is inconclusive."""
 
-ALONE = 2.0
-"""Where points farther away cannot tell, as near release, a jump must be so many times as significant to be sure of it:
-a few points with heavy tails make up what the normal distribution never does. Measured: in 100 campaigns with
-heavy-tailed noise and all their frames (null:heavy_tails of `benchmarks/hidden_effects.py`, tuning seeds 20600 to
-20699) times were moved for four jumps of 5.9 to 9.8 standard errors, none of them sure by this. Each of 38 campaigns
-with dropped frames (frames:dropped, 20600 to 20639) has a jump that is. At half all are sure, at twice those near
-release never."""
+SURE_FACTOR = 2.0
+"""Factor on JUMP_SIGMAS for a jump that points farther away cannot confirm, as near release: a few points with heavy
+tails produce what the normal distribution never does. Measured: in 100 campaigns with heavy-tailed noise and all their
+frames (null:heavy_tails of `benchmarks/hidden_effects.py`, tuning seeds 20600 to 20699) times were changed for four
+jumps of 5.9 to 9.8 standard errors, none of them sure by this. Each of 38 campaigns with dropped frames
+(frames:dropped, 20600 to 20639) has a jump that is. At half all are sure, at twice those near release never are."""
 
-UNEVEN = 0.05
-"""Spacings within this fraction of a whole number of frames count as even: printed times are rounded. Chosen: times
-printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: at half such times count as uneven and
-are left alone; at twice irregular times are corrected as if even."""
+UNEVEN_PART = 0.05
+"""Deviation of a spacing from a whole number of frames, as a part of it, below which the spacing is even: printed times
+are rounded. Chosen: times printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: at half such
+times count as uneven and are left unchanged; at twice irregular times are corrected as if even."""
 
 
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
@@ -102,7 +103,7 @@ _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
 
 
 @dataclass(frozen=True)
-class _Event:
+class _Fault:
     """A fault on the way to row `row`: a frame repeated (stale or inserted) or `missing` frames dropped."""
 
     kind: str
@@ -111,7 +112,7 @@ class _Event:
 
 
 def correct_frames(track: Track) -> Track:
-    """A copy of the track with repeated frames flagged, gaps flagged, and times put right.
+    """Flag repeated frames and gaps of a track, and correct its times.
 
     Parameters
     ----------
@@ -120,40 +121,40 @@ def correct_frames(track: Track) -> Track:
     Returns
     -------
     Track
-        `rejected` on wild points; `duplicate` on repeated frames; `gap` on the first row after a gap in the times;
-        `gap;retimed` on the first row after dropped frames that the times did not show. Each is told in `notes`, but
-        for gaps in the times that were marked before. A repeated frame that was inserted is set half a frame after
+        `rejected` on outliers; `duplicate` on repeated frames; `gap` on the first row after a gap in the times;
+        `gap;retimed` on the first row after dropped frames that the times did not show. Each is reported in `notes`,
+        except gaps in the times that were marked before. A repeated frame that was inserted is set half a frame after
         the frame it repeats, so that times still increase.
     """
-    return reject_wild_points(_corrected(reject_wild_points(track, spare_copies=True)))
+    return reject_outliers(_correct_timing(reject_outliers(track, spare_copies=True)))
 
 
-def _corrected(track: Track) -> Track:
-    """The same of a track without wild points, but for those that may be copies."""
+def _correct_timing(track: Track) -> Track:
+    """Correct the times of a track without outliers, other than those that may be copies."""
     spacing = np.diff(track.time_s)
     if track.time_s.size < 6 or not np.all(spacing > 0):
         return track
     step_s = float(np.median(spacing))
     frames = spacing / step_s
-    if np.any(np.abs(frames - np.rint(frames)) > UNEVEN * np.maximum(np.rint(frames), 1.0)):
+    if np.any(np.abs(frames - np.rint(frames)) > UNEVEN_PART * np.maximum(np.rint(frames), 1.0)):
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
     noise_m, rho = _noise(out)
     out = _retime_known_copies(out, step_s, noise_m, rho)
-    tried = 0
-    while (event := _next_event(out, tried, step_s, noise_m, rho)) is not None:
-        out = _apply(out, event, step_s)
-        tried = event.row
+    checked_to = 0
+    while (fault := _next_fault(out, checked_to, step_s, noise_m, rho)) is not None:
+        out = _correct_fault(out, fault, step_s)
+        checked_to = fault.row
     return out
 
 
 def frames_surely_missing(track: Track) -> bool:
-    """Whether frames are missing from a track beyond doubt: one jump at least that more than the nearest points tell.
+    """Whether frames are missing beyond doubt: at least one jump is confirmed by more than the nearest points.
 
     Parameters
     ----------
     track : Track
-        With its times put right, as by `correct_frames`; or by the tracker, which has grounds of its own.
+        With its times corrected by `correct_frames`, or by the tracker, which uses the pictures.
 
     Returns
     -------
@@ -165,35 +166,35 @@ def frames_surely_missing(track: Track) -> bool:
     for i in (np.flatnonzero(with_flag(track.flag[rows], "retimed")) - 1).tolist():
         missing = frame[i + 1] - frame[i] - 1
         as_filmed = np.where(np.arange(frame.size) > i, frame - missing, frame)
-        around = as_filmed, track.lead_position_m[rows]
-        jump = _jump(*around, slice(0, i + 1), slice(i + 1, None), noise_m[rows[i]], rho) if i >= 0 else None
-        if jump is None or math.isfinite(_jump_far_around(*around, i, noise_m[rows[i]])):
+        near = as_filmed, track.lead_position_m[rows]
+        jump = _jump(*near, slice(0, i + 1), slice(i + 1, None), noise_m[rows[i]], rho) if i >= 0 else None
+        if jump is None or math.isfinite(_wide_jump(*near, i, noise_m[rows[i]])):
             return True
-        if jump[0] > ALONE * JUMP_SIGMAS * jump[1]:
+        if jump[0] > SURE_FACTOR * JUMP_SIGMAS * jump[1]:
             return True
     return False
 
 
 def _noise(track: Track) -> tuple[Floats, float]:
-    """Standard deviation of a position at each row of a track, m, and the correlation of the noise from row to row.
+    """Standard deviation of a position at each row of a track, m, and the lag-one correlation of the noise.
 
-    Of the whole track, or, where that is more, of the points around: an edge far from the lamp is noisier than at rest,
-    and its noise makes jumps there.
+    It is that of the whole track, or of the points around where that is larger: an edge far from the lamp is noisier
+    than at rest, and its noise makes jumps there.
     """
     usable = track.usable
     y = track.lead_position_m[usable]
     whole_m, rho = robust_position_noise(track.time_s[usable], y)
     noise_m = np.full(usable.size, whole_m)
     if y.size > 2 * WIDE_SIDE_POINTS:
-        around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
+        around_m = local_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE_SD, WIDE_SIDE_POINTS)
         noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
     return noise_m, rho
 
 
 def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: float) -> Track:
-    """Later times moved back behind repeated frames that the picture showed, where the motion says they were inserted.
+    """Move later times back behind repeated pictures, where the motion says that they were inserted.
 
-    A repeated picture tells that a frame is a copy, not whether it took the place of another.
+    A repeated picture shows that a frame is a copy, not whether it took the place of another.
     """
     for row in np.flatnonzero(with_flag(track.flag, "duplicate")):
         with_copy = track.usable
@@ -203,14 +204,14 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: floa
         if not with_copy[row] or i < 0:
             continue
         frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m[rows[i]], rho, rows)
-        if event is not None and event.kind == "inserted":
-            track = _apply(track, event, step_s)
+        fault = _repeated_frame(frame, track.lead_position_m[rows], i, noise_m[rows[i]], rho, rows)
+        if fault is not None and fault.kind == "inserted":
+            track = _correct_fault(track, fault, step_s)
     return track
 
 
 def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
-    """`gap` on the first row after each spacing of two frames or more, where nothing has marked it yet."""
+    """Flag `gap` on the first row after each spacing of two frames or more that nothing has marked yet."""
     out = track
     for before in np.flatnonzero((frames > 1) & ~with_flag(track.flag[1:], "gap")):
         missing = int(frames[before]) - 1
@@ -220,7 +221,7 @@ def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
 
 
 def frames_are(frames: int) -> str:
-    """A number of frames as the beginning of a sentence.
+    """A number of frames as the beginning of a sentence, with its verb.
 
     Parameters
     ----------
@@ -233,7 +234,7 @@ def frames_are(frames: int) -> str:
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
-def _next_event(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Event | None:
+def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Fault | None:
     """The first fault on a row beyond `after`."""
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
@@ -243,24 +244,27 @@ def _next_event(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     speed = np.diff(y) / np.diff(frame)
     stated = track.lead_position_sigma_m[rows]
     noise_m = noise_m[rows]
-    for i in _suspects(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
+    for i in _suspect_steps(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
         if rows[i + 1] <= after:
             continue
-        event = _judge_drop(frame, y, i, noise_m[i], rho, rows) or _judge_repeat(frame, y, i, noise_m[i], rho, rows)
-        if event is not None:
-            return event
+        fault = _dropped_frames(frame, y, i, noise_m[i], rho, rows) or _repeated_frame(
+            frame, y, i, noise_m[i], rho, rows
+        )
+        if fault is not None:
+            return fault
     return None
 
 
-def _suspects(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
-    """Steps that stand out from the smaller or larger of their neighbours, and from their own noise: a first sieve.
+def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
+    """Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening.
 
-    A point that is stated to be unsure, such as one that a door half hides, makes no step that tells of frames.
+    A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
+    frames.
     """
     before, after = _neighbours(speed)
-    usual = np.fmin(np.abs(before), np.abs(after))
+    smaller = np.fmin(np.abs(before), np.abs(after))
     clear = np.fmax(before, after) > CLEAR_STEP_SIGMAS * noise_m
-    return np.flatnonzero(clear & ((speed > DROP_RATIO * usual) | (speed < 0.4 * np.fmax(before, after))))
+    return np.flatnonzero(clear & ((speed > DROP_RATIO * smaller) | (speed < 0.4 * np.fmax(before, after))))
 
 
 def _neighbours(speed: Floats) -> tuple[Floats, Floats]:
@@ -278,51 +282,56 @@ def _row_median(view: Floats) -> Floats:
     return np.where(count == 0, np.nan, pick)
 
 
-def _judge_drop(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]) -> _Event | None:
-    """Whether frames are missing between points i and i + 1."""
+def _dropped_frames(
+    frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
+) -> _Fault | None:
+    """The fault where frames are missing between points i and i + 1, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
     size, sigma, step, sides = jump
     missing = round(size / step)
-    long = y[i + 1] - y[i]
-    if missing < 1 or long <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
+    long_step = y[i + 1] - y[i]
+    if missing < 1 or long_step <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
         return None
-    # Both single neighbours count too, to within a standard error: speeding up, the one after is nearly as long.
+    # Both single neighbours count too, to within a standard error: in acceleration the one after is nearly as long.
     nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
-    if long <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
+    if long_step <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
         return None
-    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or _one_wild_point(sides, noise_m):
+    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or _outlier_explains(sides, noise_m):
         return None
-    if _jump_far_around(frame, y, i, noise_m) < LEAST_SHARE * missing * step:
+    if _wide_jump(frame, y, i, noise_m) < LEAST_SHARE * missing * step:
         return None
-    return _Event("dropped", int(rows[i + 1]), missing)
+    return _Fault("dropped", int(rows[i + 1]), missing)
 
 
-def _judge_repeat(
+def _repeated_frame(
     frame: Floats, y: Floats, i: int, noise_m: float, rho: float, rows: NDArray[np.int_]
-) -> _Event | None:
-    """Whether point i + 1 repeats point i, and if so, whether the copy replaced a frame or was inserted."""
+) -> _Fault | None:
+    """The fault where point i + 1 repeats point i, whether it replaced a frame or was inserted, or None."""
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
     size, sigma, step, _ = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
-    still = y[i + 1] - y[i]
-    if abs(still) > min(STILL * step, 4 * step_sigma + 0.02 * step) or step - still < STILL_SIGMAS * step_sigma:
+    short_step = y[i + 1] - y[i]
+    if (
+        abs(short_step) > min(STILL_PART * step, 4 * step_sigma + 0.02 * step)
+        or step - short_step < STILL_SIGMAS * step_sigma
+    ):
         return None
     if 0 < i < y.size - 3 and 2 * step_sigma < sigma:
-        # Where the motion bends, what the two steps bring against their two neighbours is the better measure.
+        # Where the motion is curved, the two steps minus their two neighbours are the better measure.
         size, sigma = float(y[i + 2] - y[i] - (y[i] - y[i - 1]) - (y[i + 3] - y[i + 2])), 2 * step_sigma
     if abs(size) <= max(3 * sigma, 0.3 * step) and abs(size) < 0.5 * step:
-        return _Event("stale", int(rows[i + 1]))
+        return _Fault("stale", int(rows[i + 1]))
     if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > COPY_SIGMAS * sigma:
-        # Seen a step ahead of its time, a frame leaves its follower where a copy would be.
-        ahead = i >= 2 and y[i] - y[i - 1] > LONG_BEFORE_COPY * max(y[i - 1] - y[i - 2], step)
+        # After a point one step ahead of its time, the next one lies where a copy would.
+        ahead = i >= 2 and y[i] - y[i - 1] > AHEAD_RATIO * max(y[i - 1] - y[i - 2], step)
         without = np.delete(frame, i + 1), np.delete(y, i + 1)
-        if ahead or -_jump_far_around(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
+        if ahead or -_wide_jump(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
             return None
-        return _Event("inserted", int(rows[i + 1]))
+        return _Fault("inserted", int(rows[i + 1]))
     return None
 
 
@@ -332,7 +341,7 @@ def _jump(
     """Jump of position between two sides of a smooth motion, its standard error, the step of one frame, the sides.
 
     The widest sides that follow one parabola are used. None where there are no such sides, where either moves slowly
-    beside the noise, or where they move so differently that a jump cannot be told from acceleration.
+    compared with the noise, or where their speeds differ so much that a jump cannot be told from acceleration.
     """
     for points in SIDE_POINTS:
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
@@ -344,26 +353,26 @@ def _jump(
     return None
 
 
-def _one_wild_point(sides: _Sides, noise_m: float) -> bool:
-    """Whether one point far off explains these points about as well as a jump between the sides does.
+def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
+    """Whether a single outlier explains these points about as well as a jump between the sides does.
 
-    Both bring one number more than a plain parabola, so what they leave can be compared. Errors with heavy tails put a
-    point one step ahead or behind now and then; the points behind a jump all go along.
+    Both add one parameter to a plain parabola, so that their residuals are comparable. Errors with heavy tails put a
+    point one step ahead or behind now and then; after a jump all later points are displaced.
     """
     (t_left, y_left), (t_right, y_right) = sides
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
     t = t - (t_left[-1] + t_right[0]) / 2
     smooth = np.column_stack([np.ones(t.size), t, t**2])
-    with_jump = _left(np.column_stack([smooth, t > 0]), y)
-    with_wild = min(_left(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
-    return with_wild < max(WILD_RATIO * with_jump, with_jump + (WILD_SIGMAS * noise_m) ** 2)
+    with_jump = _residual_squares(np.column_stack([smooth, t > 0]), y)
+    with_outlier = min(_residual_squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
+    return with_outlier < max(OUTLIER_RATIO * with_jump, with_jump + (OUTLIER_SIGMAS * noise_m) ** 2)
 
 
-def _jump_far_around(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
-    """Jump between points i and i + 1 against many more points on either side, ±∞ where those cannot tell.
+def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
+    """Jump between points i and i + 1 from many more points on either side, ±∞ where those are inconclusive.
 
-    They can where one cubic and a step follow all of them to within the noise: then what a few wild points near by made
-    up is gone.
+    They are conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few
+    nearby outliers made up is then gone.
     """
     first = max(i + 1 - WIDE_SIDE_POINTS, 0)
     near = slice(first, i + 1 + WIDE_SIDE_POINTS)
@@ -377,7 +386,7 @@ def _jump_far_around(frame: Floats, y: Floats, i: int, noise_m: float, sign: int
     return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
 
 
-def _left(basis: Floats, y: Floats) -> float:
+def _residual_squares(basis: Floats, y: Floats) -> float:
     """Sum of squares that least squares leave."""
     return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
 
@@ -387,9 +396,9 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[floa
     (t_left, y_left), (t_right, y_right) = sides
     near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
     near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
-    if min(near_left, near_right) < SLOWEST_SIDE * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
+    if min(near_left, near_right) < LEAST_SIDE_PART * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
         return None
-    if max(near_left, near_right) > SIMILAR_SIDES * min(near_left, near_right):
+    if max(near_left, near_right) > LARGEST_SPEED_RATIO * min(near_left, near_right):
         return None
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
     t = t - (t_left[-1] + t_right[0]) / 2
@@ -398,7 +407,7 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[floa
     fit = weights @ y
     misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
     step = float(fit[1])
-    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > LARGEST_MISFIT * step + 2 * noise_m:
+    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > LARGEST_MISFIT_PART * step + 2 * noise_m:
         return None
     lag = np.abs(np.subtract.outer(t, t))
     correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
@@ -406,22 +415,22 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[floa
     return float(fit[3]), sigma, step
 
 
-def _apply(track: Track, event: _Event, step_s: float) -> Track:
-    """The track with one fault flagged, told, and its times put right."""
-    at_s = float(track.time_s[event.row])
-    if event.kind == "stale":
+def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:
+    """The track with one fault flagged and reported, and its times corrected."""
+    at_s = float(track.time_s[fault.row])
+    if fault.kind == "stale":
         return _mark(
-            track, event.row, "duplicate", f"the frame at {at_s:.5g} s repeats the one before it and is left out"
+            track, fault.row, "duplicate", f"the frame at {at_s:.5g} s repeats the one before it and is left out"
         )
     time_s = track.time_s.copy()
-    if event.kind == "inserted":
-        time_s[event.row] -= step_s / 2
-        time_s[event.row + 1 :] -= step_s
+    if fault.kind == "inserted":
+        time_s[fault.row] -= step_s / 2
+        time_s[fault.row + 1 :] -= step_s
         note = f"the frame at {at_s:.5g} s is an inserted copy: left out, later times moved back by one frame"
-        return _mark(replace(track, time_s=time_s), event.row, "duplicate", note)
-    time_s[event.row :] += event.missing * step_s
-    note = f"{frames_are(event.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
-    return _mark(replace(track, time_s=time_s), event.row, "gap;retimed", note)
+        return _mark(replace(track, time_s=time_s), fault.row, "duplicate", note)
+    time_s[fault.row :] += fault.missing * step_s
+    note = f"{frames_are(fault.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
+    return _mark(replace(track, time_s=time_s), fault.row, "gap;retimed", note)
 
 
 def _mark(track: Track, row: int, flags: str, note: str) -> Track:

@@ -1,7 +1,7 @@
-"""Positions measured elsewhere become a track: a CSV, a Physics Tracker project or its text export.
+"""Import positions measured elsewhere as a track: a CSV, a Physics Tracker project or its text export.
 
-A trial whose sheet names a `track` skips the video stages; what they would have delivered is read here. Stands on
-`records` and `tables` alone, so that the experiment's check can use it.
+A trial whose sheet names a `track` skips the video stages; this module reads what they would have produced. It depends
+on `records` and `tables` alone, so that the experiment's check can use it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_press
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
 
 LARGEST_TDMS_BYTES = 200_000_000
-"""Chosen: an hour of three channels at 2 kHz. At half long logs are refused, at twice a wrong file takes a minute."""
+"""Largest TDMS file that is read. Chosen: an hour of three channels at 2 kHz. At half long logs are refused, at twice a
+wrong file takes a minute."""
 HEADER_WITHIN_LINES = 20
-"""Titles and remarks above the header of a text export end well before this line. Chosen: exports have one or two
-lines of title; twice or half changes nothing for them."""
+"""Lines within which the header of a text export is looked for, below its title and remarks. Chosen: exports have one
+or two lines of title; twice or half changes nothing for them."""
 
 
 def load_track(trial: Trial) -> Track:
-    """Track of a trial whose positions are already measured, with the pressure of its `pressure_trace` if it has one.
+    """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one.
 
     Parameters
     ----------
@@ -58,11 +59,12 @@ def load_track(trial: Trial) -> Track:
 
 
 def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
-    """Read positions measured elsewhere; the kind of file is found from its content.
+    """Read positions measured elsewhere; the kind of file is recognised from its content.
 
-    Understood are a CSV with `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and
+    Accepted are a CSV with `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and
     Tracker's text export (columns t, x, y or t and one coordinate, with or without a title above). Points in a plane
-    are projected on the principal axis of their motion. `flag` is blank throughout; `edge_px` NaN except in a project.
+    are projected on the principal axis of their motion. `flag` is blank throughout; `edge_px` is NaN except in a
+    project.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
 
 
 def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
-    """The track with the rows before and after those used flagged.
+    """Flag the rows before and after those used.
 
     Raises
     ------
@@ -118,7 +120,7 @@ def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
 
 
 def _read_positions(table: Table) -> Track:
-    """The project's own table of positions; every row of it is a row of the track."""
+    """Read a table of positions; every row of it is a row of the track."""
     _require(table, "time_s", "position_m")
     time_s, position_m = table.numbers("time_s"), table.numbers("position_m")
     time_s, note = unrounded_times(time_s)
@@ -172,9 +174,9 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
 
 
 def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
-    """The track with a pressure trace interpolated linearly on its times; trace and track share one clock.
+    """Interpolate a pressure trace linearly on the times of a track; trace and track share one clock.
 
-    Beyond the ends of the trace its first and last values are held, which a note says.
+    Beyond the ends of the trace its first and last values are held, which a note reports.
 
     Parameters
     ----------
@@ -204,7 +206,7 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
 
 
 def _as_csv(path: Path) -> str:
-    """The channels of a TDMS file as the text of a CSV, so that units in their names are converted alike."""
+    """The channels of a TDMS file as the text of a CSV, so that units in their names are converted in the same way."""
     from vinetrack.tracks.tdms import tdms_columns
 
     try:

@@ -1,9 +1,9 @@
-"""Files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
+"""Read files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
 
 A project stores the marks of a point mass in image pixels, frame by frame, and the axes: origin (px, image y
-downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The same transform as in Tracker's
-source, `org.opensourcephysics.media.core.ImageCoordSystem`, leads to world coordinates. Where origin, angle or scale
-change, a project holds them for key frames; each is valid until the next.
+downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The transform to world coordinates is
+that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale change, a
+project holds them for key frames; each is valid until the next.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class _Axes:
 
 
 def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
-    """Track of a `.trk` project: one point mass, projected on the axis of its motion.
+    """Read the track of a `.trk` project: one point mass, projected on the axis of its motion.
 
-    That is the one named `point_mass`, else the one with the most marks; marks outside `frames_used` are left aside.
+    It is the one named `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     frame_s, start_s, start_frame = _clock(panel)
     notes = []
     if others and not point_mass:
-        notes.append(f"Taken from the point mass {name!r}, which has the most points; left aside: {', '.join(others)}.")
+        notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
     unit = (_text(panel, "length_unit") or "").strip()
     if unit and unit not in METRES:
         raise TrackError(f"measures lengths in {unit[:20]!r}: set the length unit to m in Tracker")
@@ -102,7 +102,7 @@ def _parse_panel(text: str) -> Element:
 
 
 def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
-    """Name and marks (frame → px) of the point mass wanted, or with the most marks, and the names of the others."""
+    """Name and marks (frame → px) of the point mass wanted, or of that with the most marks; names of the others."""
     masses: list[tuple[str, dict[int, tuple[float, ...]]]] = []
     for node in panel.iter("object"):
         if node.get("class", "").endswith(".PointMass"):
@@ -162,7 +162,7 @@ def _to_world(frames: np.ndarray, pixels: Floats, axes: list[_Axes]) -> Floats:
 
 
 def _clock(panel: Element) -> tuple[float, float, int]:
-    """Seconds per frame, time and number of the start frame."""
+    """Seconds per frame, and time and number of the start frame."""
     clip, control = _object(panel, "videoclip"), _object(panel, "clipcontrol")
     video = None if clip is None else _object(clip, "video")
     spacings = [_number(node, "delta_t") for node in (control, video) if node is not None]
@@ -198,7 +198,7 @@ def _text(node: Element, name: str) -> str | None:
 
 
 def _number(node: Element, name: str) -> float:
-    """A stored number, NaN where it is missing, is none or is beyond all measure."""
+    """A stored number; NaN where it is missing, is none or is beyond LARGEST_NUMBER."""
     try:
         value = float(_text(node, name) or "nan")
     except ValueError:
@@ -234,7 +234,7 @@ def _column(cell: str) -> tuple[str, str]:
 
 
 def read_export(table: Table) -> Track:
-    """Track of Tracker's text export; a blank coordinate is a frame without a point.
+    """Read the track of Tracker's text export; a blank coordinate is a frame without a point.
 
     Parameters
     ----------
@@ -273,6 +273,7 @@ def read_export(table: Table) -> Track:
 
 
 def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
+    """Factor from a column's unit to SI."""
     name, unit = column
     if unit and unit not in units:
         raise TrackError(f"column {name[:30]!r} has an unknown unit: use one of {', '.join(units)}")

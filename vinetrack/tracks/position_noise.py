@@ -1,9 +1,9 @@
-"""How noisy measured positions are: the standard deviation of one of them and how far the noise remembers itself.
+"""Noise of measured positions: the standard deviation of one of them and the correlation of the noise in time.
 
-The noise is taken as AR(1): correlation ρ^k between frames k apart. σ and ρ maximise the restricted likelihood
-(Harville 1977, J. Am. Stat. Assoc. 72:320) of short stretches of the track, each free to follow its own polynomial: a
-straight line where the vine is at rest, a cubic where it moves. Stretches that a cubic cannot follow (release, the end
-of growth) are left out.
+The noise is modelled as AR(1): correlation ρ^k between frames k apart. σ and ρ maximise the restricted likelihood
+(Harville 1977, J. Am. Stat. Assoc. 72:320) of short stretches of the track, each with its own polynomial: a straight
+line where the vine is at rest, a cubic where it moves. Stretches that a cubic cannot follow (release, the end of
+growth) are left out.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from vinetrack.core.records import Floats, Track
 
 ENOUGH_REST_FRAMES = 60
 """Frames at rest from which their noise alone counts as that of the track. Chosen: two stretches of 32, less rounding;
-they tell a standard deviation to 9 %. By reasoning: at half to 13 %; at twice, motion, which a cubic may miss, enters
-more tracks."""
+they estimate a standard deviation to 9 %. By reasoning: at half to 13 %; at twice, motion, which a cubic may miss,
+enters more tracks."""
 
-REST_MARGIN = 3  # the corner between rest and motion is found to within about two frames
-"""Frames left out before the corner between rest and motion. Chosen: the corner is found to within about two frames.
-By reasoning: at half, motion enters the noise; at twice, three frames are lost."""
+REST_MARGIN_FRAMES = 3
+"""Frames left out before the corner between rest and motion. Chosen: the corner is found to within about two frames. By
+reasoning: at half, motion enters the noise; at twice, three frames are lost."""
 
-LONG_TRACK = 90
+LONG_TRACK_POINTS = 90
 """Moving points from which stretches are twice as long. Chosen: seven stretches of 12 determine σ; from there on longer
-ones, which show slow correlation, gain more than further ones. Half or twice moves which tracks get them."""
+ones, which show slow correlation, gain more than further ones. Half or twice changes which tracks get them."""
 
 REST_STRETCH, REST_ORDER = 32, 1
 """Points in a stretch at rest and degree of its polynomial. Chosen: a line takes up drift, and 32 points show
@@ -38,36 +38,36 @@ reasoning: at half two remain; at twice curvature passes for noise."""
 
 RHO_GRID = np.linspace(0.0, 0.95, 20)
 PRIOR_RHO_SD = 0.5
-"""Standard deviation of the normal prior of ρ about 0. Chosen: flat where there are data; short tracks are pulled to
+"""Standard deviation of the normal prior of ρ about 0. Chosen: flat where there are data; short tracks are shrunk to
 white noise. By reasoning: at half ρ = 0.7 costs 7.8 of −2 ln L in place of 2.0, at twice 0.5."""
 
 SHORTEST_MOTION = 12
 """Points in motion below which the whole track is used. Chosen: one stretch in motion."""
 
 SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
-"""Noise that remembers itself so well may be motion that a cubic does not follow: shorter stretches then decide.
-Chosen: at ρ = 0.85 noise persists for six frames, half a stretch; seven points are the fewest on which a cubic leaves
-three degrees of freedom. By reasoning: a lower limit replaces truly slow noise by too small a ρ, a higher one lets
-curvature pass for noise."""
+"""Correlation above which the noise may be motion that a cubic does not follow, and the length of the shorter stretches
+that then decide. Chosen: at ρ = 0.85 noise persists for six frames, half a stretch; seven points are the fewest on
+which a cubic leaves three degrees of freedom. By reasoning: a lower limit replaces truly slow noise by too small a ρ, a
+higher one lets curvature pass for noise."""
 
-THIRD_DIFFERENCE = math.sqrt(20.0)
+THIRD_DIFFERENCE_SD = math.sqrt(20.0)
 """Standard deviation of third differences of white noise of unit variance. Derived: 1² + 3² + 3² + 1² = 20."""
 
-OF_THIRD = 1.84
-"""By how much the median third difference may be too small for noise that remembers itself. Derived: at ρ = 0.6 third
-differences have 1/1.84² of the variance of white noise."""
+THIRD_DIFFERENCE_ALLOWANCE = 1.84
+"""Factor by which the median third difference may underestimate correlated noise. Derived: at ρ = 0.6 third differences
+have 1/1.84² of the variance of white noise."""
 
-SAME_STEP = 0.01
-"""Relative difference of two steps of rounding that are the same. Chosen: steps in pixels are known to a thousandth,
-decimals exactly; half or twice tells the same of either."""
+SAME_STEP_TOLERANCE = 0.01
+"""Relative difference within which two rounding steps are the same. Chosen: steps in pixels are known to a thousandth,
+decimals exactly; half or twice distinguishes the same."""
 
-MOSTLY_ROUNDING = math.sqrt(2.0)
+ROUNDING_DOMINATES = math.sqrt(2.0)
 """Noise of a track, in errors of rounding, below which most of it is rounding. Derived: noise as large as that error
-comes to √2 of it together, and shows in spite of the rounding."""
+gives √2 of it in total, and shows in spite of the rounding."""
 
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """Standard deviation and lag-one correlation of the random error of single positions.
+    """Estimate the standard deviation and lag-one correlation of the random error of single positions.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     Returns
     -------
     noise_m
-        Standard deviation, m. 0 where the positions are exact or too few (under 5) to tell.
+        Standard deviation, m. 0 where the positions are exact or fewer than 5.
     correlation
-        Lag-one correlation, 0 to 0.95; pulled to 0 where the track is too short to tell.
+        Lag-one correlation, 0 to 0.95; shrunk to 0 where the track is short.
     """
     noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
     return (rounding_m, 0.0) if noise_m < rounding_m else (noise_m, correlation)
@@ -94,7 +94,7 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
         groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], REST_STRETCH, REST_ORDER))
     n_moving = position_m.size - n_rest
     if n_rest < ENOUGH_REST_FRAMES or n_moving > n_rest:
-        length = MOVING_STRETCH if n_moving < LONG_TRACK else 2 * MOVING_STRETCH
+        length = MOVING_STRETCH if n_moving < LONG_TRACK_POINTS else 2 * MOVING_STRETCH
         groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
     noise_m, correlation = _restricted_likelihood(groups)
     if correlation > SUSPECT_RHO:
@@ -104,10 +104,10 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
 
 
 def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """`position_noise`, kept down where a fault in a short track would itself pass for noise.
+    """Estimate `position_noise`, bounded so that a fault in a short track does not pass for noise.
 
-    The median third difference hardly knows of one fault, and is at most `OF_THIRD` times too small; of positions that
-    are rounded, and mostly at rest, it knows nothing at all.
+    The bound is the median third difference, which a single fault hardly changes, times THIRD_DIFFERENCE_ALLOWANCE; of
+    positions that are rounded, and mostly at rest, it carries no information.
 
     Parameters
     ----------
@@ -120,17 +120,17 @@ def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, fl
     """
     noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
     correlation = 0.0 if noise_m < rounding_m else correlation
-    return max(min(noise_m, OF_THIRD * rough_noise(position_m)), rounding_m), correlation
+    return max(min(noise_m, THIRD_DIFFERENCE_ALLOWANCE * rough_noise(position_m)), rounding_m), correlation
 
 
 def _frames_at_rest(position_m: Floats) -> int:
-    """Points at rest that are enough for stretches of their own, else none."""
-    n_rest = max(rest_points(position_m) - REST_MARGIN, 0)
+    """Points at rest, if they are enough for stretches of their own, else 0."""
+    n_rest = max(rest_points(position_m) - REST_MARGIN_FRAMES, 0)
     return n_rest if n_rest >= 2 * MOVING_STRETCH else 0
 
 
 def rounding_noise(position_m: Floats) -> float:
-    """Standard deviation of the error of positions that are rounded (whole pixels, printed decimals).
+    """Estimate the standard deviation of the error of rounded positions (whole pixels, printed decimals).
 
     Parameters
     ----------
@@ -141,16 +141,16 @@ def rounding_noise(position_m: Floats) -> float:
     float, m
         0 where they are not rounded, or where it does not show.
     """
-    floor_m = _quantum(position_m) / math.sqrt(12)
+    floor_m = _rounding_step(position_m) / math.sqrt(12)
     if floor_m == 0:
         return 0.0
     moving_m = position_m[_frames_at_rest(position_m) :]
     moving_m = moving_m if moving_m.size >= SHORTEST_MOTION else position_m
-    return floor_m if _jagged(moving_m, floor_m) else 0.0
+    return floor_m if _shows_rounding(moving_m, floor_m) else 0.0
 
 
 def common_rounding_noise(tracks: Sequence[Floats]) -> float:
-    """`rounding_noise` of most of a campaign's tracks where it is most of their noise; it then holds for all of them.
+    """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
 
     Parameters
     ----------
@@ -160,30 +160,32 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     Returns
     -------
     float, m
-        0 where most are not rounded, or not alike, or are noisier than that.
+        0 where most are not rounded, or to different steps, or are noisier than that.
     """
-    mostly = MOSTLY_ROUNDING / math.sqrt(12)
+    limit = ROUNDING_DOMINATES / math.sqrt(12)
     noises = sorted(
-        rounding_noise(position_m) if rough_noise(position_m) < mostly * _quantum(position_m) else 0.0
+        rounding_noise(position_m) if rough_noise(position_m) < limit * _rounding_step(position_m) else 0.0
         for position_m in tracks
     )
     typical = noises[len(noises) // 2] if noises else 0.0
-    alike = sum(typical * (1 - SAME_STEP) <= noise <= typical * (1 + SAME_STEP) for noise in noises)
-    return typical if 2 * alike > len(noises) else 0.0
+    n_same = sum(
+        typical * (1 - SAME_STEP_TOLERANCE) <= noise <= typical * (1 + SAME_STEP_TOLERANCE) for noise in noises
+    )
+    return typical if 2 * n_same > len(noises) else 0.0
 
 
-def _jagged(position_m: Floats, floor_m: float) -> bool:
+def _shows_rounding(position_m: Floats, floor_m: float) -> bool:
     """Whether positions that are all multiples of a step are so from rounding.
 
-    Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero but for
-    a few at a corner.
+    Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero except a
+    few at a corner.
     """
     uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
-    few = 5 if position_m.size >= SHORTEST_MOTION else 0
-    return bool(uneven > max(few, 0.05 * position_m.size))
+    allowed = 5 if position_m.size >= SHORTEST_MOTION else 0
+    return bool(uneven > max(allowed, 0.05 * position_m.size))
 
 
-def _quantum(position_m: Floats) -> float:
+def _rounding_step(position_m: Floats) -> float:
     """Step of which all positions are multiples (whole pixels, printed decimals), m; 0 where there is none.
 
     Rounding to a step q adds an error of standard deviation q/√12, which frames at rest cannot show.
@@ -194,10 +196,10 @@ def _quantum(position_m: Floats) -> float:
     steps = np.diff(values)
     span = float(values[-1] - values[0])
     resolution = np.finfo(float).eps * float(np.max(np.abs(values)))
-    # Fast motion may skip single steps: the smallest difference is then two or more of them.
+    # Fast motion may skip single steps: the smallest difference is then several steps.
     for count in range(1, 7):
         step = float(np.min(steps)) / count
-        # A fit is no chance only where the step is coarse beside float resolution, and the span holds several.
+        # A match is meaningful only where the step is coarse beside float resolution, and the span holds several.
         if step < 1e4 * resolution or span < 3 * step or span / step > 1e7:
             return 0.0
         multiples = steps / step
@@ -222,13 +224,13 @@ def rough_noise(position_m: Floats) -> float:
     if position_m.size < 5:
         return 0.0
     third = np.diff(position_m, 3)
-    return float(np.median(np.abs(third))) / 0.6745 / THIRD_DIFFERENCE
+    return float(np.median(np.abs(third))) / 0.6745 / THIRD_DIFFERENCE_SD
 
 
 def rest_points(position_m: Floats) -> int:
-    """How many points at the start stay at rest, from positions alone; 0 where the track starts in motion.
+    """Count the points at the start that are at rest; 0 where the track starts in motion.
 
-    The track leaves rest where it goes above the resting level for good; the corner is then that of the best
+    The track leaves rest where it rises above the resting level for good; the corner is then that of the best
     flat-then-straight line through the points up to there.
 
     Parameters
@@ -276,7 +278,7 @@ def _corner(position_m: Floats) -> int:
 
 
 def _stretches(time_s: Floats, position_m: Floats, length: int, order: int) -> tuple[Floats, Floats]:
-    """Positions cut into stretches, shape (s, m), and the polynomial of each stretch's own time, (s, m, order + 1)."""
+    """Positions cut into stretches, shape (s, m), and the polynomial basis of each in its time, (s, m, order + 1)."""
     n = position_m.size
     length = min(length, n)
     starts = np.unique(np.linspace(0, n - length, max(1, math.ceil(n / length))).astype(int))
@@ -291,23 +293,23 @@ def _stretches(time_s: Floats, position_m: Floats, length: int, order: int) -> t
 
 def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, float]:
     """σ and ρ that maximise the restricted likelihood of all stretches that follow their polynomial."""
-    tables = [_residuals(y, basis) for y, basis in groups]
+    tables = [_whitened_residuals(y, basis) for y, basis in groups]
     dof = np.concatenate([np.full(y.shape[0], y.shape[1] - basis.shape[2]) for y, basis in groups])
     rss = np.concatenate([table[0] for table in tables], axis=1)
     log_det = np.concatenate([table[1] for table in tables], axis=1)
     scale = max(float(np.ptp(y)) for y, _ in groups)
-    keep = np.ones(dof.size, dtype=bool)
+    used = np.ones(dof.size, dtype=bool)
     best = 0
     for _ in range(6):
-        variance = np.median(rss[best] / _chi2_median(dof)) if keep.all() else rss[best, keep].sum() / dof[keep].sum()
-        now = rss[best] <= variance * (dof + 4 * np.sqrt(2 * dof) + 3)
-        keep = now if now.any() else keep
-        pooled, n = rss[:, keep].sum(axis=1), float(dof[keep].sum())
+        variance = np.median(rss[best] / _chi2_median(dof)) if used.all() else rss[best, used].sum() / dof[used].sum()
+        following = rss[best] <= variance * (dof + 4 * np.sqrt(2 * dof) + 3)
+        used = following if following.any() else used
+        pooled, n = rss[:, used].sum(axis=1), float(dof[used].sum())
         if pooled.min() <= n * (1e-13 * scale) ** 2:
             return 0.0, 0.0
-        score = -0.5 * (n * np.log(pooled) + log_det[:, keep].sum(axis=1)) - 0.5 * (RHO_GRID / PRIOR_RHO_SD) ** 2
+        score = -0.5 * (n * np.log(pooled) + log_det[:, used].sum(axis=1)) - 0.5 * (RHO_GRID / PRIOR_RHO_SD) ** 2
         best = int(np.argmax(score))
-    rho = _vertex(RHO_GRID, score, best)
+    rho = _parabola_vertex(RHO_GRID, score, best)
     innovation = math.exp(np.interp(rho, RHO_GRID, np.log(pooled / n)))
     return math.sqrt(innovation / (1 - rho**2)), rho
 
@@ -317,7 +319,7 @@ def _chi2_median(dof: Floats) -> Floats:
     return dof * (1 - 2 / (9 * dof)) ** 3
 
 
-def _residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
+def _whitened_residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
     """For each ρ of the grid and each stretch: whitened residual sum of squares, and the log-determinants of REML."""
     rho, root = RHO_GRID[:, None, None], np.sqrt(1 - RHO_GRID**2)[:, None, None]
     white_y = np.concatenate([root * y[:, :1], y[:, 1:] - rho * y[:, :-1]], axis=2)
@@ -330,8 +332,8 @@ def _residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
     return np.sum(residual**2, axis=2), 2 * np.log(diagonal).sum(axis=2) - np.log(1 - RHO_GRID**2)[:, None]
 
 
-def _vertex(x: Floats, score: Floats, best: int) -> float:
-    """Abscissa of the parabola through the best grid point and its neighbours, inside the grid."""
+def _parabola_vertex(x: Floats, score: Floats, best: int) -> float:
+    """Abscissa of the vertex of the parabola through the best grid point and its neighbours."""
     if best == 0 or best == x.size - 1:
         return float(x[best])
     left, middle, right = score[best - 1 : best + 2]
@@ -339,7 +341,7 @@ def _vertex(x: Floats, score: Floats, best: int) -> float:
 
 
 def track_noise(track: Track) -> tuple[float, float]:
-    """Standard deviation and lag-one correlation of the random error of a single position.
+    """Estimate the noise of a track's usable points; see `position_noise`.
 
     Parameters
     ----------
@@ -348,16 +350,16 @@ def track_noise(track: Track) -> tuple[float, float]:
     Returns
     -------
     noise_m
-        Standard deviation, m. 0 where the positions are exact or too few (under 5) to tell.
+        Standard deviation, m. 0 where the positions are exact or fewer than 5.
     correlation
-        Lag-one correlation, 0 to 0.95; pulled to 0 where the track is too short to tell.
+        Lag-one correlation, 0 to 0.95; shrunk to 0 where the track is short.
     """
     usable = track.usable
     return position_noise(track.time_s[usable], track.lead_position_m[usable])
 
 
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
-    """Draw stationary autoregressive noise of first order, as simulated tracks have it.
+    """Draw stationary first-order autoregressive noise, as simulated tracks have it.
 
     Parameters
     ----------

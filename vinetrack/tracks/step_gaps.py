@@ -1,6 +1,6 @@
-"""Frames missing from a recording, by single steps of its edge: counted in before positions are in metres.
+"""Count missing frames of a recording from single steps of its edge, before positions are in metres.
 
-The threshold is that of `frame_timing`, which looks at tracks of any source and at what this leaves undecided.
+The threshold is that of `frame_timing`, which examines tracks of any source and what remains undecided here.
 """
 
 from __future__ import annotations
@@ -13,28 +13,27 @@ from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.tracks.frame_timing import CLEAR_STEP_SIGMAS, DROP_RATIO, frames_are
 
 SMALLEST_STEP_PX = 2.0
-"""Steps of a recording below this show no missing frame. Chosen: blur and film texture move an edge by some tenths of
-a pixel. By reasoning: at half a slow tip that sticks and slips passes for one; at twice slow recordings are left
-alone."""
+"""Smallest step of a recording that can show a missing frame. Chosen: blur and film texture move an edge by some tenths
+of a pixel. By reasoning: at half a slow tip that sticks and slips passes for one; at twice slow recordings are left
+unchanged."""
 
-EVEN_STEPS = 0.35
-"""Range of the four steps around a long one, as a part of their median, within which they are one steady motion.
-Chosen: at release steps grow by more. By reasoning: at half only steady growth shows missing frames; at twice release
-does."""
+EVEN_STEP_RANGE = 0.35
+"""Range of the four steps around a long one, as a part of their median, below which the motion is steady. Chosen: at
+release steps grow by more. By reasoning: at half only steady growth shows missing frames; at twice release does."""
 
-WHOLE_STEPS, MOST_STEPS = 0.2, 4
-"""A long step this near a whole number of steps, and up to so many, is counted in; another is only told. Chosen: beyond
-four the motion between is a guess. By reasoning: at half speeds that change are only told; at twice every long step
-is counted in, one of 1.6 as two."""
+WHOLE_STEP_TOLERANCE, MOST_MISSING_STEPS = 0.2, 4
+"""A long step this near to a whole number of steps, and no more than so many, is counted in; another is only reported.
+Chosen: beyond four the motion between is a guess. By reasoning: at half speeds that change are only reported; at twice
+every long step is counted in, one of 1.6 as two."""
 
 
 @dataclass(frozen=True)
 class MissingFrames:
-    """Where frames are missing from a recording, all arrays of shape (n_frames,).
+    """Missing frames of a recording; all arrays of shape (n_frames,).
 
     `slot` counts capture periods from the first frame, missing ones included; `gap` marks frames before which some are
-    missing or may be, `retimed` those of them from which `slot` was moved on. `notes` tells of what `slot` did not
-    show.
+    missing or may be, `retimed` those from which `slot` was corrected. `notes` report what the recording's own periods
+    did not show.
     """
 
     slot: Indices
@@ -48,14 +47,14 @@ def count_missing(
 ) -> MissingFrames:
     """Count in the frames that steps of the motion show to be missing.
 
-    A step is compared with two on each side, which must agree (EVEN_STEPS) and be clear of the stated errors.
+    A step is compared with two on each side, which must agree (EVEN_STEP_RANGE) and be clear of the stated errors.
 
     Parameters
     ----------
     edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
-    slot : capture periods from the first frame as the recording tells them, shape (n_frames,).
-    number : of each frame in the recording, shape (n_frames,); frames that were left out are no gap.
-    repeated : mask of pictures like the one before, shape (n_frames,).
+    slot : capture periods from the first frame, from the recording, shape (n_frames,).
+    number : of each frame in the recording, shape (n_frames,); frames that were left out are not gaps.
+    repeated : mask of frames that repeat the one before, shape (n_frames,).
     moving : first and last frame in which the edge is on its way.
 
     Returns
@@ -74,16 +73,16 @@ def count_missing(
         near = step[[i - 1, i + 1]]
         if not np.all(np.isfinite(around)) or not np.isfinite(step[i]) or repeated[i - 2 : i + 3].any():
             continue
-        usual = float(np.median(around))
-        clear = max(SMALLEST_STEP_PX, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
-        if usual < clear or np.ptp(around) > EVEN_STEPS * usual:
+        median_step = float(np.median(around))
+        least_step = max(SMALLEST_STEP_PX, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
+        if median_step < least_step or np.ptp(around) > EVEN_STEP_RANGE * median_step:
             continue
         ratio = step[i] / float(near.mean())
         if ratio <= DROP_RATIO:
             continue
         gap[i] = True
         whole = round(ratio)
-        retimed[i] = abs(ratio - whole) < WHOLE_STEPS and whole <= MOST_STEPS
+        retimed[i] = abs(ratio - whole) < WHOLE_STEP_TOLERANCE and whole <= MOST_MISSING_STEPS
         if retimed[i]:
             counted[i:] += whole - 1
             where = f"before frame {number[i]} (the step there is too long)"

@@ -1,8 +1,8 @@
-"""Channels of a TDMS file, as LabVIEW writes measurements, as the table that a CSV of them would be.
+"""Read the channels of a TDMS file, in which LabVIEW writes measurements, as the columns of a table.
 
-Source: National Instruments, *TDMS File Format Internal Structure*. A file is a row of segments, each with a lead-in of
-28 bytes, properties and the layout of its channels, and raw values: one channel after the other or sample by sample.
-Values that are scaled only when they are read (DAQmx, `NI_Scale`) are refused by name.
+Source: National Instruments, *TDMS File Format Internal Structure*. A file is a sequence of segments, each with a
+lead-in of 28 bytes, properties and the layout of its channels, and raw values: one channel after the other or sample by
+sample. Values that need scaling on reading (DAQmx, `NI_Scale`) are refused by name.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from vinetrack.core.units import convert, split_unit
 from vinetrack.tracks.track_checks import TrackError
 
 LEAD_IN_BYTES = 28
-"""Source: the format's description."""
+"""Bytes of a segment's lead-in. Source: the format's description."""
 _META, _NEW_LIST, _RAW, _INTERLEAVED, _BIG_ENDIAN, _DAQMX = 1 << 1, 1 << 2, 1 << 3, 1 << 5, 1 << 6, 1 << 7
-"""What a segment holds, by bits of its lead-in. Source: the format's description."""
+"""Content of a segment, by bits of its lead-in. Source: the format's description."""
 _NO_RAW, _AS_BEFORE, _TO_THE_END = 0xFFFFFFFF, 0, 0xFFFFFFFFFFFFFFFF
 """Marks in place of a layout, or of a segment's length. Source: the format's description."""
 _TYPES = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8", 25: "f4", 26: "f8"}
-_TEXT, _TRUTH, _MOMENT = 0x20, 0x21, 0x44
-"""Codes of text, truth and moments. Source: the format's description."""
+_TEXT, _BOOLEAN, _TIME_STAMP = 0x20, 0x21, 0x44
+"""Type codes of text, Booleans and time stamps. Source: the format's description."""
 _DAQMX_LAYOUTS = {0x1269, 0x1369}
 
 
 @dataclass
 class _Channel:
-    """A channel as far as it is read: type and count of its values in a segment, properties, and all values."""
+    """A channel as far as it has been read: type and count of its values in a segment, properties, and all values."""
 
     kind: str = ""
     count: int = 0
@@ -43,8 +43,8 @@ class _Channel:
 def tdms_columns(data: bytes) -> dict[str, Floats]:
     """Read the channels of a file that are as long as its pressure.
 
-    A channel is named as it is in the file, with its unit behind (`pressure` in `kPa` is `pressure_kPa`). Where none is
-    a time, `time_s` comes from the waveform's start and increment.
+    A channel is named as in the file, with its unit appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a
+    time, `time_s` comes from the waveform's start and increment.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def tdms_columns(data: bytes) -> dict[str, Floats]:
 
 
 def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
-    """A pressure in kPa and a time in s, whatever unit they are in; others as they are."""
+    """Convert a pressure to kPa and a time to s; others stay as they are."""
     quantity, unit = split_unit(name)
     wanted = {"pressure": "kPa", "time": "s"}.get(quantity, unit)
     if unit in ("", wanted):
@@ -92,12 +92,14 @@ def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
 
 
 def _column(path: str, channel: _Channel) -> str:
+    """Name of a channel with its unit."""
     name = path.rpartition("/'")[2].removesuffix("'").replace("''", "'")
     unit = str(channel.properties.get("unit_string", ""))
     return name if not unit or name.endswith(f"_{unit}") else f"{name}_{unit}"
 
 
 def _values(name: str, channel: _Channel) -> Floats:
+    """All values of a channel, unless they need scaling on reading."""
     scales = channel.properties.get("NI_Number_Of_Scales", 0)
     if name and (scales or any(key.startswith("NI_Scale[") for key in channel.properties)):
         raise TrackError(f"channel {name} is scaled only when it is read (NI_Scale): export it as CSV")
@@ -133,7 +135,7 @@ def _channels(data: bytes) -> dict[str, _Channel]:
 
 
 def _read_layout(data: bytes, place: int, order: str, listed: list[str], channels: dict[str, _Channel]) -> list[str]:
-    """Take over properties and layout of a segment's channels; return which have raw values, in their order."""
+    """Update properties and layout of a segment's channels; return those with raw values, in order."""
     (objects,) = struct.unpack_from(f"{order}I", data, place)
     place += 4
     listed = list(listed)
@@ -176,9 +178,9 @@ def _property(data: bytes, place: int, order: str) -> tuple[Any, int]:
     place += 4
     if kind == _TEXT:
         return _text(data, place, order)
-    if kind == _TRUTH:
+    if kind == _BOOLEAN:
         return bool(data[place]), place + 1
-    if kind == _MOMENT:
+    if kind == _TIME_STAMP:
         return None, place + 16
     if kind not in _TYPES:
         raise ValueError(f"a property of unknown type {kind}")
@@ -187,7 +189,7 @@ def _property(data: bytes, place: int, order: str) -> tuple[Any, int]:
 
 
 def _read_values(raw: bytes, order: str, layout: list[_Channel], interleaved: bool) -> None:
-    """Append a segment's values to its channels: the same chunk over and over; what is left of the last is dropped."""
+    """Append a segment's values to its channels: repeated chunks of one layout; an incomplete last chunk is dropped."""
     fields = [(str(i), order + c.kind, () if interleaved else (c.count,)) for i, c in enumerate(layout)]
     chunk = np.dtype(fields)
     if not chunk.itemsize:

@@ -1,4 +1,4 @@
-"""What every imported track must satisfy, and how one is put together."""
+"""Checks that every imported track must pass, and how a track is assembled."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from vinetrack.core.records import Floats, Track, plain_track
 
 FEWEST_POINTS = 5
-"""Points of a track at least. Derived: a cubic and one to spare."""
+"""Fewest points of a track. Derived: a cubic and one to spare."""
 
 LARGEST_PRESSURE_KPA = 1000.0
-"""Largest gauge pressure taken for one in kPa. Chosen: ten times what vines bear; Pa in place of kPa are larger from 1
-kPa on. At half or twice only that message changes."""
+"""Largest gauge pressure in kPa that is accepted. Chosen: ten times what vines bear; Pa in place of kPa are larger from
+1 kPa on. At half or twice only that message changes."""
 
 VACUUM_KPA = -101.4
-"""No gauge reads less; sensors do read a little below zero. Derived: minus the standard atmosphere, 101.325, rounded
-away from zero."""
+"""Least gauge pressure that is accepted; sensors do read a little below zero. Derived: minus the standard atmosphere,
+101.325, rounded away from zero."""
 LARGEST_NUMBER = 1e9
-"""Seconds or metres; anything larger is no measurement and would overflow when squared and summed. Chosen: squares and
-their sums then stay far below 1e308."""
+"""Largest time or position, s or m; anything larger is no measurement and would overflow when squared and summed.
+Chosen: squares and their sums then stay far below 1e308."""
 
 
 class TrackError(Exception):
@@ -51,7 +51,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
-    """Refuse pressures beyond what the sheet allows; NaN passes.
+    """Refuse pressures outside what the sheet allows; NaN passes.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.tracks.wild_points import reject_wild_points, wild_points
+from vinetrack.tracks.outliers import find_outliers, reject_outliers
 
 FRAME_S = 1 / CAPTURE_FPS
 VINES = [(Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.6), (Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0.0)]
@@ -36,7 +36,7 @@ def test_no_point_of_an_undisturbed_motion_is_wild():
             end_frames = 5 if seed % 2 else 0
             draw = np.random.default_rng(seed)
             track = record(vine, draw, noise_m=noise_m, rho=rho, end_frames=end_frames).track
-            flagged += np.count_nonzero(wild_points(track.time_s, track.lead_position_m))
+            flagged += np.count_nonzero(find_outliers(track.time_s, track.lead_position_m))
     assert flagged == 0
 
 
@@ -44,7 +44,7 @@ def test_one_in_a_hundred_points_is_named_and_no_other():
     draw = np.random.default_rng(20001)
     track = steady_track(seed=20001)
     wild = 20 + 40 * np.arange(7) + draw.integers(-5, 6, 7)
-    out = reject_wild_points(displaced(track, wild, draw.choice([-1, 1], 7) * draw.uniform(1e-3, 1e-2, 7)))
+    out = reject_outliers(displaced(track, wild, draw.choice([-1, 1], 7) * draw.uniform(1e-3, 1e-2, 7)))
     assert np.flatnonzero(out.flag == "rejected").tolist() == wild.tolist()
     assert len(out.notes) == 1
     assert out.notes[0].startswith("7 points lie far off")
@@ -52,13 +52,13 @@ def test_one_in_a_hundred_points_is_named_and_no_other():
 
 
 def test_two_wild_points_beside_each_other_are_both_rejected():
-    out = reject_wild_points(displaced(steady_track(), np.array([150, 151]), np.array([3e-3, -3e-3])))
+    out = reject_outliers(displaced(steady_track(), np.array([150, 151]), np.array([3e-3, -3e-3])))
     assert np.flatnonzero(out.flag == "rejected").tolist() == [150, 151]
 
 
 @pytest.mark.parametrize("row", [0, 299])
 def test_a_wild_point_at_an_end_is_rejected(row):
-    out = reject_wild_points(displaced(steady_track(), np.array([row]), 5e-3))
+    out = reject_outliers(displaced(steady_track(), np.array([row]), 5e-3))
     assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
 
 
@@ -73,7 +73,7 @@ def test_a_wild_point_that_lies_near_the_one_before_is_no_copy_and_rejected(row,
     y = speed_m_s * time_s + ar1(300, noise_m, 0.0, np.random.default_rng(20003))
     y[row] = y[row - 1] + 0.2 * (y[row + 1] - y[row - 1]) / 2
     track = make_track(time_s, y)
-    assert not wild_points(track.time_s, y, spare_copies=True)[row]
+    assert not find_outliers(track.time_s, y, spare_copies=True)[row]
     out = correct_frames(track)
     assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
     np.testing.assert_array_equal(out.time_s, time_s)
@@ -86,7 +86,7 @@ def test_at_the_ends_a_motion_may_have_stopped_or_begun_and_not_the_other_way(ro
     time_s = np.arange(300) * FRAME_S
     y = 6.0 * time_s + ar1(300, 3e-5, 0.0, np.random.default_rng(20004))
     track = displaced(make_track(time_s, y), np.array([row]), steps * 6.0 * FRAME_S)
-    assert np.flatnonzero(reject_wild_points(track).flag == "rejected").tolist() == (
+    assert np.flatnonzero(reject_outliers(track).flag == "rejected").tolist() == (
         [row] if (steps > 0) == (row > 1) else []
     )
 
@@ -112,7 +112,7 @@ def test_a_motion_that_starts_at_full_speed_keeps_its_points():
     """Ten standard deviations a frame from one frame to the next, as a latch lets go."""
     for seed in range(20010, 20030):
         track = steady_track(seed=seed)
-        assert not wild_points(track.time_s, track.lead_position_m).any()
+        assert not find_outliers(track.time_s, track.lead_position_m).any()
 
 
 def test_noise_that_grows_with_speed_is_not_wild():
@@ -120,7 +120,7 @@ def test_noise_that_grows_with_speed_is_not_wild():
     speed = 40.0 * time_s
     draw = np.random.default_rng(20002)
     y = 20.0 * time_s**2 + np.hypot(5e-5, 6e-5 * speed) * draw.standard_normal(time_s.size)
-    assert not wild_points(time_s, y).any()
+    assert not find_outliers(time_s, y).any()
 
 
 def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
@@ -129,12 +129,11 @@ def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
     position_m[30] += 2e-3
     flag = np.full(60, "", dtype="<U80")
     track = Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))
-    assert reject_wild_points(track).flag[30] == "rejected"
+    assert reject_outliers(track).flag[30] == "rejected"
     flag = flag.copy()
     flag[30] = "corrected"
     assert (
-        reject_wild_points(Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))).flag[30]
-        == "corrected"
+        reject_outliers(Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))).flag[30] == "corrected"
     )
 
 
@@ -143,7 +142,7 @@ def test_where_one_point_in_eight_is_wild_none_is_rejected() -> None:
     rows = np.arange(10, 290, 8)
     draw = np.random.default_rng(20002)
     track = displaced(steady_track(seed=20002), rows, draw.choice([-1, 1], rows.size) * 5e-3)
-    assert not wild_points(track.time_s, track.lead_position_m).any()
+    assert not find_outliers(track.time_s, track.lead_position_m).any()
 
 
 @pytest.mark.parametrize("step_m", [5e-4, 1e-3, 2e-3])
@@ -154,12 +153,12 @@ def test_rounded_positions_are_neither_wild_nor_miss_frames(step_m, every):
         for vine, noise_m, rho in VINES:
             track = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho).track
             position_m = np.round(track.lead_position_m[::every] / step_m) * step_m
-            rounded = correct_frames(reject_wild_points(make_track(track.time_s[::every], position_m)))
+            rounded = correct_frames(reject_outliers(make_track(track.time_s[::every], position_m)))
             assert not rounded.notes
 
 
 def test_a_wild_point_among_rounded_ones_is_rejected():
     track = steady_track(n=600)
     rounded = replace(track, lead_position_m=np.round(track.lead_position_m, 3))
-    out = reject_wild_points(displaced(rounded, np.array([20, 300]), np.array([5e-3, -6e-3])))
+    out = reject_outliers(displaced(rounded, np.array([20, 300]), np.array([5e-3, -6e-3])))
     assert np.flatnonzero(out.flag == "rejected").tolist() == [20, 300]
