@@ -84,7 +84,7 @@ def errors(campaign: Hidden, learned: LearnedForce) -> dict[str, float]:
         chosen = np.flatnonzero(counts)[::EVERY]
         courses = (motion.time_s, motion.lead_position_m, motion.tail_velocity_m_s, motion.pressure_Pa)
         true.append(force_of(*(course[chosen] for course in courses)))
-        at = [course[chosen] for course in learned.domain.of_motion(motion)]
+        at = [course[chosen] for course in learned.domain.values_along(motion)]
         force_N, sigma_N = learned.best.force(at)
         alone.append(force_N)
         sigma.append(sigma_N)
@@ -121,8 +121,8 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     if learned is not None:
         row["variables"] = learned.domain.name
         row["weight"] = learned.weights[row["variables"]]
-        row["beside"] = ", ".join(learned.beside)
-        row["in_set"] = LAWS[law] in (row["variables"], *learned.beside)
+        row["beside"] = ", ".join(learned.not_excluded)
+        row["in_set"] = LAWS[law] in (row["variables"], *learned.not_excluded)
         row["weight_of_truth"] = learned.weights.get(LAWS[law], 0.0)
         row |= {"explained": learned.explained, **errors(campaign, learned)}
     if with_law:

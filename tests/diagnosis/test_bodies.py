@@ -14,9 +14,9 @@ from lsoda_vine import as_track
 import vinetrack as vt
 from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.force_inversion import Gain
+from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
-from vinetrack.diagnosis.missing_force import _Judged
+from vinetrack.diagnosis.law_ranking import RankedLaw
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 DRAG = 0.5
@@ -72,12 +72,12 @@ def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
 
 
 def test_a_local_force_narrower_than_a_millimetre_is_not_named() -> None:
-    assert Law("patch", shapes=2, low=-2e-3, high=4e-4).is_a_point
-    assert not Law("patch", shapes=2, low=0.02, high=0.04).is_a_point
+    assert Law("patch", n_shapes=2, low=-2e-3, high=4e-4).is_unresolved
+    assert not Law("patch", n_shapes=2, low=0.02, high=0.04).is_unresolved
 
 
 def test_a_force_far_beyond_drive_and_weight_is_not_named() -> None:
-    gain = Gain(100.0, np.array([-1.6e6]), 10.0, np.empty(0), 1)
-    law = Law("patch", shapes=2, low=0.274, high=0.294)
-    assert not _Judged(law, gain, 0.0, largest_N=50.0).seen
-    assert _Judged(law, replace(gain, amplitude=np.array([-20.0]), sigma=1.0), 0.0, largest_N=50.0).seen
+    estimate = ForceEstimate(100.0, np.array([-1.6e6]), 10.0, np.empty(0), 1)
+    law = Law("patch", n_shapes=2, low=0.274, high=0.294)
+    assert not RankedLaw(law, estimate, 0.0, largest_N=50.0).is_detected
+    assert RankedLaw(law, replace(estimate, amplitude=np.array([-20.0]), sigma=1.0), 0.0, largest_N=50.0).is_detected

@@ -1,4 +1,4 @@
-"""The compiled loop of answers to forces: that of the arrays, and a closed form."""
+"""The compiled variational equations against the same method in arrays, and against a closed form."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_kernels import answers
-from vinetrack.diagnosis.force_sensitivities import STAGE, _followed
+from vinetrack.diagnosis.force_kernels import integrate_responses
+from vinetrack.diagnosis.force_sensitivities import SDIRK_GAMMA, _responses
 
 TRIALS, STEPS, COLUMNS = 3, 400, 4
 
@@ -31,13 +31,16 @@ def stepped(x: Floats, v: Floats, h: Floats, k: Floats, c: Floats, push: Floats)
 def test_it_does_what_the_arrays_do() -> None:
     time_s, k, c, push = courses(3)
     x, v = np.zeros((2, TRIALS, COLUMNS))
-    moved, sped = answers(time_s, k, c, push, STAGE)
+    moved, sped = integrate_responses(time_s, k, c, push, SDIRK_GAMMA)
     for i in range(STEPS):
         h = (time_s[:, i + 1] - time_s[:, i])[:, None]
-        inside = [(1 - STAGE) * each[:, i] + STAGE * each[:, i + 1] for each in (k[:, :, None], c[:, :, None], push)]
-        _, speed, rate = stepped(x, v, STAGE * h, *inside)
-        x, v = x + (1 - STAGE) * h * speed, v + (1 - STAGE) * h * rate
-        x, v, _ = stepped(x, v, STAGE * h, k[:, i + 1, None], c[:, i + 1, None], push[:, i + 1])
+        inside = [
+            (1 - SDIRK_GAMMA) * each[:, i] + SDIRK_GAMMA * each[:, i + 1]
+            for each in (k[:, :, None], c[:, :, None], push)
+        ]
+        _, speed, rate = stepped(x, v, SDIRK_GAMMA * h, *inside)
+        x, v = x + (1 - SDIRK_GAMMA) * h * speed, v + (1 - SDIRK_GAMMA) * h * rate
+        x, v, _ = stepped(x, v, SDIRK_GAMMA * h, k[:, i + 1, None], c[:, i + 1, None], push[:, i + 1])
         np.testing.assert_allclose(moved[:, i + 1], x, rtol=1e-12)
         np.testing.assert_allclose(sped[:, i + 1], v, rtol=1e-12)
 
@@ -45,7 +48,9 @@ def test_it_does_what_the_arrays_do() -> None:
 def test_a_spring_that_is_pushed_swings_about_where_it_comes_to_rest() -> None:
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, STEPS + 1)[None]
-    moved, sped = answers(time_s, np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1)), STAGE)
+    moved, sped = integrate_responses(
+        time_s, np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1)), SDIRK_GAMMA
+    )
     assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
 
@@ -54,6 +59,6 @@ def test_what_overflows_is_raised_where_numpy_is_told_to_raise() -> None:
     time_s, k, c, push = courses(4)
     motions = [SimpleNamespace(time_s=t, stiffness=s, friction=f) for t, s, f in zip(time_s, -1e5 * k, c, strict=True)]
     with np.errstate(all="ignore"):
-        assert not np.isfinite(_followed(motions, 1e300 * push)[0]).all()  # type: ignore[arg-type]
+        assert not np.isfinite(_responses(motions, 1e300 * push)[0]).all()  # type: ignore[arg-type]
     with np.errstate(all="raise", under="ignore"), pytest.raises(FloatingPointError):
-        _followed(motions, 1e300 * push)  # type: ignore[arg-type]
+        _responses(motions, 1e300 * push)  # type: ignore[arg-type]

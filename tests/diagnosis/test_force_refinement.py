@@ -10,9 +10,10 @@ import pytest
 from grown import hidden_force, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.force_refinement import Place, _as_driven, normal_equations
+from vinetrack.diagnosis.cubic_splines import uniform_splines
+from vinetrack.diagnosis.force_refinement import SearchPoint, _with_updated_motions, normal_equations
 from vinetrack.diagnosis.force_sensitivities import force_sensitivities
-from vinetrack.diagnosis.force_surface import Surface, curves, domains
+from vinetrack.diagnosis.force_surface import SmoothForce, candidate_domains
 from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
@@ -30,16 +31,16 @@ def slowed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, LinearMisfit]
 def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tuple[Fit, LinearMisfit]) -> None:
     """The slope of the cost by what a trial's pressure deviates, held against the cost a little further on."""
     fit, linear = slowed
-    domain = next(each for each in domains(linear.motions) if each.variables == ("growth", "pressure"))
-    growth, pressure = (curves(np.linspace(0, 1, 40), count) for count in domain.counts)
+    domain = next(each for each in candidate_domains(linear.motions) if each.variables == ("growth", "pressure"))
+    growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
     effects = linear.fit.trial_effects
     motions = on_tracks(linear.fit, effects, linear.motions)
-    place = Place(fit.solution.state.theta, effects, Surface(domain, np.eye(domain.size)), force, motions)
+    place = SearchPoint(fit.solution.state.theta, effects, SmoothForce(domain, np.eye(domain.size)), force, motions)
     settled = place
     for _ in range(12):  # where a place far off the tracks is settled depends on where it begins
-        settled = _as_driven(fit, settled)
+        settled = _with_updated_motions(fit, settled)
     trial = 0
     mine = place.theta.size + domain.size + trial * N_TRIAL_EFFECTS + PRESSURE
     slope = normal_equations(fit, linear.fit, settled).slope[mine]
@@ -49,7 +50,7 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
         effects[trial, PRESSURE] += step
         moved = replace(settled, trial_effects=effects)
         for _ in range(3):
-            moved = _as_driven(fit, moved)
+            moved = _with_updated_motions(fit, moved)
         costs.append(normal_equations(fit, linear.fit, moved).cost)
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
 

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.diagnosis.force_evidence import Beginning
-from vinetrack.diagnosis.force_surface import NOTHING, Domain, Surface
-from vinetrack.diagnosis.learned_effect import even_coefficients, table_name, table_text
+from vinetrack.diagnosis.force_evidence import ForcePosterior
+from vinetrack.diagnosis.force_surface import ZERO_AT_START, Domain, SmoothForce
+from vinetrack.diagnosis.learned_effect import table_name, table_text, uniform_table
 from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.learned_variables import dependence, not_excluded
 from vinetrack.effects import own_effects
@@ -35,8 +35,8 @@ def learned(domain: Domain, seed: int) -> LearnedForce:
         "pressure_Pa": [2e4, 2.5e4],
     }
     table = pd.DataFrame({**places, "force_N": [-0.1, -0.3], "sigma_N": 0.01, "trials": [2, 3], "condition": ["", ""]})
-    surface, lengths = Surface(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
-    best = Beginning(NOTHING, 50.0, surface, lengths, coefficients, np.eye(domain.size) * 1e-4, 1.0)
+    surface, lengths = SmoothForce(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
+    best = ForcePosterior(ZERO_AT_START, 50.0, surface, lengths, coefficients, np.eye(domain.size) * 1e-4, 1.0)
     return LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
 
 
@@ -71,7 +71,7 @@ def test_the_file_holds_the_force_that_was_learned_wherever_trials_have_been(dom
 
 
 def test_even_splines_make_the_same_constant() -> None:
-    assert even_coefficients(DOMAINS[1], np.full(DOMAINS[1].size, 0.7)) == pytest.approx(0.7)
+    assert uniform_table(DOMAINS[1], np.full(DOMAINS[1].size, 0.7)) == pytest.approx(0.7)
 
 
 def test_choices_are_set_aside_by_what_they_leave_and_not_by_how_smooth_they_are() -> None:
@@ -79,7 +79,9 @@ def test_choices_are_set_aside_by_what_they_leave_and_not_by_how_smooth_they_are
     growth = replace(DOMAINS[0], counts=(12,))
     time, speed = (replace(growth, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
     pairs = [
-        replace(growth, variables=pair, low=(0.0, 0.0), high=(0.25, high), counts=(12, 8), usual=(math.inf, math.inf))
+        replace(
+            growth, variables=pair, low=(0.0, 0.0), high=(0.25, high), counts=(12, 8), log_scale=(math.inf, math.inf)
+        )
         for pair, high in ((("growth", "speed"), 8.0), (("growth", "time"), 0.125))
     ]
     part = np.linspace(0, 1, 80)

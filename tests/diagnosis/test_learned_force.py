@@ -13,10 +13,17 @@ from grown import grown, hidden_force, pairs_of, sheet
 from scipy.interpolate import BSpline
 
 import vinetrack as vt
-from vinetrack.diagnosis.cubic_splines import splines
-from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, Domain, Surface, covariance_root, curves
+from vinetrack.diagnosis.cubic_splines import splines, uniform_splines
+from vinetrack.diagnosis.force_surface import (
+    CONSTANT_AT_START,
+    FREE_AT_START,
+    ZERO_AT_START,
+    Domain,
+    SmoothForce,
+    covariance_modes,
+)
 from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS
-from vinetrack.diagnosis.learned_variables import following
+from vinetrack.diagnosis.learned_variables import dependent_variables
 from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.propose import Proposal, propose
 from vinetrack.effects import State
@@ -31,7 +38,7 @@ ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 
 
 def test_the_process_has_the_covariance_it_says() -> None:
-    directions, variances = covariance_root(12, 0.4)
+    directions, variances = covariance_modes(12, 0.4)
     covariance = (directions * variances) @ directions.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # First and last splines lie at the ends: one whole apart.
@@ -39,7 +46,7 @@ def test_the_process_has_the_covariance_it_says() -> None:
 
 
 def test_a_process_from_nothing_is_the_one_conditioned_on_its_first_value() -> None:
-    directions, variances = covariance_root(12, 0.4, from_nothing=True)
+    directions, variances = covariance_modes(12, 0.4, zero_at_start=True)
     covariance = (directions * variances) @ directions.T
     assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
     assert covariance[-1, -1] == pytest.approx(1 - ALIKE**2)
@@ -50,17 +57,17 @@ def test_a_surface_begins_as_it_is_told_to() -> None:
     speeds = np.linspace(0, 8, 9)
     begins = BOTH.basis([np.zeros(9), speeds])
     draw = np.random.default_rng(5)
-    for name, spread in ((NOTHING, False), (CONSTANT, False), (ANY, True)):
-        mix = BOTH.mix((0.25, 0.25), name)
+    for name, spread in ((ZERO_AT_START, False), (CONSTANT_AT_START, False), (FREE_AT_START, True)):
+        mix = BOTH.prior_modes((0.25, 0.25), name)
         at_start = begins @ mix @ draw.standard_normal(mix.shape[1])
         assert (np.ptp(at_start) > 0.1) == spread
-        assert (np.abs(at_start).max() < 1e-9) == (name == NOTHING)
+        assert (np.abs(at_start).max() < 1e-9) == (name == ZERO_AT_START)
 
 
 def test_which_variables_say_that_growth_has_begun() -> None:
-    assert [replace(BOTH, variables=names).course for names in (("growth", "time"), ("speed", "time"))] == [0, 1]
-    assert replace(BOTH, variables=("speed", "pressure")).beginnings == (ANY,)
-    assert GROWTH.beginnings == (NOTHING, CONSTANT)
+    assert [replace(BOTH, variables=names).start_axis for names in (("growth", "time"), ("speed", "time"))] == [0, 1]
+    assert replace(BOTH, variables=("speed", "pressure")).start_conditions == (FREE_AT_START,)
+    assert GROWTH.start_conditions == (ZERO_AT_START, CONSTANT_AT_START)
 
 
 @pytest.mark.parametrize("domain", [GROWTH, BOTH])
@@ -84,24 +91,24 @@ def test_products_of_splines_are_summed_without_those_that_are_nothing() -> None
     draw = np.random.default_rng(7)
     at = [draw.uniform(0, 0.3, 50), draw.uniform(0, 9, 50)]
     coefficients = draw.standard_normal(BOTH.size)
-    assert BOTH.sum(at, coefficients) == pytest.approx(BOTH.basis(at) @ coefficients, abs=1e-13)
-    alone = [curves(part, count) for part, count in zip(BOTH.parts(at), BOTH.counts, strict=True)]
+    assert BOTH.evaluate(at, coefficients) == pytest.approx(BOTH.basis(at) @ coefficients, abs=1e-13)
+    alone = [uniform_splines(part, count) for part, count in zip(BOTH.normalised(at), BOTH.counts, strict=True)]
     expected = np.einsum("na,nb->nab", *alone).reshape(50, -1)
     assert BOTH.basis(at) == pytest.approx(expected, abs=1e-15)
 
 
 def test_speeds_are_taken_as_logarithms_beyond_what_is_usual() -> None:
-    (parts,) = replace(GROWTH, usual=(0.01,)).parts([np.array([0.0, 0.01 * (math.sqrt(26) - 1), 0.25])])
+    (parts,) = replace(GROWTH, log_scale=(0.01,)).normalised([np.array([0.0, 0.01 * (math.sqrt(26) - 1), 0.25])])
     assert parts == pytest.approx([0.0, 0.5, 1.0])
 
 
 def test_a_surface_follows_the_function_whose_values_its_coefficients_are() -> None:
     """A function linear in both variables is held exactly by its values at the places of the splines."""
     u, v = (np.linspace(0, 1, count) for count in (101, 101))
-    places = [np.linalg.lstsq(curves(u, count), u, rcond=None)[0] for count in BOTH.counts]
+    places = [np.linalg.lstsq(uniform_splines(u, count), u, rcond=None)[0] for count in BOTH.counts]
     coefficients = (2 * places[0][:, None] - 3 * places[1]).ravel()
     motion = SimpleNamespace(lead_position_m=0.25 * u, tail_velocity_m_s=8.0 * v[::-1])
-    force = Surface(BOTH, coefficients[:, None]).along(motion)[:, 0]  # type: ignore[arg-type]
+    force = SmoothForce(BOTH, coefficients[:, None]).unit_force(motion)[:, 0]  # type: ignore[arg-type]
     assert force == pytest.approx(2 * u - 3 * v[::-1])
 
 
@@ -118,8 +125,8 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
         for speed in (2.0, 3.0, 4.5, 6.0, 7.5)
     ]
     time, speed = (replace(GROWTH, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
-    assert following(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
-    assert following(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
+    assert dependent_variables(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
+    assert dependent_variables(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +143,7 @@ def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(proposal
     size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
     assert size.value == pytest.approx(1.0, abs=0.1)
     assert table.ratio.fit.chi2_per_dof < 1.5 < proposal.before.chi2_per_dof
-    assert "No formula tried does what the learned force does." in proposal.sentences()[-1]
+    assert "No formula in the list reproduces the learned force." in proposal.sentences()[-1]
     zero = State(*(0.0,) * len(State._fields))
     assert math.isfinite(table.effect.functions["tail_force"](zero, None, 1.0))
 

@@ -143,6 +143,6 @@ def test_the_force_is_learned_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> 
         threads.extend(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
 
     monkeypatch.setattr(missing_force_module, "learned_force", learned)
-    linear: Any = SimpleNamespace(fit=SimpleNamespace(scatter=SimpleNamespace(dof=1)), motions=[])
+    linear: Any = SimpleNamespace(inversion=SimpleNamespace(scatter=SimpleNamespace(dof=1)), motions=[])
     assert missing_force_module._learned(linear, linear) is None
     assert set(threads) == {1}

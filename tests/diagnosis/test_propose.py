@@ -10,37 +10,41 @@ from grown import grown, hidden_force, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_laws import Law
-from vinetrack.diagnosis.missing_force import SeenLaw
+from vinetrack.diagnosis.missing_force import DetectedLaw
 from vinetrack.diagnosis.propose import effect_text, propose
 from vinetrack.effects import own_effects
 
 LAWS = [
-    SeenLaw(Law("constant"), (-0.2,), 0.9, "a constant force"),
-    SeenLaw(Law("position", largest=0.5), (-0.2,), 0.9, "a force in proportion to x"),
-    SeenLaw(Law("speed", largest=9.0, by_area=3e-4), (-0.2,), 0.9, "a force in proportion to ẋ"),
-    SeenLaw(Law("speed_squared", largest=81.0), (0.2,), 0.9, "a force in proportion to ẋ²"),
-    SeenLaw(Law("pressure", largest=3e4), (-0.2,), 0.9, "a force in proportion to P"),
-    SeenLaw(Law("time", largest=0.3), (-0.2,), 0.9, "a force that grows with time"),
-    SeenLaw(Law("inverse_speed", scale=2.5, largest=1.7), (-0.2,), 0.9, "a force that falls as 1/ẋ"),
-    SeenLaw(Law("falling_with_speed", shapes=1, scale=1.5), (-0.2,), 0.9, "a force that falls with speed"),
-    SeenLaw(Law("fading_in_time", shapes=1, scale=0.04), (-0.2,), 0.9, "a force that fades in time"),
-    SeenLaw(Law("fading_along", shapes=1, scale=0.07), (-0.2,), 0.9, "a force that fades along the growth"),
-    SeenLaw(Law("patch", shapes=2, low=0.08, high=0.11), (-0.2,), 0.9, "a force between 80 and 110 mm"),
-    SeenLaw(Law("position_squared", largest=0.25), (-0.2,), 0.9, "a force in proportion to x²"),
-    SeenLaw(Law("beyond_a_place", shapes=1, scale=0.06, largest=0.1), (-0.2,), 0.9, "a force beyond 60 mm"),
-    SeenLaw(Law("speed_cubed", largest=729.0), (-0.2,), 0.9, "a force in proportion to ẋ³"),
-    SeenLaw(Law("beyond_a_speed", shapes=1, scale=1.2, largest=7.8), (-0.2,), 0.9, "a force beyond 1.2 m/s"),
-    SeenLaw(Law("squared_beyond_a_speed", shapes=1, scale=1.2, largest=61.0), (-0.2,), 0.9, "a square beyond 1.2 m/s"),
-    SeenLaw(Law("position", times="speed", largest=4.0), (-0.2,), 0.9, "a force in proportion to x ẋ"),
-    SeenLaw(Law("patch", shapes=2, low=0.08, high=0.11, times="pressure", largest=3e4), (-0.2,), 0.9, "a patch by P"),
-    SeenLaw(Law("falling_with_speed", shapes=1, scale=1.5, times="position"), (-0.2,), 0.9, "falling, by x"),
-    SeenLaw(Law("speed_squared", times="pressure", largest=2e6, by_area=3e-4), (-0.2,), 0.9, "ẋ² by P"),
-    SeenLaw(Law("periodic", columns=2, shapes=1, scale=0.03), (0.1, -0.2), 0.9, "a force every 30 mm"),
+    DetectedLaw(Law("constant"), (-0.2,), 0.9, "a constant force"),
+    DetectedLaw(Law("position", peak=0.5), (-0.2,), 0.9, "a force in proportion to x"),
+    DetectedLaw(Law("speed", peak=9.0, reference_area_m2=3e-4), (-0.2,), 0.9, "a force in proportion to ẋ"),
+    DetectedLaw(Law("speed_squared", peak=81.0), (0.2,), 0.9, "a force in proportion to ẋ²"),
+    DetectedLaw(Law("pressure", peak=3e4), (-0.2,), 0.9, "a force in proportion to P"),
+    DetectedLaw(Law("time", peak=0.3), (-0.2,), 0.9, "a force that grows with time"),
+    DetectedLaw(Law("inverse_speed", scale=2.5, peak=1.7), (-0.2,), 0.9, "a force that falls as 1/ẋ"),
+    DetectedLaw(Law("falling_with_speed", n_shapes=1, scale=1.5), (-0.2,), 0.9, "a force that falls with speed"),
+    DetectedLaw(Law("fading_in_time", n_shapes=1, scale=0.04), (-0.2,), 0.9, "a force that fades in time"),
+    DetectedLaw(Law("fading_along", n_shapes=1, scale=0.07), (-0.2,), 0.9, "a force that fades along the growth"),
+    DetectedLaw(Law("patch", n_shapes=2, low=0.08, high=0.11), (-0.2,), 0.9, "a force between 80 and 110 mm"),
+    DetectedLaw(Law("position_squared", peak=0.25), (-0.2,), 0.9, "a force in proportion to x²"),
+    DetectedLaw(Law("beyond_a_place", n_shapes=1, scale=0.06, peak=0.1), (-0.2,), 0.9, "a force beyond 60 mm"),
+    DetectedLaw(Law("speed_cubed", peak=729.0), (-0.2,), 0.9, "a force in proportion to ẋ³"),
+    DetectedLaw(Law("beyond_a_speed", n_shapes=1, scale=1.2, peak=7.8), (-0.2,), 0.9, "a force beyond 1.2 m/s"),
+    DetectedLaw(
+        Law("squared_beyond_a_speed", n_shapes=1, scale=1.2, peak=61.0), (-0.2,), 0.9, "a square beyond 1.2 m/s"
+    ),
+    DetectedLaw(Law("position", factor="speed", peak=4.0), (-0.2,), 0.9, "a force in proportion to x ẋ"),
+    DetectedLaw(
+        Law("patch", n_shapes=2, low=0.08, high=0.11, factor="pressure", peak=3e4), (-0.2,), 0.9, "a patch by P"
+    ),
+    DetectedLaw(Law("falling_with_speed", n_shapes=1, scale=1.5, factor="position"), (-0.2,), 0.9, "falling, by x"),
+    DetectedLaw(Law("speed_squared", factor="pressure", peak=2e6, reference_area_m2=3e-4), (-0.2,), 0.9, "ẋ² by P"),
+    DetectedLaw(Law("periodic", n_amplitudes=2, n_shapes=1, scale=0.03), (0.1, -0.2), 0.9, "a force every 30 mm"),
 ]
 
 
 @pytest.mark.parametrize("seen", LAWS, ids=lambda seen: seen.law.name)
-def test_the_file_of_a_law_does_what_the_law_says(seen: SeenLaw, tmp_path: Path) -> None:
+def test_the_file_of_a_law_does_what_the_law_says(seen: DetectedLaw, tmp_path: Path) -> None:
     path = tmp_path / f"proposed_{seen.law.name}.py"
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
@@ -53,14 +57,14 @@ def test_the_file_of_a_law_does_what_the_law_says(seen: SeenLaw, tmp_path: Path)
 @pytest.mark.parametrize(
     ("law", "unit"),
     [
-        (Law("position", times="speed"), "N·s/m²"),
-        (Law("speed_squared", times="pressure"), "N·s²/(m²·Pa)"),
-        (Law("falling_with_speed", shapes=1, scale=1.5, times="position"), "N/m"),
+        (Law("position", factor="speed"), "N·s/m²"),
+        (Law("speed_squared", factor="pressure"), "N·s²/(m²·Pa)"),
+        (Law("falling_with_speed", n_shapes=1, scale=1.5, factor="position"), "N/m"),
         (Law("speed_cubed"), "N·s³/m³"),
     ],
 )
 def test_sizes_have_the_unit_that_makes_a_force(law: Law, unit: str) -> None:
-    assert f'"{unit}"' in effect_text(SeenLaw(law, (-0.2,), 0.9, "a law"))
+    assert f'"{unit}"' in effect_text(DetectedLaw(law, (-0.2,), 0.9, "a law"))
 
 
 def test_a_force_that_grows_with_time_is_proposed_and_mends_left_out_conditions(tmp_path: Path) -> None:

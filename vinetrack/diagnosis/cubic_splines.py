@@ -1,4 +1,4 @@
-"""Cubic B-splines by the four that act at a place: of dozens of splines all others are nothing there."""
+"""Cubic B-splines, evaluated through the four that are nonzero at each position."""
 
 from __future__ import annotations
 
@@ -8,63 +8,96 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 
-ACTING = 4
-"""Cubic splines that act between two knots. Derived: order + 1."""
+N_NONZERO = 4
+"""Cubic splines that are nonzero between two knots. Derived: order + 1."""
 
 
 @lru_cache(maxsize=64)
 def _pieces(knots: tuple[float, ...]) -> tuple[Floats, Floats]:
-    """Knots, and the polynomials of the splines that act beyond each, shape (n_knots − 1, power, spline)."""
+    """Knots, and the polynomials of the nonzero splines on each interval, shape (n_knots − 1, power, spline)."""
     from scipy.interpolate import BSpline, PPoly
 
     ends = np.array([knots[0]] * 3 + [*knots] + [knots[-1]] * 3)
-    whole = np.array([PPoly.from_spline(BSpline(ends, only, 3)).c[::-1] for only in np.eye(len(knots) + 2)])
-    pieces = [whole[k : k + ACTING, :, 3 + k].T for k in range(len(knots) - 1)]
+    polynomials = np.array([PPoly.from_spline(BSpline(ends, unit, 3)).c[::-1] for unit in np.eye(len(knots) + 2)])
+    pieces = [polynomials[k : k + N_NONZERO, :, 3 + k].T for k in range(len(knots) - 1)]
     return np.array(knots), np.array(pieces)
 
 
-def acting_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, Floats]:
-    """Which splines act at each place, and how much of each; constant beyond the ends.
+def nonzero_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, Floats]:
+    """Indices and values of the splines that are nonzero at each position; constant beyond the end knots.
 
     Parameters
     ----------
     at : array, shape (n,)
-        Places.
+        Positions.
     knots : tuple of float
-        Rising.
+        Increasing.
 
     Returns
     -------
     first : array of int, shape (n,)
-        The first of the four that act, of n_knots + 2.
-    weights : array, shape (n, 4)
-        Of these four; they sum up to 1.
+        The first of the four nonzero splines, of n_knots + 2.
+    values : array, shape (n, 4)
+        Of these four; they sum to 1.
     """
     breaks, pieces = _pieces(knots)
     inside = np.clip(at, breaks[0], breaks[-1])
     first = np.clip(np.searchsorted(breaks, inside, side="right") - 1, 0, len(pieces) - 1)
-    beyond = inside - breaks[first]
-    here = pieces[first]
-    weights = here[:, 3]
+    offset = inside - breaks[first]
+    polynomials = pieces[first]
+    values = polynomials[:, 3]
     for power in (2, 1, 0):
-        weights = weights * beyond[:, None] + here[:, power]
-    return first, weights
+        values = values * offset[:, None] + polynomials[:, power]
+    return first, values
 
 
 def splines(at: Floats, knots: Floats) -> Floats:
-    """Cubic B-splines on these knots, constant beyond the ends, shape (n, n_knots + 2).
+    """Design matrix of cubic B-splines on these knots; constant beyond the end knots.
 
     Parameters
     ----------
     at : array, shape (n,)
     knots : array, shape (n_knots,)
-        Rising.
+        Increasing.
 
     Returns
     -------
     array, shape (n, n_knots + 2)
     """
-    first, weights = acting_splines(at, tuple(np.asarray(knots).tolist()))
-    whole = np.zeros((len(first), len(knots) + 2))
-    np.put_along_axis(whole, first[:, None] + np.arange(ACTING), weights, axis=1)
-    return whole
+    first, values = nonzero_splines(at, tuple(np.asarray(knots).tolist()))
+    design = np.zeros((len(first), len(knots) + 2))
+    np.put_along_axis(design, first[:, None] + np.arange(N_NONZERO), values, axis=1)
+    return design
+
+
+def uniform_splines(at: Floats, count: int) -> Floats:
+    """Cubic B-splines on 0 to 1 with evenly spaced knots.
+
+    Parameters
+    ----------
+    at : array, shape (n,)
+        Positions from 0 to 1.
+    count : int
+        Number of splines.
+
+    Returns
+    -------
+    array, shape (n, count)
+    """
+    return splines(at, np.array(uniform_knots(count)))
+
+
+@lru_cache
+def uniform_knots(count: int) -> tuple[float, ...]:
+    """Knots of `uniform_splines`.
+
+    Parameters
+    ----------
+    count : int
+        Number of splines.
+
+    Returns
+    -------
+    tuple of float
+    """
+    return tuple(np.linspace(0.0, 1.0, count - 2).tolist())

@@ -16,7 +16,7 @@ import numpy as np
 from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, as_deviate
-from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of, push_sensitivities
+from vinetrack.diagnosis.force_sensitivities import FittedMotion, acceleration_sensitivities, motions_of
 from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, PerTrialEstimates
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.inference.fit_result import Fit
@@ -92,7 +92,7 @@ def _halves(fit: Fit, laid: AlignedTrial, trial_effects: Floats) -> _Halves:
     ]
     pushes = [_pushes(*pair) for pair in zip(motions, middles, strict=True)]
     deviation = np.full((len(data), 2), math.nan)
-    for i, answers in enumerate(push_sensitivities(fit, trial_effects, motions, pushes)):
+    for i, answers in enumerate(acceleration_sensitivities(fit, trial_effects, motions, pushes)):
         others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
         if laid.predictor.has_damping_deviation[i] and np.all(np.ptp(answers, axis=0) > 0):
             deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
@@ -106,7 +106,7 @@ def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
     more = motion.model.with_values({DAMPING: value * math.exp(STEP)})
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
     changed = evaluate(more, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
-    push = (changed - motion.free) / STEP
+    push = (changed - motion.model_acceleration) / STEP
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 

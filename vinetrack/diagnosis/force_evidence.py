@@ -1,7 +1,7 @@
-"""How likely a force over some variables makes the tracks, and the most likely force among all that they allow.
+"""Marginal likelihood and posterior of a smooth force over given variables, averaged over its hyperparameters.
 
-A force that is nothing where growth begins, one that is a constant there and one that is anything there are compared by
-their marginal likelihoods: see `force_surface` for why the first is what is drawn unless the tracks are against it.
+A force that is zero where growth begins, one that is constant there and one that is free there are compared by their
+marginal likelihoods; `force_surface` explains why the first is drawn unless the tracks contradict it.
 """
 
 from __future__ import annotations
@@ -14,64 +14,80 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_refinement import Normal, Place
-from vinetrack.diagnosis.force_surface import AMPLITUDES, ANY, FOLLOWED, LENGTHS, Domain, Surface, standard_error
+from vinetrack.diagnosis.force_refinement import NormalEquations, SearchPoint
+from vinetrack.diagnosis.force_surface import (
+    FREE_AT_START,
+    LENGTH_SCALES,
+    RELATIVE_AMPLITUDES,
+    SEARCHED_VARIANCE,
+    Domain,
+    SmoothForce,
+    standard_error,
+)
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 
 LEAST_INFORMATION = 1e-8
-"""Information below which a direction is not told apart from others, where each number alone has 1. Derived: sums of
-squares are rounded at 1e-14 of the largest, and the score of such a direction at its root."""
+"""Information, where each unknown alone has 1, below which a combination of unknowns is not estimable. Derived: sums of
+squares are rounded at 1e-14 of the largest, and the score in such a direction at the root of that."""
 
-UNLIKELY = 5.0
-"""ln of how much less likely lengths and amplitudes may be to count in the mean and the band. Chosen: a hundredth and
-a half; at twice of it the band is the same within a hundredth and takes four times as long."""
+NEGLIGIBLE_LOG_RATIO = 5.0
+"""Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band.
+Chosen: a weight of 0.7 % of the best; at twice of it the band is the same within a hundredth and takes four times as
+long."""
 
-DRAWN = 30
-"""Points over a variable at which it is asked what a force is known to. Chosen: more than it has splines."""
+GRID_POINTS = 30
+"""Points over a variable at which the standard error of a force is evaluated. Chosen: more than it has splines."""
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """What positions say of the coefficients of a domain's splines: precision, score about 0, χ² at 0, its fall.
+class CoefficientLikelihood:
+    """Quadratic log-likelihood of the spline coefficients, all other unknowns integrated out.
 
-    `log_determinant` is that of the information on all other numbers.
+    `information` and `score` are about coefficients of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to
+    the best coefficients. `log_determinant` is that of the information on all other unknowns.
     """
 
     information: Floats
     score: Floats
-    cost: float
-    gain: float
+    chi2_at_zero: float
+    delta_chi2: float
     log_determinant: float
 
     @property
-    def lowest(self) -> float:
-        """χ² of the best coefficients, whatever the prior says of how smooth they are."""
-        return self.cost - self.gain
+    def least_chi2(self) -> float:
+        """χ² of the best coefficients, without regard to the smoothness prior."""
+        return self.chi2_at_zero - self.delta_chi2
 
     @property
-    def finite(self) -> bool:
-        """Whether positions say anything: far beyond what trials have been through numbers overflow."""
-        parts = (self.information, self.score, self.cost, self.gain, self.log_determinant)
+    def is_finite(self) -> bool:
+        """Whether all entries are finite: far outside the visited range the equations overflow."""
+        parts = (self.information, self.score, self.chi2_at_zero, self.delta_chi2, self.log_determinant)
         return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """A force that begins in one way, with its marginal likelihood at the most likely lengths and amplitude.
+class ForcePosterior:
+    """Posterior of a force under one condition at the start of growth.
 
-    `mean` and `covariance` are those of the splines' coefficients, N; `left` is the χ² that it leaves.
+    `log_evidence` is the log marginal likelihood, averaged over amplitude and length scales; `surface` has the most
+    likely ones. `mean`, N, and `covariance`, N², are those of the spline coefficients; `chi2` is that of the mean.
     """
 
-    begins: str
+    at_start: str
     log_evidence: float
-    surface: Surface
-    lengths: tuple[float, ...]
+    surface: SmoothForce
+    length_scales: tuple[float, ...]
     mean: Floats
     covariance: Floats
-    left: float
+    chi2: float
+
+    @property
+    def domain(self) -> Domain:
+        """The variables of the force, with their ranges."""
+        return self.surface.domain
 
     def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of the variables, SI, and its standard error, each of shape (n,), N.
+        """Posterior mean of the force at values of the variables, and its standard error.
 
         Parameters
         ----------
@@ -82,124 +98,135 @@ class Beginning:
         -------
         force, sigma : arrays, shape (n,), N
         """
-        basis = self.surface.domain.basis(values)
+        basis = self.domain.basis(values)
         return basis @ self.mean, standard_error(basis, self.covariance)
 
 
 @dataclass(frozen=True)
 class VariableChoice:
-    """A domain with its marginal likelihood, averaged over all ways to begin, and each of these."""
+    """A choice of variables with its log marginal likelihood, and the posterior under each start condition.
+
+    The marginal likelihood is averaged over the start conditions.
+    """
 
     domain: Domain
     log_evidence: float
-    beginnings: tuple[Beginning, ...]
+    posteriors: tuple[ForcePosterior, ...]
 
-    def best(self, error: float = 1.0) -> Beginning:
-        """The force that is drawn; differences of ln Z count in units of `error`.
+    def best(self, error: float = 1.0) -> ForcePosterior:
+        """The posterior that is drawn; differences of ln Z count in units of `error`.
 
-        Where growth begins it is nothing, or a constant where that is likelier. Whether it is anything else there stays
-        open unless that is worth Δχ² 9: B, n and P_y could hold it. The band holds what nothing and a constant differ
-        by, each as likely as it is.
+        The force is zero where growth begins, or a constant where that is more likely. It is free there only if that is
+        worth Δχ² of 9, because B, n and P_y could take over such a force. The covariance is that of the mixture of zero
+        and constant, weighted by their marginal likelihoods.
 
         Parameters
         ----------
         error : float
-            What ln Z is known to.
+            Standard error of ln Z.
 
         Returns
         -------
-        Beginning
+        ForcePosterior
         """
-        narrow = [each for each in self.beginnings if each.begins != ANY]
-        wide = [each for each in self.beginnings if each.begins == ANY]
-        most = max((each.log_evidence for each in narrow), default=-math.inf)
-        if not narrow or (wide and wide[0].log_evidence > most + 0.5 * ANSWER_SET_DELTA_CHI2 * error):
-            return wide[0]
-        weights = np.exp([(each.log_evidence - most) / error for each in narrow])
+        restricted = [each for each in self.posteriors if each.at_start != FREE_AT_START]
+        free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
+        highest = max((each.log_evidence for each in restricted), default=-math.inf)
+        if not restricted or (free and free[0].log_evidence > highest + 0.5 * ANSWER_SET_DELTA_CHI2 * error):
+            return free[0]
+        weights = np.exp([(each.log_evidence - highest) / error for each in restricted])
         weights /= weights.sum()
-        likely = next(each for each in narrow if each.log_evidence > most - error)
+        likely = next(each for each in restricted if each.log_evidence > highest - error)
         covariance = np.zeros_like(likely.covariance)
-        for weight, each in zip(weights, narrow, strict=True):
-            off = each.mean - likely.mean
-            covariance += weight * (each.covariance + np.outer(off, off))
+        for weight, each in zip(weights, restricted, strict=True):
+            deviation = each.mean - likely.mean
+            covariance += weight * (each.covariance + np.outer(deviation, deviation))
         return replace(likely, covariance=covariance)
 
     @property
     def undecided_N(self) -> float:
-        """What a force where growth begins is known to, N, beside B, n and P_y: the median over its other variable."""
-        wide = [each for each in self.beginnings if each.begins == ANY]
-        if not wide or self.domain.course < 0:
+        """Standard error of a force that is free where growth begins, N: its median over the other variable.
+
+        B, n and P_y compete with such a force.
+        """
+        free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
+        if not free or self.domain.start_axis < 0:
             return 0.0
-        grid = [np.linspace(low, high, DRAWN) for low, high in zip(self.domain.low, self.domain.high, strict=True)]
-        grid[self.domain.course] = np.full(DRAWN, self.domain.low[self.domain.course])
-        return float(np.median(wide[0].force(grid)[1]))
+        grid = [
+            np.linspace(low, high, GRID_POINTS) for low, high in zip(self.domain.low, self.domain.high, strict=True)
+        ]
+        grid[self.domain.start_axis] = np.full(GRID_POINTS, self.domain.low[self.domain.start_axis])
+        return float(np.median(free[0].force(grid)[1]))
 
-    def smooth_from(self, begins: str) -> Surface:
-        """As smooth and as large as the most likely force, but one that begins in this way where it may.
+    def with_start(self, at_start: str) -> SmoothForce:
+        """A force with the most likely hyperparameters, but with this condition at the start of growth.
 
-        Where motions do not follow the force yet, what they lack at their begin would pass for a force there.
+        While motions do not yet include the force, their defect at the start would be fitted as a force there.
 
         Parameters
         ----------
-        begins : str
+        at_start : str
 
         Returns
         -------
-        Surface
+        SmoothForce
         """
-        likely = max(self.beginnings, key=lambda each: each.log_evidence)
-        return Surface(self.domain, self.domain.mix(likely.lengths, begins, FOLLOWED), likely.surface.sd_N)
+        likely = max(self.posteriors, key=lambda each: each.log_evidence)
+        modes = self.domain.prior_modes(likely.length_scales, at_start, SEARCHED_VARIANCE)
+        return SmoothForce(self.domain, modes, likely.surface.sd_N)
 
 
-def posterior(place: Place, normal: Normal) -> Posterior:
-    """All numbers but the coefficients of the force integrated out; in units in which each has unit information.
+def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> CoefficientLikelihood:
+    """Integrate out all unknowns but the force coefficients, after scaling each unknown to unit information.
 
     Parameters
     ----------
-    place : where the search stands.
+    point : where the search stands.
     normal : its normal equations.
 
     Returns
     -------
-    Posterior
+    CoefficientLikelihood
     """
-    p, q = place.theta.size, place.amplitude.size
-    size = np.diag(normal.square)
+    p, q = point.theta.size, point.amplitude.size
+    size = np.diag(normal.matrix)
     unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
-    square, slope = normal.square * unit[:, None] * unit, normal.slope * unit
+    matrix, score = normal.matrix * unit[:, None] * unit, normal.score * unit
     force = np.arange(p, p + q)
-    beside = np.concatenate([np.arange(p), np.arange(p + q, slope.size)])
-    beside = beside[size[beside] > 0]
-    values, directions = np.linalg.eigh(square[np.ix_(beside, beside)])
-    told = values > LEAST_INFORMATION
-    root = directions[:, told] / np.sqrt(values[told])
-    cross, along = root.T @ square[np.ix_(beside, force)], root.T @ slope[beside]
-    strength, ways = np.linalg.eigh(square[np.ix_(force, force)] - cross.T @ cross)
-    # What other numbers do as well is known no better than numbers are rounded.
-    ways, strength = ways[:, strength > LEAST_INFORMATION], strength[strength > LEAST_INFORMATION]
+    nuisance = np.concatenate([np.arange(p), np.arange(p + q, score.size)])
+    nuisance = nuisance[size[nuisance] > 0]
+    values, vectors = np.linalg.eigh(matrix[np.ix_(nuisance, nuisance)])
+    estimable = values > LEAST_INFORMATION
+    root = vectors[:, estimable] / np.sqrt(values[estimable])
+    cross, nuisance_score = root.T @ matrix[np.ix_(nuisance, force)], root.T @ score[nuisance]
+    strength, directions = np.linalg.eigh(matrix[np.ix_(force, force)] - cross.T @ cross)
+    # Directions that the nuisance parameters reproduce have information only from rounding.
+    directions, strength = directions[:, strength > LEAST_INFORMATION], strength[strength > LEAST_INFORMATION]
     scale = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)
-    back = scale[:, None] * ways
-    heard = ways.T @ (slope[force] - cross.T @ along)
-    inner = scale * place.amplitude @ ways
-    cost = normal.cost - float(along @ along)
-    return Posterior(
+    back = scale[:, None] * directions
+    local_score = directions.T @ (score[force] - cross.T @ nuisance_score)
+    at_point = scale * point.amplitude @ directions
+    cost = normal.cost - float(nuisance_score @ nuisance_score)
+    return CoefficientLikelihood(
         information=(back * strength) @ back.T,
-        score=back @ (heard + strength * inner),
-        cost=cost + 2 * float(heard @ inner) + float(strength @ inner**2),
-        gain=float(np.sum((heard + strength * inner) ** 2 / strength)),
-        log_determinant=float(np.sum(np.log(values[told]))) - 2 * float(np.sum(np.log(unit[beside]))),
+        score=back @ (local_score + strength * at_point),
+        chi2_at_zero=cost + 2 * float(local_score @ at_point) + float(strength @ at_point**2),
+        delta_chi2=float(np.sum((local_score + strength * at_point) ** 2 / strength)),
+        log_determinant=float(np.sum(np.log(values[estimable]))) - 2 * float(np.sum(np.log(unit[nuisance]))),
     )
 
 
-def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float) -> VariableChoice:
-    """The marginal likelihood of a domain, averaged over ways to begin, lengths and amplitudes.
+def marginal_likelihood(
+    domain: Domain, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
+) -> VariableChoice:
+    """Average the marginal likelihood of a domain over start conditions, length scales and amplitudes.
 
     Parameters
     ----------
     domain : the variables.
-    told : what positions say of a force over them.
+    likelihood : that of the spline coefficients.
     inflation : float
-        By how much χ² counts for less than noise alone would let it.
+        Factor by which the residual variance exceeds that of the noise.
     largest_N : float
         The largest drive of any trial.
 
@@ -207,67 +234,73 @@ def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float)
     -------
     VariableChoice
     """
-    beginnings = tuple(_begun(domain, begins, told, inflation, largest_N) for begins in domain.beginnings)
-    logs = np.array([each.log_evidence for each in beginnings])
-    return VariableChoice(domain, float(logs.max() + np.log(np.mean(np.exp(logs - logs.max())))), beginnings)
+    posteriors = tuple(
+        _force_posterior(domain, at_start, likelihood, inflation, largest_N) for at_start in domain.start_conditions
+    )
+    logs = np.array([each.log_evidence for each in posteriors])
+    return VariableChoice(domain, float(logs.max() + np.log(np.mean(np.exp(logs - logs.max())))), posteriors)
 
 
-def _begun(domain: Domain, begins: str, told: Posterior, inflation: float, largest_N: float) -> Beginning:
-    """One way to begin: averaged over lengths and amplitudes, each as likely as positions make it.
+def _force_posterior(
+    domain: Domain, at_start: str, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
+) -> ForcePosterior:
+    """The posterior under one start condition, averaged over length scales and amplitudes by their likelihoods.
 
-    In the directions of one choice of lengths, each known by itself, only the shrinkage depends on the amplitude.
+    For given length scales the information in the prior's modes is diagonalised, so that the amplitude only changes how
+    much each component is shrunk.
     """
-    sizes_N = largest_N * AMPLITUDES[:, None]
-    by_length, tried = [], []
-    for lengths in itertools.product(LENGTHS, repeat=len(domain.variables)):
-        mix = domain.mix(lengths, begins)
-        values, directions = np.linalg.eigh(mix.T @ told.information @ mix / inflation)
-        heard = directions.T @ (mix.T @ told.score) / inflation
-        spread = 1 + sizes_N**2 * np.maximum(values, 0.0)
-        shrunk = sizes_N**2 / spread
-        by_length.append(0.5 * np.sum(shrunk * heard**2 - np.log(spread), axis=1))
-        tried.append((lengths, mix @ directions, shrunk, shrunk * heard))
-    logs = np.array(by_length)
+    sizes_N = largest_N * RELATIVE_AMPLITUDES[:, None]
+    log_likelihoods, by_length = [], []
+    for lengths in itertools.product(LENGTH_SCALES, repeat=len(domain.variables)):
+        modes = domain.prior_modes(lengths, at_start)
+        values, vectors = np.linalg.eigh(modes.T @ likelihood.information @ modes / inflation)
+        score = vectors.T @ (modes.T @ likelihood.score) / inflation
+        widening = 1 + sizes_N**2 * np.maximum(values, 0.0)
+        variance = sizes_N**2 / widening
+        log_likelihoods.append(0.5 * np.sum(variance * score**2 - np.log(widening), axis=1))
+        by_length.append((lengths, modes @ vectors, variance, variance * score))
+    logs = np.array(log_likelihoods)
     best, size = np.unravel_index(np.argmax(logs), logs.shape)
-    most = logs[best, size]
-    likelihoods = np.exp(logs - most)
-    evidence = most + math.log(float(np.mean(likelihoods)))
-    weights = np.where(logs > most - UNLIKELY, likelihoods, 0.0)
+    highest = logs[best, size]
+    likelihoods = np.exp(logs - highest)
+    evidence = highest + math.log(float(np.mean(likelihoods)))
+    weights = np.where(logs > highest - NEGLIGIBLE_LOG_RATIO, likelihoods, 0.0)
     weights /= weights.sum()
-    mean, square = np.zeros(domain.size), np.zeros((domain.size, domain.size))
-    for weight, (_, ways, shrunk, means) in zip(weights, tried, strict=True):
+    mean, second_moment = np.zeros(domain.size), np.zeros((domain.size, domain.size))
+    for weight, (_, components, variance, means) in zip(weights, by_length, strict=True):
         if weight.any():
-            mean += ways @ (weight @ means)
-            square += ways @ (np.diag(weight @ shrunk) + (means.T * weight) @ means) @ ways.T
-    lengths = tried[best][0]
-    return Beginning(
-        begins,
-        float(evidence) - 0.5 * told.cost / inflation - 0.5 * told.log_determinant,
-        Surface(domain, domain.mix(lengths, begins, FOLLOWED), float(sizes_N[size, 0])),
+            mean += components @ (weight @ means)
+            second_moment += components @ (np.diag(weight @ variance) + (means.T * weight) @ means) @ components.T
+    lengths = by_length[best][0]
+    return ForcePosterior(
+        at_start,
+        float(evidence) - 0.5 * likelihood.chi2_at_zero / inflation - 0.5 * likelihood.log_determinant,
+        SmoothForce(domain, domain.prior_modes(lengths, at_start, SEARCHED_VARIANCE), float(sizes_N[size, 0])),
         lengths,
         mean,
-        square - np.outer(mean, mean),
-        told.cost - 2 * float(told.score @ mean) + float(mean @ told.information @ mean),
+        second_moment - np.outer(mean, mean),
+        likelihood.chi2_at_zero - 2 * float(likelihood.score @ mean) + float(mean @ likelihood.information @ mean),
     )
 
 
-def posterior_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:
-    """Posterior weights of choices by name, one variable and two with the same odds beforehand.
+def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:
+    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two.
 
     Parameters
     ----------
     choices : sequence of VariableChoice
     error : float
-        What ln Z is known to.
+        Standard error of ln Z, in units of which its differences count.
 
     Returns
     -------
-    dict, best first
+    dict of float
+        By name of the choice, highest first.
     """
     counts = {size: sum(len(choice.domain.variables) == size for choice in choices) for size in (1, 2)}
-    most = max(choice.log_evidence for choice in choices)
+    highest = max(choice.log_evidence for choice in choices)
     raw = {
-        choice.domain.name: math.exp((choice.log_evidence - most) / error) / counts[len(choice.domain.variables)]
+        choice.domain.name: math.exp((choice.log_evidence - highest) / error) / counts[len(choice.domain.variables)]
         for choice in choices
     }
     return {name: value / sum(raw.values()) for name, value in sorted(raw.items(), key=lambda part: -part[1])}

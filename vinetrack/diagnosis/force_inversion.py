@@ -1,4 +1,14 @@
-"""Least squares for forces that a model lacks, beside its own numbers and those of every trial."""
+"""Linear inversion for missing forces: generalised least squares beside model parameters and trial effects.
+
+The fit is linearised about its parameters and about given trial effects. With a force of amplitudes f, positions are
+
+    y = J δθ + Z b_i + S f + e
+
+J the sensitivities to the model parameters θ, Z those to the effects b_i of trial i (release, origin, pressure, B), S
+those to the force amplitudes (`vinetrack.diagnosis.force_sensitivities`), and e AR(1) noise of the tracks. θ and b_i
+have normal priors. The trial effects are eliminated trial by trial, the model parameters over all trials (Schur
+complements of the normal equations), so that only equations for f remain.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
@@ -19,46 +30,61 @@ from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import whiten
 
-PER_TRIAL = 10.0
-"""Independent pieces of information that one trial counts for: its frames err together. Chosen: residual correlation
-times of a tenth of a recording; half or twice moves the error of a force by 1.4."""
+INDEPENDENT_POINTS_PER_TRIAL = 10.0
+"""Effective number of independent residuals in one trial: residuals of neighbouring frames are correlated. Chosen:
+residual correlation times of a tenth of a recording; half or twice moves the error of a force by 1.4."""
 
-OWN_ITERATIONS = 8
-"""Iterations of the trial effects at most. Chosen."""
+MAX_TRIAL_EFFECT_ITERATIONS = 8
+"""Most iterations of the trial effects. Chosen."""
 
-LEAST_INFORMATION = 1e-9
-"""Part of the largest information below which a force moves nothing, or only what others move too. Chosen far below
-anything of weight."""
+LEAST_RELATIVE_INFORMATION = 1e-9
+"""Part of the largest information below which a force amplitude is not estimable: the force moves nothing, or only what
+the parameters move too. Chosen far below anything of weight."""
 
-SMOOTHNESS = np.geomspace(1e-6, 1e2, 17)
+PARAMETER_CUTOFF = 1e-11
+"""Relative eigenvalue below which a combination of model parameters is not estimable. Derived: sums of squares are
+rounded at 1e-14 of the largest, a thousandth of this."""
+
+SMOOTHING_PENALTIES = np.geomspace(1e-6, 1e2, 17)
+"""Penalties on second differences among which generalised cross-validation chooses, relative to the mean information
+about a coefficient. Chosen: from no visible smoothing to a straight line, in steps of a factor of three."""
 
 
 @dataclass(frozen=True)
-class Gain:
-    """What forces explain: the fall of χ², their amplitudes, N, and the error of one.
+class ForceEstimate:
+    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring.
 
-    `terms` counts the amplitudes that the data feel: chance alone lets χ² fall by as much. `numbers` is how the model's
-    own numbers move along, as the fit holds them.
+    `sigma` is the root mean square standard error of an amplitude. `parameter_shift` is how far the model parameters
+    move along, in the fit's own scaling. `degrees_of_freedom` counts the estimable amplitudes: by chance alone χ² falls
+    by as much.
     """
 
-    chi2: float
+    delta_chi2: float
     amplitude: Floats
     sigma: float
-    numbers: Floats
-    terms: int
+    parameter_shift: Floats
+    degrees_of_freedom: int
 
     @property
-    def beyond(self) -> float:
-        """The fall of χ² beyond what chance gives."""
-        return max(self.chi2 - self.terms, 0.0)
+    def delta_chi2_beyond_chance(self) -> float:
+        """The fall of χ² in excess of its expectation under no force; at least 0."""
+        return max(self.delta_chi2 - self.degrees_of_freedom, 0.0)
 
 
-class ForceFit:
-    """The trials of a fit laid out for any number of forces.
+class LinearInversion:
+    """A fit linearised about its parameters and given trial effects, ready to estimate any number of forces.
 
-    The noise is that of the tracks: what the model misses is no noise. Pressure and B of a trial scatter as replicates
-    do. `chi2` is what is left without any further force. `own`, shape (n_trials, 4), is where the trials' own numbers
-    begin: each comes as near to its track as they let it, so that little is left for forces.
+    The noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a
+    trial have the standard deviations estimated from replicates.
+
+    Parameters
+    ----------
+    fit : the fit that lacks a force.
+    trial_effects : array, shape (n_trials, 4)
+        Where the trial effects start. Each trial's effects are then optimised with the model parameters held, so that
+        the trajectories come as near to the tracks as their priors allow and little is left to a force.
+    scatter : Scatter
+        Between-trial standard deviations.
     """
 
     def __init__(self, fit: Fit, trial_effects: Floats, scatter: Scatter) -> None:
@@ -67,234 +93,260 @@ class ForceFit:
         noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
         self.scatter = scatter
         spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
-        before = fit.solution.state
-        state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, variance_floor(data)))
-        still = replace(problem, free=np.zeros_like(problem.free))
-        held = FixedTerms(spread, (rho, state.variance))
-        solution = solve(fit.predictor, still, state, held, warm=True, most_iterations=OWN_ITERATIONS)
+        fitted = fit.solution.state
+        state = FitState(fitted.theta, trial_effects, spread, rho, np.maximum(noise, variance_floor(data)))
+        parameters_held = replace(problem, free=np.zeros_like(problem.free))
+        noise_held = FixedTerms(spread, (rho, state.variance))
+        solution = solve(
+            fit.predictor, parameters_held, state, noise_held, warm=True, most_iterations=MAX_TRIAL_EFFECT_ITERATIONS
+        )
         self.data, self.problem = data, problem
         self.state, self.columns = solution.state, solution.columns
-        self.precision = trial_effect_prior(problem, self.state)[1]
-        self.pull = -problem.prior_precision * (state.theta - problem.prior_mean)
+        self.trial_effect_precision = trial_effect_prior(problem, self.state)[1]
+        self.prior_score = -problem.prior_precision * (state.theta - problem.prior_mean)
         self.conditions = [trial_data.trial.condition for trial_data in data]
-        self.points = float(sum(trial_data.time_s.size for trial_data in data))
+        self.n_points = float(sum(trial_data.time_s.size for trial_data in data))
 
     @property
     def trial_effects(self) -> Floats:
-        """The trials' own numbers, about which everything is linear, shape (n_trials, 4)."""
+        """The trial effects about which everything is linear, shape (n_trials, 4)."""
         return self.state.trial_effects
 
-    def _blocks(self, answers: Sequence[Floats]) -> Floats:
-        """Products of [keys, forces, residual] of every trial, its own numbers eliminated."""
-        blocks = []
-        for i, (columns, more) in enumerate(zip(self.columns, answers, strict=True)):
-            left = (
-                columns[:, -1]
-                + columns[:, list(DEVIATION_COLUMNS)] @ self.state.trial_effects[i, list(DEVIATION_COLUMNS)]
-            )
-            rows = np.column_stack([columns[:, :-1], more, left])
-            white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
-            gram = white.T @ white / self.state.variance[i]
-            within_trial = gram[:N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + np.diag(self.precision[i])
-            blocks.append(
-                gram[N_TRIAL_EFFECTS:, N_TRIAL_EFFECTS:]
-                - gram[N_TRIAL_EFFECTS:, :N_TRIAL_EFFECTS]
-                @ np.linalg.solve(within_trial, gram[:N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:])
-            )
-        return np.array(blocks)
-
-    def _spread(self, blocks: Floats) -> tuple[Floats, Floats, Floats]:
-        """Sums over trials: numbers with themselves (p, p), with forces and residual (p, L + 1), and the rest."""
-        k, p = self.problem.index.shape[1], self.pull.size
-        index = self.problem.index
-        square, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, blocks.shape[1] - k))
-        np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, :k, :k])
-        np.add.at(cross, index, blocks[:, :k, k:])
-        square, cross = square[:p, :p] + np.diag(self.problem.prior_precision), cross[:p].copy()
-        cross[:, -1] += self.pull
-        still = ~self.problem.free | ~(np.diag(square) > 0)
-        square[still, :] = square[:, still] = cross[still] = 0.0
-        return square, cross, blocks[:, k:, k:].sum(axis=0)
-
-    def _inverse(self, square: Floats) -> Floats:
-        scale = np.where(np.diag(square) > 0, 1 / np.sqrt(np.maximum(np.diag(square), 1e-300)), 0.0)
-        inverse = np.linalg.pinv(square * scale[:, None] * scale, rcond=1e-11, hermitian=True)
-        return np.asarray(inverse * scale[:, None] * scale)
-
-    def gains(self, answers: Sequence[Floats], columns: Sequence[int]) -> list[Gain]:
-        """What each of several forces explains alone; `columns` counts the columns of each among the answers.
+    def estimate_each(self, sensitivities: Sequence[Floats], columns: Sequence[int]) -> list[ForceEstimate]:
+        """Estimate each of several forces with none of the others present.
 
         Parameters
         ----------
-        answers : sequence of arrays, shape (n_points, n_columns), m
-            What the forces do to the positions of each trial, side by side.
+        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
+            Of the positions of each trial to the amplitudes of all forces, side by side.
         columns : sequence of int
-            Columns of each force.
+            Number of amplitudes of each force.
 
         Returns
         -------
-        list of Gain
+        list of ForceEstimate
         """
-        blocks = self._blocks(answers)
-        square, cross, total = self._spread(blocks)
-        inverse = self._inverse(square)
-        lever = inverse @ cross
-        left = total - cross.T @ lever
+        products = self._products_without_trial_effects(sensitivities)
+        matrix, cross, total = self._sums_over_trials(products)
+        parameter_response = scaled_pseudo_inverse(matrix, PARAMETER_CUTOFF) @ cross
+        reduced = total - cross.T @ parameter_response
         ends = np.concatenate([[0], np.cumsum(columns)])
-        return [self._gain(blocks, lever, left, slice(a, b)) for a, b in itertools.pairwise(ends.tolist())]
+        return [
+            self._estimate(products, parameter_response, reduced, slice(a, b))
+            for a, b in itertools.pairwise(ends.tolist())
+        ]
 
-    def _gain(self, blocks: Floats, lever: Floats, left: Floats, place: slice) -> Gain:
-        information, score = left[place, place], left[place, -1]
-        size = np.diag(information)
-        heard = size > LEAST_INFORMATION * max(float(size.max()), 1e-300)
-        if not heard.any():
-            return Gain(0.0, np.zeros(score.size), math.inf, np.zeros(lever.shape[0]), 0)
-        scale = np.where(heard, 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
-        covariance = np.linalg.pinv(information * scale[:, None] * scale, rcond=LEAST_INFORMATION, hermitian=True)
-        covariance = covariance * scale[:, None] * scale
-        amplitude = covariance @ score
-        numbers = lever[:, -1] - lever[:, place] @ amplitude
-        single = self._scores(blocks, lever[:, place], place, amplitude, numbers)
-        count = len(single)
-        robust = covariance @ (single.T @ single * count / max(count - numbers.size - score.size, 1)) @ covariance
-        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
-        return Gain(float(score @ amplitude), amplitude, sigma, numbers, int(np.count_nonzero(heard)))
-
-    def _scores(self, blocks: Floats, lever: Floats, place: slice, amplitude: Floats, numbers: Floats) -> Floats:
-        """What single trials say beyond the fit about amplitudes, shape (n_trials, n_columns)."""
-        k = self.problem.index.shape[1]
-        index = self.problem.index
-        moved = np.append(numbers, 0.0)[index]
-        forces = slice(k + place.start, k + place.stop)
-        left = blocks[:, :, -1] - np.einsum("nqk,nk->nq", blocks[:, :, :k], moved) - blocks[:, :, forces] @ amplitude
-        levers = np.vstack([lever, np.zeros((1, lever.shape[1]))])[index]
-        return np.asarray(left[:, forces] - np.einsum("nkl,nk->nl", levers, left[:, :k]))
-
-    def information(self, answers: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Precision and score of forces that are the same in every trial, all other numbers integrated out.
+    def estimate_jointly(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
+        """Estimate all force amplitudes together, the same in every trial.
 
         Parameters
         ----------
-        answers : sequence of arrays, shape (n_points, n_columns), m
+        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
 
         Returns
         -------
-        information : array, shape (n_columns, n_columns), 1/N²
-        score : array, shape (n_columns,), 1/N
+        ForceEstimate
         """
-        square, cross, total = self._spread(self._blocks(answers))
-        left = total - cross.T @ self._inverse(square) @ cross
-        return left[:-1, :-1], left[:-1, -1]
+        return self.estimate_each(sensitivities, [sensitivities[0].shape[1]])[0]
 
-    def together(self, answers: Sequence[Floats]) -> Gain:
-        """What forces explain all together, the same in every trial.
+    def estimate_by_condition(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
+        """Estimate all force amplitudes together, with separate amplitudes for each condition.
 
         Parameters
         ----------
-        answers : sequence of arrays, shape (n_points, n_columns), m
+        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
 
         Returns
         -------
-        Gain
-        """
-        return self.gains(answers, [answers[0].shape[1]])[0]
-
-    def by_condition(self, answers: Sequence[Floats]) -> Gain:
-        """What forces explain all together, each condition with amplitudes of its own.
-
-        Parameters
-        ----------
-        answers : sequence of arrays, shape (n_points, n_columns), m
-
-        Returns
-        -------
-        Gain
+        ForceEstimate
         """
         names = list(dict.fromkeys(self.conditions))
-        count = answers[0].shape[1]
-        wide = []
-        for condition, answer in zip(self.conditions, answers, strict=True):
-            block = np.zeros((len(answer), count * len(names)))
+        count = sensitivities[0].shape[1]
+        of_conditions = []
+        for condition, of_trial in zip(self.conditions, sensitivities, strict=True):
+            block = np.zeros((len(of_trial), count * len(names)))
             k = names.index(condition) * count
-            block[:, k : k + count] = answer
-            wide.append(block)
-        return self.together(wide)
+            block[:, k : k + count] = of_trial
+            of_conditions.append(block)
+        return self.estimate_jointly(of_conditions)
 
     @cached_property
-    def chi2(self) -> float:
-        """What is left without any further force."""
-        blocks = self._blocks([np.zeros((len(c), 0)) for c in self.columns])
-        square, cross, total = self._spread(blocks)
-        return float(total[-1, -1] - cross[:, -1] @ self._inverse(square) @ cross[:, -1])
+    def chi2_without_force(self) -> float:
+        """χ² with model parameters and trial effects re-estimated and no force added."""
+        products = self._products_without_trial_effects([np.zeros((len(c), 0)) for c in self.columns])
+        matrix, cross, total = self._sums_over_trials(products)
+        covariance = scaled_pseudo_inverse(matrix, PARAMETER_CUTOFF)
+        return float(total[-1, -1] - cross[:, -1] @ covariance @ cross[:, -1])
 
-    def bic(self, chi2: float, numbers: int, most: float) -> float:
-        """How badly forces of so many numbers do beside the `most` that any explained: smaller is better.
+    def bic(self, delta_chi2: float, n_parameters: int, largest_delta_chi2: float) -> float:
+        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better.
 
-        What not even that explains is no noise but counts as if it were, once for every independent piece.
+        The misfit that not even the best force explains is counted as further noise: it inflates the variance of every
+        independent residual.
 
-        Source: Schwarz, Annals of Statistics 6, 461 (1978), with the misfit scaled by what nothing explains.
+        Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
 
         Parameters
         ----------
-        chi2 : float
-            What the forces explain.
-        numbers : int
-            Numbers that they have.
-        most : float
-            The most that any explained.
+        delta_chi2 : float
+            The fall of χ² with this force.
+        n_parameters : int
+            Parameters of the force.
+        largest_delta_chi2 : float
+            The largest fall of χ² with any force.
 
         Returns
         -------
         float
         """
-        pieces = PER_TRIAL * len(self.data)
-        beyond = max(self.chi2 - most - self.points, 0.0)
-        return (most - chi2) / (1 + beyond / pieces) + numbers * math.log(pieces)
+        independent_points = INDEPENDENT_POINTS_PER_TRIAL * len(self.data)
+        unexplained = max(self.chi2_without_force - largest_delta_chi2 - self.n_points, 0.0)
+        misfit = (largest_delta_chi2 - delta_chi2) / (1 + unexplained / independent_points)
+        return misfit + n_parameters * math.log(independent_points)
 
-    def smooth(self, answers: Sequence[Floats], numbers: Floats) -> dict[str, tuple[Floats, Floats]]:
-        """A smooth force in every condition, the model's numbers moved by `numbers`: coefficients and covariance.
+    def smooth_force_by_condition(
+        self, sensitivities: Sequence[Floats], parameter_shift: Floats
+    ) -> dict[str, tuple[Floats, Floats]]:
+        """Estimate a smooth force in every condition: spline coefficients and their covariance.
 
-        As smooth as generalised cross-validation finds best, the same in all conditions.
+        The coefficients minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx 1996). One
+        penalty for all conditions is chosen by generalised cross-validation.
 
         Parameters
         ----------
-        answers : sequence of arrays, shape (n_points, n_columns), m
-            Of a spline's pieces.
-        numbers : array, shape (n_free,)
-            How far the model's numbers moved, scaled.
+        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
+            To the coefficients of the splines.
+        parameter_shift : array, shape (n_free,)
+            How far the model parameters are moved beforehand, scaled.
 
         Returns
         -------
         dict of (coefficients, covariance)
-            By condition; shapes (n_columns,) and (n_columns, n_columns), N.
+            By condition; shapes (n_columns,) in N and (n_columns, n_columns) in N².
         """
-        blocks = self._blocks(answers)
+        products = self._products_without_trial_effects(sensitivities)
         k = self.problem.index.shape[1]
-        moved = np.append(numbers, 0.0)[self.problem.index]
+        shift_of_keys = np.append(parameter_shift, 0.0)[self.problem.index]
         names = list(dict.fromkeys(self.conditions))
-        place = np.array([names.index(condition) for condition in self.conditions])
-        count = answers[0].shape[1]
-        square, slope = np.zeros((len(names), count, count)), np.zeros((len(names), count))
-        left = blocks[:, k:, -1] - np.einsum("nlk,nk->nl", blocks[:, k:, :k], moved)
-        np.add.at(square, place, blocks[:, k:-1, k:-1])
-        np.add.at(slope, place, left[:, :-1])
-        bend = np.diff(np.eye(count), 2, axis=0)
-        unit = float(np.mean(np.einsum("nkk->n", square))) / count
-        rough = unit * (bend.T @ bend + 1e-6 * np.eye(count))
+        condition_of_trial = np.array([names.index(condition) for condition in self.conditions])
+        count = sensitivities[0].shape[1]
+        information, score = np.zeros((len(names), count, count)), np.zeros((len(names), count))
+        residual_products = products[:, k:, -1] - np.einsum("nlk,nk->nl", products[:, k:, :k], shift_of_keys)
+        np.add.at(information, condition_of_trial, products[:, k:-1, k:-1])
+        np.add.at(score, condition_of_trial, residual_products[:, :-1])
+        second_difference = np.diff(np.eye(count), 2, axis=0)
+        unit = float(np.mean(np.einsum("nkk->n", information))) / count
+        roughness = unit * (second_difference.T @ second_difference + 1e-6 * np.eye(count))
         best: tuple[float, Floats, Floats] | None = None
-        pieces = PER_TRIAL * len(self.data)
-        whole = float(np.sum(slope * np.linalg.solve(square + 1e-9 * rough, slope[:, :, None])[:, :, 0]))
-        for strength in SMOOTHNESS:
-            inverse = np.linalg.inv(square + strength * rough)
-            coefficients = np.einsum("nkl,nl->nk", inverse, slope)
-            missed = whole - float(
-                np.sum(2 * coefficients * slope) - np.einsum("nk,nkl,nl->", coefficients, square, coefficients)
+        independent_points = INDEPENDENT_POINTS_PER_TRIAL * len(self.data)
+        unpenalised = np.linalg.solve(information + 1e-9 * roughness, score[:, :, None])[:, :, 0]
+        largest_gain = float(np.sum(score * unpenalised))
+        for penalty in SMOOTHING_PENALTIES:
+            inverse = np.linalg.inv(information + penalty * roughness)
+            coefficients = np.einsum("nkl,nl->nk", inverse, score)
+            lost_gain = largest_gain - float(
+                np.sum(2 * coefficients * score) - np.einsum("nk,nkl,nl->", coefficients, information, coefficients)
             )
-            freedom = float(np.einsum("nkl,nlk->", inverse, square))
-            score = (missed + pieces) / max(pieces - freedom, 1.0) ** 2
-            if best is None or score < best[0]:
-                best = score, coefficients, inverse
+            degrees_of_freedom = float(np.einsum("nkl,nlk->", inverse, information))
+            cross_validation = (lost_gain + independent_points) / max(independent_points - degrees_of_freedom, 1.0) ** 2
+            if best is None or cross_validation < best[0]:
+                best = cross_validation, coefficients, inverse
         assert best is not None
-        spare = max(self.points - count * len(names), 1.0)
-        noise = max(1.0, (self.chi2 - whole) / spare) if not numbers.any() else 1.0
-        return {name: (best[1][i], noise * best[2][i]) for i, name in enumerate(names)}
+        residual_dof = max(self.n_points - count * len(names), 1.0)
+        unmoved = not parameter_shift.any()
+        inflation = max(1.0, (self.chi2_without_force - largest_gain) / residual_dof) if unmoved else 1.0
+        return {name: (best[1][i], inflation * best[2][i]) for i, name in enumerate(names)}
+
+    def _products_without_trial_effects(self, sensitivities: Sequence[Floats]) -> Floats:
+        """Cross products of [parameters, forces, residual] of each trial, its trial effects eliminated.
+
+        Shape (n_trials, n_keys + n_forces + 1, the same again).
+        """
+        products = []
+        for i, (columns, of_force) in enumerate(zip(self.columns, sensitivities, strict=True)):
+            deviations = self.state.trial_effects[i, list(DEVIATION_COLUMNS)]
+            residual = columns[:, -1] + columns[:, list(DEVIATION_COLUMNS)] @ deviations
+            rows = np.column_stack([columns[:, :-1], of_force, residual])
+            white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
+            gram = white.T @ white / self.state.variance[i]
+            effects, others = slice(None, N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, None)
+            of_effects = gram[effects, effects] + np.diag(self.trial_effect_precision[i])
+            eliminated = gram[others, effects] @ np.linalg.solve(of_effects, gram[effects, others])
+            products.append(gram[others, others] - eliminated)
+        return np.array(products)
+
+    def _sums_over_trials(self, products: Floats) -> tuple[Floats, Floats, Floats]:
+        """Normal equations over all trials, with the priors of the p model parameters.
+
+        Blocks: parameters by parameters (p, p); parameters by [forces, residual] (p, L + 1); the latter by themselves.
+        """
+        k, p = self.problem.index.shape[1], self.prior_score.size
+        index = self.problem.index
+        matrix, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, products.shape[1] - k))
+        np.add.at(matrix, (index[:, :, None], index[:, None, :]), products[:, :k, :k])
+        np.add.at(cross, index, products[:, :k, k:])
+        matrix, cross = matrix[:p, :p] + np.diag(self.problem.prior_precision), cross[:p].copy()
+        cross[:, -1] += self.prior_score
+        held = ~self.problem.free | ~(np.diag(matrix) > 0)
+        matrix[held, :] = matrix[:, held] = cross[held] = 0.0
+        return matrix, cross, products[:, k:, k:].sum(axis=0)
+
+    def _estimate(self, products: Floats, parameter_response: Floats, reduced: Floats, place: slice) -> ForceEstimate:
+        """The force whose amplitudes are at `place`, from the equations with all other unknowns eliminated.
+
+        Its standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
+        """
+        information, score = reduced[place, place], reduced[place, -1]
+        size = np.diag(information)
+        estimable = size > LEAST_RELATIVE_INFORMATION * max(float(size.max()), 1e-300)
+        if not estimable.any():
+            return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(parameter_response.shape[0]), 0)
+        covariance = scaled_pseudo_inverse(information, LEAST_RELATIVE_INFORMATION, estimable)
+        amplitude = covariance @ score
+        shift = parameter_response[:, -1] - parameter_response[:, place] @ amplitude
+        scores = self._scores_by_trial(products, parameter_response[:, place], place, amplitude, shift)
+        n_trials = len(scores)
+        residual_dof = max(n_trials - shift.size - score.size, 1)
+        robust = covariance @ (scores.T @ scores * n_trials / residual_dof) @ covariance
+        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
+        return ForceEstimate(float(score @ amplitude), amplitude, sigma, shift, int(np.count_nonzero(estimable)))
+
+    def _scores_by_trial(
+        self, products: Floats, parameter_response: Floats, place: slice, amplitude: Floats, shift: Floats
+    ) -> Floats:
+        """Contribution of each trial to the score of the amplitudes at the estimate, shape (n_trials, n_columns)."""
+        k = self.problem.index.shape[1]
+        index = self.problem.index
+        shift_of_keys = np.append(shift, 0.0)[index]
+        forces = slice(k + place.start, k + place.stop)
+        residual_products = (
+            products[:, :, -1]
+            - np.einsum("nqk,nk->nq", products[:, :, :k], shift_of_keys)
+            - products[:, :, forces] @ amplitude
+        )
+        response_of_keys = np.vstack([parameter_response, np.zeros((1, parameter_response.shape[1]))])[index]
+        return np.asarray(
+            residual_products[:, forces] - np.einsum("nkl,nk->nl", response_of_keys, residual_products[:, :k])
+        )
+
+
+def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.bool_] | None = None) -> Floats:
+    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1.
+
+    Parameters
+    ----------
+    matrix : array, shape (n, n)
+    cutoff : float
+        Eigenvalues of the scaled matrix below this part of the largest count as zero.
+    estimable : array of bool, shape (n,), optional
+        Rows that take part; those with a positive diagonal where None.
+
+    Returns
+    -------
+    array, shape (n, n)
+        Zero in the rows and columns that do not take part.
+    """
+    diagonal = np.diag(matrix)
+    scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+    inverse = np.linalg.pinv(matrix * scale[:, None] * scale, rcond=cutoff, hermitian=True)
+    return np.asarray(inverse * scale[:, None] * scale)

@@ -1,4 +1,4 @@
-"""A compiled loop over the steps by which answers to small forces are followed along motions."""
+"""Compiled integration of the variational equations: responses of motions to small accelerations."""
 
 from __future__ import annotations
 
@@ -9,40 +9,44 @@ from vinetrack.core.records import Floats
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def answers(time_s: Floats, stiffness: Floats, friction: Floats, push: Floats, stage: float) -> tuple[Floats, Floats]:
-    """Changes of position and speed for further accelerations along each motion.
+def integrate_responses(
+    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
+) -> tuple[Floats, Floats]:
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion.
 
-    By the two-stage method of Alexander, SIAM J. Numer. Anal. 14, 1006 (1977): each stage holds with the rates there.
+    The method is the L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by
+    Alexander, SIAM J. Numer. Anal. 14, 1006 (1977).
 
     Parameters
     ----------
     time_s : array, shape (n_trials, n_steps + 1), s
     stiffness, friction : arrays, shape (n_trials, n_steps + 1), 1/s² and 1/s
-        ∂a/∂x and ∂a/∂ẋ along the motions.
-    push : array, shape (n_trials, n_steps + 1, n), m/s²
-        Further accelerations.
-    stage : float
-        Where in a step its first stage lies.
+        k = ∂a/∂x and c = ∂a/∂ẋ along the motions.
+    acceleration : array, shape (n_trials, n_steps + 1, n), m/s²
+        Added accelerations.
+    gamma : float
+        Diagonal coefficient of the scheme: the first stage lies at this part of a step.
 
     Returns
     -------
-    moved, sped : arrays, shape (n_trials, n_steps + 1, n), m and m/s
+    position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and m/s
     """
-    trials, points, count = push.shape
-    moved, sped = np.zeros_like(push), np.zeros_like(push)
+    trials, points, count = acceleration.shape
+    position_change, velocity_change = np.zeros_like(acceleration), np.zeros_like(acceleration)
     for trial in range(trials):
         for i in range(points - 1):
             h = time_s[trial, i + 1] - time_s[trial, i]
-            first, after = stage * h, (1 - stage) * h
+            implicit, explicit = gamma * h, (1 - gamma) * h
             k, c = stiffness[trial, i + 1], friction[trial, i + 1]
-            k_inside = (1 - stage) * stiffness[trial, i] + stage * k
-            c_inside = (1 - stage) * friction[trial, i] + stage * c
-            below, last = 1 - first * c_inside - first * first * k_inside, 1 - first * c - first * first * k
+            k_stage = (1 - gamma) * stiffness[trial, i] + gamma * k
+            c_stage = (1 - gamma) * friction[trial, i] + gamma * c
+            pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
+            pivot = 1 - implicit * c - implicit * implicit * k
             for j in range(count):
-                x, v, pushed = moved[trial, i, j], sped[trial, i, j], push[trial, i + 1, j]
-                inside = (1 - stage) * push[trial, i, j] + stage * pushed
-                rate = (k_inside * (x + first * v) + c_inside * v + inside) / below
-                x, v = x + after * (v + first * rate), v + after * rate
-                speed = v + first * ((k * (x + first * v) + c * v + pushed) / last)
-                moved[trial, i + 1, j], sped[trial, i + 1, j] = x + first * speed, speed
-    return moved, sped
+                x, v, a = position_change[trial, i, j], velocity_change[trial, i, j], acceleration[trial, i + 1, j]
+                a_stage = (1 - gamma) * acceleration[trial, i, j] + gamma * a
+                rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
+                x, v = x + explicit * (v + implicit * rate), v + explicit * rate
+                v_end = v + implicit * ((k * (x + implicit * v) + c * v + a) / pivot)
+                position_change[trial, i + 1, j], velocity_change[trial, i + 1, j] = x + implicit * v_end, v_end
+    return position_change, velocity_change

@@ -1,7 +1,7 @@
-"""Simple laws that a missing force may follow, each with the words for it.
+"""Simple laws that a missing force may follow, each with its description in words.
 
-Every law is a shape of largest size 1 along the motions at hand, so that its amplitude is the largest force, N; a
-periodic one has two shapes, a quarter of a period apart. Laws with a place or a scale come in a grid of them.
+Every law is scaled to a peak of 1 along the fitted motions, so that its amplitude is the largest force, N. A periodic
+law has two amplitudes, of a sine and a cosine. Laws with a position or a scale come in a grid of them.
 """
 
 from __future__ import annotations
@@ -17,96 +17,98 @@ from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
-PLACES, WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
-"""Places and widths of a local force, as parts of the growth. Chosen: neighbours overlap by half."""
+PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
+"""Number of positions of a local force, and its widths as parts of the growth. Chosen: neighbours overlap by half."""
 
-PERIODS = 24
-"""Periods tried. Chosen: each a tenth shorter than the one before."""
+N_PERIODS = 24
+"""Periods in the grid. Chosen: each a tenth shorter than the one before."""
 
 LONGEST_PERIOD, SHORTEST_PERIOD = 0.6, 0.04
-"""Of the growth. Longer ones are slopes; shorter ones leave no trace in positions. Derived: two inertial lengths of
-the fastest vine, and 1.5 periods in the growth."""
+"""As parts of the growth. Longer periods look like straight lines; shorter ones leave no trace in positions. Derived:
+two inertial lengths of the fastest vine, and 1.5 periods in the growth."""
 
-SCALES = (0.04, 0.1, 0.2, 0.4)
-"""Decay lengths tried, as parts of the growth. Chosen in factors of two."""
+RELATIVE_SCALES = (0.04, 0.1, 0.2, 0.4)
+"""Decay scales in the grid, as parts of the largest growth, speed or time. Chosen in factors of two."""
 
-LEAST_SPEED = 0.05
-"""Part of the highest speed at which 1/ẋ stops rising: a vine starts from rest. Chosen: below, a frame says nothing of
-the speed."""
+LEAST_RELATIVE_SPEED = 0.05
+"""Part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest. Chosen: below it,
+positions hardly determine the speed."""
 
-EDGE = 0.1
-"""Of a patch's width, over which the force rises at its ends. Chosen: sharp against the patch, smooth against a
-frame."""
+EDGE_FRACTION = 0.1
+"""Part of a patch's width over which the force rises at each end. Chosen: sharp compared with the patch, smooth
+compared with a frame."""
 
-START = 0.05
-"""Of the growth, over which a vine gathers speed: a force there is not the largest that is seen. Chosen; wording alone
-depends on it."""
+START_FRACTION = 0.05
+"""Part of the growth over which a vine accelerates: a force there does not count as the largest. Chosen; only the
+wording depends on it."""
 
 LEAST_PATCH_M = 1e-3
-"""Least width of a local force that is named. Chosen: its ends are printed in millimetres; at half of it both ends
-could be the same number, at twice a narrow obstacle goes unnamed."""
+"""Least width of a local force that is reported. Chosen: its ends are printed in millimetres; at half of it both ends
+could be the same number, at twice a narrow obstacle goes unreported."""
 
-PLACES_BEYOND, SPEEDS_BEYOND = 8, 8
-"""Places and speeds beyond which a force may set in. Chosen: each is then found between its neighbours by the fit in
-full. Powers of the speed are 1, 2 and 3 only: one near n is the damping itself, and takes any size with B."""
+N_THRESHOLD_POSITIONS, N_THRESHOLD_SPEEDS = 8, 8
+"""Positions and speeds in the grid above which a force may set in. Chosen: the nonlinear fit finds values between them.
+Powers of the speed are 1, 2 and 3 only: a power near n is the damping itself, and trades off against B without
+limit."""
 
-SAME_AREA = 1.02
-"""Ratio of areas up to which two vines count as one. Chosen: twice the error of a diameter of 0.5 %."""
+SAME_AREA_RATIO = 1.02
+"""Ratio of cross-sections up to which two vines count as equally wide. Chosen: twice the error of a diameter of 0.5
+%."""
 
 
 @dataclass(frozen=True)
 class Law:
-    """One shape of force along a motion.
+    """One form of force along a motion.
 
-    `kind` names it; `low` and `high` are its place (m of growth), `scale` its period, range or where it sets in.
-    `times` is what it is multiplied by: "position", "speed", "pressure" or nothing. `shapes` counts the numbers that
-    shape it, `columns` its amplitudes. `by_area` tells a force that is larger on a wider vine, as the cross-section;
-    `largest` is what the bare expression reaches along the motions at hand.
+    `kind` names it; `low` and `high` are the ends of a patch (m of growth), `scale` its period, decay scale or
+    threshold. `factor` is the variable that it is multiplied by: "position", "speed", "pressure" or nothing. `n_shapes`
+    counts shape parameters, `n_amplitudes` amplitudes. With a `reference_area_m2` the force is proportional to the
+    cross-section over that area. `peak` is the largest value of the bare expression along the fitted motions.
     """
 
     kind: str
-    columns: int = 1
-    shapes: int = 0
+    n_amplitudes: int = 1
+    n_shapes: int = 0
     low: float = math.nan
     high: float = math.nan
     scale: float = math.nan
-    by_area: float = 0.0
-    largest: float = 1.0
-    times: str = ""
+    reference_area_m2: float = 0.0
+    peak: float = 1.0
+    factor: str = ""
 
     @property
     def name(self) -> str:
-        """What it is told from others by."""
-        return f"{self.kind}_by_{self.times}" if self.times else self.kind
+        """Name of the law: its kind and factor."""
+        return f"{self.kind}_by_{self.factor}" if self.factor else self.kind
 
     @property
-    def numbers(self) -> int:
-        """Numbers that it has, a second factor counted as one: it was chosen among several."""
-        return self.columns + self.shapes + bool(self.times)
+    def n_parameters(self) -> int:
+        """Number of parameters; a factor counts as one, because it was chosen among several."""
+        return self.n_amplitudes + self.n_shapes + bool(self.factor)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """What it hangs on: growth, speed, time or pressure; nothing where it is constant."""
-        both = {VARIABLE[kind] for kind in (self.kind, self.times) if kind in VARIABLE}
-        return tuple(name for name in ("growth", "speed", "time", "pressure") if name in both)
+        """The variables that it depends on: growth, speed, time or pressure; none for a constant."""
+        variables = {VARIABLE_OF_KIND[kind] for kind in (self.kind, self.factor) if kind in VARIABLE_OF_KIND}
+        return tuple(name for name in ("growth", "speed", "time", "pressure") if name in variables)
 
     @property
-    def is_a_point(self) -> bool:
-        """Whether it acts over less than a millimetre, which no camera that sees the growth resolves."""
+    def is_unresolved(self) -> bool:
+        """Whether it acts over less than a millimetre, which no camera that films the whole growth resolves."""
         return self.kind == "patch" and not self.high - max(self.low, 0.0) > LEAST_PATCH_M
 
     @property
-    def precision(self) -> float:
-        """Of its amplitudes beforehand, 1/N²: none, they are free."""
+    def amplitude_precision(self) -> float:
+        """Prior precision of its amplitudes, 1/N²: 0, because they are free."""
         return 0.0
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """The numbers that shape it."""
-        return ("low", "high") if self.kind == "patch" else ("scale",) * self.shapes
+        """Names of its shape parameters."""
+        return ("low", "high") if self.kind == "patch" else ("scale",) * self.n_shapes
 
     def size_of(self, name: str) -> float:
-        """How much of a change of one of them is a large one.
+        """Scale on which a shape parameter changes the law.
 
         Parameters
         ----------
@@ -120,7 +122,7 @@ class Law:
         return self.high - self.low if self.kind == "patch" else float(getattr(self, name))
 
     def shifted(self, name: str, by: float) -> Law:
-        """The law with one of them changed.
+        """The law with one shape parameter changed.
 
         Parameters
         ----------
@@ -135,8 +137,8 @@ class Law:
         """
         return replace(self, **{name: getattr(self, name) + by})
 
-    def kept_inside(self, growth_m: float) -> Law:
-        """A patch no further beyond the growth than it is rounded.
+    def within_growth(self, growth_m: float) -> Law:
+        """The law with the ends of a patch kept inside the growth, apart from its rounded edges.
 
         Parameters
         ----------
@@ -149,11 +151,11 @@ class Law:
         """
         if self.kind != "patch":
             return self
-        room = EDGE * (self.high - self.low)
-        return replace(self, low=max(self.low, -room), high=min(self.high, growth_m + room))
+        edge = EDGE_FRACTION * (self.high - self.low)
+        return replace(self, low=max(self.low, -edge), high=min(self.high, growth_m + edge))
 
-    def along(self, motion: FittedMotion) -> Floats:
-        """The force of amplitude 1 along a motion, N, shape (n_times, columns).
+    def unit_force(self, motion: FittedMotion) -> Floats:
+        """The force of each unit amplitude along a motion.
 
         Parameters
         ----------
@@ -162,14 +164,14 @@ class Law:
 
         Returns
         -------
-        array, shape (n_times, n_columns), N
+        array, shape (n_times, n_amplitudes), N
         """
-        size = (motion.trial.area_m2 / self.by_area if self.by_area else 1.0) / self.largest
+        size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
         force = size * _EXPRESSIONS[self.kind](self, motion)
-        return force * _EXPRESSIONS[self.times](self, motion) if self.times else force
+        return force * _EXPRESSIONS[self.factor](self, motion) if self.factor else force
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
-        """What it looks like, with its size.
+        """Describe the law with its size.
 
         Parameters
         ----------
@@ -182,13 +184,13 @@ class Law:
         str
         """
         if self.kind == "periodic":
-            size = f"with an amplitude of {_sized(math.hypot(*amplitude_N), sigma_N)}"
+            size = f"with an amplitude of {_with_error(math.hypot(*amplitude_N), sigma_N)}"
         else:
-            size = f"{'+' if amplitude_N[0] > 0 else ''}{_sized(amplitude_N[0], sigma_N)}".replace("-", "−")
-        wide = ", larger on a wider vine as its cross-section" if self.by_area else ""
+            size = f"{'+' if amplitude_N[0] > 0 else ''}{_with_error(amplitude_N[0], sigma_N)}".replace("-", "−")
+        by_area = ", in proportion to the cross-section of the vine" if self.reference_area_m2 else ""
         words = _WORDS[self.kind]
-        if self.times:
-            words = f"{words.partition(', {size}')[0]}, times {_TIMES[self.times]}, {{size}} at its largest"
+        if self.factor:
+            words = f"{words.partition(', {size}')[0]}, times {_FACTOR_WORDS[self.factor]}, {{size}} at its largest"
         return (
             words.format(
                 size=size,
@@ -198,7 +200,7 @@ class Law:
                 scale_ms=_round(1e3 * self.scale),
                 scale=f"{self.scale:.2g}",
             )
-            + wide
+            + by_area
         )
 
 
@@ -206,7 +208,7 @@ def _round(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
-def _sized(value_N: float, sigma_N: float) -> str:
+def _with_error(value_N: float, sigma_N: float) -> str:
     if not math.isfinite(sigma_N):
         return "any size"
     digits = decimals(sigma_N)
@@ -214,7 +216,7 @@ def _sized(value_N: float, sigma_N: float) -> str:
 
 
 def _patch(law: Law, motion: FittedMotion) -> Floats:
-    edge = EDGE * (law.high - law.low)
+    edge = EDGE_FRACTION * (law.high - law.low)
     y = motion.lead_position_m
     return (0.5 * (np.tanh((y - law.low) / edge) - np.tanh((y - law.high) / edge)))[:, None]
 
@@ -243,17 +245,18 @@ _EXPRESSIONS = {
     "patch": _patch,
     "periodic": _periodic,
 }
-VARIABLE = {
+VARIABLE_OF_KIND = {
     **dict.fromkeys(("position", "position_squared", "beyond_a_place", "fading_along", "patch", "periodic"), "growth"),
     **dict.fromkeys(("speed", "speed_squared", "speed_cubed", "beyond_a_speed", "squared_beyond_a_speed"), "speed"),
     **dict.fromkeys(("inverse_speed", "falling_with_speed"), "speed"),
     **dict.fromkeys(("time", "fading_in_time"), "time"),
     "pressure": "pressure",
 }
-"""What every kind but the constant hangs on."""
+"""The variable that each kind but the constant depends on."""
 
-_OF_SPEED = ("inverse_speed", "falling_with_speed")
-"""Largest at rest, where no speed tells: their size is that at the slowest that is seen."""
+_LARGEST_AT_REST = ("inverse_speed", "falling_with_speed")
+"""Kinds that peak at rest, where positions do not determine the speed: their size is stated at the lowest speed
+observed."""
 
 _WORDS = {
     "constant": "a constant force of {size}",
@@ -263,43 +266,47 @@ _WORDS = {
     "position_squared": "a force in proportion to x², {size} at the end",
     "beyond_a_place": "a force that rises in proportion to the growth beyond {scale_mm} mm, {size} at the end",
     "speed_cubed": "a force in proportion to ẋ³, {size} at the highest speed",
-    "beyond_a_speed": "a force in proportion to what ẋ has beyond {scale} m/s, {size} at the highest",
-    "squared_beyond_a_speed": "a force with the square of what ẋ has beyond {scale} m/s, {size} at the highest",
+    "beyond_a_speed": "a force in proportion to the excess of ẋ over {scale} m/s, {size} at the highest speed",
+    "squared_beyond_a_speed": (
+        "a force in proportion to the square of the excess of ẋ over {scale} m/s, {size} at the highest speed"
+    ),
     "pressure": "a force in proportion to the pressure, {size} at the highest",
     "time": "a force that grows in proportion to time, {size} at the end of the longest trial",
     "inverse_speed": "a force that falls with speed as 1/ẋ, {size} at {scale} m/s and below",
-    "falling_with_speed": "a force that falls with speed, {size} where slowest and e times less every {scale} m/s of ẋ",
-    "fading_in_time": "a force that fades in time, {size} at release and e times less every {scale_ms} ms",
-    "fading_along": "a force that fades along the growth, {size} at the start and e times less every {scale_mm} mm",
+    "falling_with_speed": (
+        "a force that falls with speed, {size} at the lowest speed, by a factor of e every {scale} m/s of ẋ"
+    ),
+    "fading_in_time": "a force that decays in time, {size} at release, by a factor of e every {scale_ms} ms",
+    "fading_along": "a force that decays along the growth, {size} at the start, by a factor of e every {scale_mm} mm",
     "patch": "a force that acts between {low} and {high} mm of growth, {size}",
-    "periodic": "a force that comes back every {scale_mm} mm of growth, {size}",
+    "periodic": "a force that repeats every {scale_mm} mm of growth, {size}",
 }
 
 
-_TIMES_OF = {
+_PRODUCTS = {
     **dict.fromkeys(("position", "position_squared", "fading_along", "beyond_a_place"), ("speed", "pressure")),
     **dict.fromkeys(("speed", "speed_squared", "inverse_speed"), ("pressure",)),
     "speed_squared": ("position", "pressure"),
     "falling_with_speed": ("pressure",),
 }
-"""Products that are tried: a function of the growth with the speed or the pressure, of the speed with travel or
-pressure. One that reads the same either way stands once. Chosen: a fall with speed times the travel is left out, for
-x exp(−ẋ/v₀) is nearly x/ẋ, which is time, and takes its place."""
+"""Products in the grid: a function of the growth times the speed or the pressure, and one of the speed times the travel
+or the pressure, each product once. Chosen: a fall with speed times the travel is left out, because x exp(−ẋ/v₀) is
+nearly x/ẋ, which is time, and would be reported in its place."""
 
-_TIMES = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
+_FACTOR_WORDS = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
 
 
 @dataclass(frozen=True)
-class _Reach:
-    """How far the motions go."""
+class _Range:
+    """The largest growth, speed and time among the motions."""
 
     growth_m: float
     speed_m_s: float
     time_s: float
 
 
-def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
-    """The grid of all laws; where vines differ in width, each also in proportion to the cross-section.
+def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
+    """The grid of all laws; where vines differ in width, also each in proportion to the cross-section.
 
     Parameters
     ----------
@@ -309,33 +316,34 @@ def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
     -------
     list of Law
     """
-    reach = _reach(motions)
+    visited = _visited_range(motions)
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
-    for k in range(PLACES_BEYOND):
-        laws.append(Law("beyond_a_place", shapes=1, scale=(k + 0.5) / PLACES_BEYOND * reach.growth_m))
-    for k in range(SPEEDS_BEYOND):
-        beyond_m_s = (k + 0.5) / SPEEDS_BEYOND * reach.speed_m_s
-        laws += [Law(kind, shapes=1, scale=beyond_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
-    laws.append(Law("inverse_speed", scale=LEAST_SPEED * reach.speed_m_s))
-    for part in SCALES:
-        laws.append(Law("falling_with_speed", shapes=1, scale=part * reach.speed_m_s))
-        laws.append(Law("fading_in_time", shapes=1, scale=part * reach.time_s))
-        laws.append(Law("fading_along", shapes=1, scale=part * reach.growth_m))
-    for width in WIDTHS:
-        for centre in (np.arange(PLACES) + 0.5) / PLACES * reach.growth_m:
-            laws.append(_patch_at(float(centre), width * reach.growth_m))
-    for period in np.geomspace(SHORTEST_PERIOD, LONGEST_PERIOD, PERIODS) * reach.growth_m:
-        laws.append(Law("periodic", columns=2, shapes=1, scale=float(period)))
-    laws += [replace(law, times=other) for law in laws for other in _TIMES_OF.get(law.kind, ())]
+    for k in range(N_THRESHOLD_POSITIONS):
+        laws.append(Law("beyond_a_place", n_shapes=1, scale=(k + 0.5) / N_THRESHOLD_POSITIONS * visited.growth_m))
+    for k in range(N_THRESHOLD_SPEEDS):
+        threshold_m_s = (k + 0.5) / N_THRESHOLD_SPEEDS * visited.speed_m_s
+        laws += [Law(kind, n_shapes=1, scale=threshold_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
+    laws.append(Law("inverse_speed", scale=LEAST_RELATIVE_SPEED * visited.speed_m_s))
+    for part in RELATIVE_SCALES:
+        laws.append(Law("falling_with_speed", n_shapes=1, scale=part * visited.speed_m_s))
+        laws.append(Law("fading_in_time", n_shapes=1, scale=part * visited.time_s))
+        laws.append(Law("fading_along", n_shapes=1, scale=part * visited.growth_m))
+    for width in PATCH_WIDTHS:
+        for centre in (np.arange(PATCH_CENTRES) + 0.5) / PATCH_CENTRES * visited.growth_m:
+            laws.append(_patch_at(float(centre), width * visited.growth_m))
+    for period in np.geomspace(SHORTEST_PERIOD, LONGEST_PERIOD, N_PERIODS) * visited.growth_m:
+        laws.append(Law("periodic", n_amplitudes=2, n_shapes=1, scale=float(period)))
+    laws += [replace(law, factor=factor) for law in laws for factor in _PRODUCTS.get(law.kind, ())]
     areas = [motion.trial.area_m2 for motion in motions]
-    if max(areas) > SAME_AREA * min(areas):
-        laws += [_by_area(law, float(np.mean(areas))) for law in laws if "pressure" not in law.variables]
-    return _scaled(laws, motions)
+    if max(areas) > SAME_AREA_RATIO * min(areas):
+        mean_m2 = float(np.mean(areas))
+        laws += [replace(law, reference_area_m2=mean_m2) for law in laws if "pressure" not in law.variables]
+    return _with_unit_peak(laws, motions)
 
 
-def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
-    """Laws around the best of the grid: its place, width, period or range moved by less than a step of the grid.
+def laws_near(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
+    """Laws near the best of the grid: its position, width, period or scale varied by less than a step of the grid.
 
     Parameters
     ----------
@@ -348,14 +356,14 @@ def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
     """
     if law.kind == "patch":
         centre, width = (law.low + law.high) / 2, law.high - law.low
-        step = _reach(motions).growth_m / PLACES
-        near = [law] if law.times else [replace(law, times="speed"), replace(law, times="pressure")]
+        step = _visited_range(motions).growth_m / PATCH_CENTRES
+        near = [law] if law.factor else [replace(law, factor="speed"), replace(law, factor="pressure")]
         near += [
-            replace(_patch_at(centre + shift * step, stretch * width), times=law.times)
+            replace(_patch_at(centre + shift * step, stretch * width), factor=law.factor)
             for shift in np.linspace(-0.75, 0.75, 7)
             for stretch in (0.5, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8)
         ]
-    elif law.shapes:
+    elif law.n_shapes:
         near = [
             replace(law, scale=law.scale * factor)
             for factor in (
@@ -364,41 +372,41 @@ def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
         ]
     else:
         return []
-    return _scaled([_by_area(near_law, law.by_area) if law.by_area else near_law for near_law in near], motions)
+    if law.reference_area_m2:
+        near = [replace(near_law, reference_area_m2=law.reference_area_m2) for near_law in near]
+    return _with_unit_peak(near, motions)
 
 
 def _patch_at(centre: float, width: float) -> Law:
-    return Law("patch", shapes=2, low=centre - width / 2, high=centre + width / 2)
+    return Law("patch", n_shapes=2, low=centre - width / 2, high=centre + width / 2)
 
 
-def _by_area(law: Law, mean_area: float) -> Law:
-    return replace(law, by_area=mean_area)
-
-
-def _scaled(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
-    """The laws with the largest force that they reach along the motions as their unit."""
+def _with_unit_peak(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
+    """The laws scaled to a peak of 1 along the motions, without patches that act only at the start."""
     scaled = []
-    for law in (replace(law, largest=1.0) for law in laws):
-        everywhere = [np.abs(law.along(motion)) for motion in motions]
-        largest = max(float(course.max()) for course in everywhere)
-        seen = max(float(course[_grown(motion)].max()) for course, motion in zip(everywhere, motions, strict=True))
-        if law.columns > 1:
-            largest = 1.0
-        elif law.kind in _OF_SPEED:
-            largest = seen
-        elif law.kind == "patch" and seen < 0.5 * largest:
+    for law in (replace(law, peak=1.0) for law in laws):
+        forces = [np.abs(law.unit_force(motion)) for motion in motions]
+        peak = max(float(force.max()) for force in forces)
+        peak_after_start = max(
+            float(force[_after_start(motion)].max()) for force, motion in zip(forces, motions, strict=True)
+        )
+        if law.n_amplitudes > 1:
+            peak = 1.0
+        elif law.kind in _LARGEST_AT_REST:
+            peak = peak_after_start
+        elif law.kind == "patch" and peak_after_start < 0.5 * peak:
             continue
-        scaled.append(replace(law, largest=largest or 1.0))
+        scaled.append(replace(law, peak=peak or 1.0))
     return scaled
 
 
-def _grown(motion: FittedMotion) -> NDArray[np.bool_]:
-    """Where a vine has left its start behind: what a law says of rest alone is not seen."""
-    return motion.lead_position_m >= START * motion.lead_position_m.max()
+def _after_start(motion: FittedMotion) -> NDArray[np.bool_]:
+    """Where a vine has grown beyond its start: the size of a law at rest alone is not observed."""
+    return motion.lead_position_m >= START_FRACTION * motion.lead_position_m.max()
 
 
-def _reach(motions: Sequence[FittedMotion]) -> _Reach:
-    return _Reach(
+def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
+    return _Range(
         max(float(motion.lead_position_m.max()) for motion in motions),
         max(float(np.quantile(motion.tail_velocity_m_s, 0.98)) for motion in motions),
         max(float(motion.time_s[-1]) for motion in motions),

@@ -1,9 +1,11 @@
-"""A simple law of force fitted in full: its size and shape, the model's numbers, and every trial's own.
+"""Nonlinear least squares for a missing force, beside the model parameters and the trial effects.
 
-Linear answers tell laws apart; but a force that slows a vine down keeps it longer where the force acts, and the size of
-a tenth of the drive comes out a fifth too large. Here the motions follow the force as it is (`force_answers.pushed`),
-and Gauss and Newton's steps go on from there. They begin from the fitted motions, which lie near the tracks, so that a
-force need not first lose what the model without it would have run ahead.
+The linear inversion (`vinetrack.diagnosis.force_inversion`) tells laws apart; but a force that slows a vine down keeps
+it longer where the force acts, so that the linear estimate of a force of a tenth of the drive comes out a fifth too
+large. Here the motions respond to the force in full (`vinetrack.diagnosis.force_sensitivities.with_force`), and
+Gauss-Newton steps, damped as by Levenberg and Marquardt where needed, find the amplitudes, the shape parameters of the
+law, the model parameters and the trial effects. The search starts from the fitted motions, which lie near the tracks:
+simulated from the parameters of the model without the force, they would run ahead of the tracks.
 """
 
 from __future__ import annotations
@@ -15,16 +17,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import ForceFit, Gain
+from vinetrack.diagnosis.force_inversion import ForceEstimate, LinearInversion, scaled_pseudo_inverse
 from vinetrack.diagnosis.force_laws import Law
 from vinetrack.diagnosis.force_sensitivities import (
     FittedMotion,
-    as_it_was,
-    push_sensitivities,
-    pushed,
-    with_derivatives,
+    acceleration_sensitivities,
+    trial_of_job,
+    with_force,
+    with_model_terms,
 )
-from vinetrack.diagnosis.force_surface import Surface
+from vinetrack.diagnosis.force_surface import SmoothForce
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
@@ -35,372 +37,403 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import whiten
 
-STEPS, ROUNDS = 12, 2
-"""Steps of a refinement and rounds of each motion. Chosen: every round leaves a tenth of the error."""
+MAX_STEPS, MOTION_CORRECTIONS = 12, 2
+"""Most Gauss-Newton steps, and corrections of the motions at each. Chosen: every correction leaves a tenth of the
+error."""
 
-BARE, SHAPED = 5, 2
-"""So many first steps are bare ones of Gauss and Newton, the cost rising or not: pressure and B of a trial do nearly
-the same, a first step along their difference overshoots, and the next ones mend it. Place and scale wait for two.
-Chosen; the damped steps that follow make up for a bad choice."""
+UNDAMPED_STEPS, STEPS_WITH_SHAPE_HELD = 5, 2
+"""The first steps are undamped Gauss-Newton steps, taken even where the cost rises: pressure and B of a trial act
+nearly alike, so that a first step along their difference overshoots and the next ones correct it. The shape parameters
+are held for the first two. Chosen; the damped steps that follow make up for a bad choice."""
 
-NEAR = 10
-"""Steps on motions that lie on the tracks, before motions follow the force. Chosen: numbers such as n, in which the
-model bends, settle in three to six; at half of it some have not, at twice only time is spent."""
+MAX_STEPS_ON_TRACKS = 10
+"""Most steps on motions that lie on the tracks, before motions respond to the force. Chosen: parameters in which the
+model is nonlinear, such as n, settle in three to six; at half of it some have not, at twice only time is spent."""
 
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
-"""Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere. Chosen
-as usual for the method; only time depends on it."""
+"""Damping factors of Levenberg and Marquardt, for steps that must lower the cost: that of a search after undamped steps
+failed, and the least. Chosen as usual for the method; only time depends on it."""
 
-MENDED = 0.5
-"""Part of χ² that the bare steps may leave, to have led anywhere. Chosen: half of χ²."""
+UNDAMPED_SUCCESS = 0.5
+"""Part of χ² above which the undamped steps have failed. Chosen: half of χ²."""
 
-SMALL = 1e-3
-"""Step of a difference, as the fit holds numbers, and relative for places and scales. Derived: 1000 times the
-integrator's error."""
+DIFFERENCE_STEP = 1e-3
+"""Step of finite differences, in the fit's scaling of parameters, and relative for shape parameters. Derived: 1000
+times the integrator's error."""
 
-END = 0.96
-"""Part of the length up to which points count. Chosen: a hundredth beyond the fit's END_FRACTION."""
+LAST_LENGTH_FRACTION = 0.96
+"""Part of the length up to which points are used. Chosen: a hundredth beyond the fit's END_FRACTION."""
 
-SETTLED = 1e-3
-"""Part of χ² by which a step must lower it for another to follow. Chosen: a thousandth of χ² moves no law's place in
-the ranking."""
+CONVERGENCE_TOLERANCE = 1e-3
+"""Relative fall of χ² below which the search ends. Chosen: a thousandth of χ² changes no law's rank."""
+
+SHAPE_CUTOFF = 1e-12
+"""Relative eigenvalue of the scaled normal matrix below which a direction does not move. Derived: sums of squares are
+rounded at 1e-14 of the largest."""
+
+MAX_RELATIVE_SHAPE_STEP = 0.2
+"""Part of its size by which a shape parameter may move in one step. Chosen: less than the width over which a law
+changes."""
 
 
 @dataclass(frozen=True)
-class Refined:
-    """A law as the full fit found it: amplitudes, N, with the error of one, and what is left.
+class RefinedLaw:
+    """A law after the nonlinear fit: amplitudes and the standard error of one, N, and the χ² that remains.
 
-    `numbers` is how far the model's own numbers moved, as the fit holds them.
+    `parameter_shift` is how far the model parameters moved, in the fit's own scaling.
     """
 
     law: Law
     amplitude: Floats
     sigma: float
     chi2: float
-    numbers: Floats
+    parameter_shift: Floats
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the search stands; `motions` are those of these numbers, with the force.
+class SearchPoint:
+    """The unknowns at one point of a search, and the motions that they are linearised about.
 
-    Not `driven`, they are others near by: what they lack is then a push of its own.
+    Where `motions_include_force`, the motions are those of these parameters and this force. Otherwise they are others
+    near by, and their defect (by how much they violate the equation of motion) is carried as a residual.
     """
 
     theta: Floats
     trial_effects: Floats
-    law: Law | Surface
+    law: Law | SmoothForce
     amplitude: Floats
     motions: list[FittedMotion]
-    driven: bool = True
+    motions_include_force: bool = True
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Cost at a place, its curvature and slope by numbers, amplitudes, shapes and the own numbers of all trials."""
+class NormalEquations:
+    """Gauss-Newton equations `matrix` · step = `score` at a point, and the cost there (χ² with all priors).
+
+    Unknowns in order: model parameters, amplitudes, shape parameters, effects of each trial.
+    """
 
     cost: float
-    square: Floats
-    slope: Floats
+    matrix: Floats
+    score: Floats
 
 
-def refine(
-    model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], law: Law, gain: Gain, *, thorough: bool = False
-) -> Refined | None:
-    """Fit a law in full, begun from its linear fit; None where it cannot be followed.
+def refine_law(
+    fit: Fit,
+    inversion: LinearInversion,
+    motions: Sequence[FittedMotion],
+    law: Law,
+    linear: ForceEstimate,
+    *,
+    thorough: bool = False,
+) -> RefinedLaw | None:
+    """Fit a law by nonlinear least squares, starting from the linear inversion.
 
     Parameters
     ----------
-    model_fit : the fit that lacks the force.
-    fit : its linear answers to forces.
+    fit : the fit that lacks the force.
+    inversion : its linearisation.
     motions : sequence of FittedMotion
-        The fitted motions that `gain` belongs to.
+        The fitted motions about which it is linear.
     law : form of the force.
-    gain : its linear fit.
+    linear : its linear estimate.
     thorough : bool
-        Whether to search once more with care where the quick way leads nowhere.
+        Whether to search again with damped steps where the undamped ones fail.
 
     Returns
     -------
-    Refined or None
+    RefinedLaw, or None where the motions cannot be simulated
     """
-    start = Place(fit.state.theta, fit.trial_effects, law, 0.0 * gain.amplitude, list(motions))
-    best = _searched(model_fit, fit, start, 0.0)
-    if thorough and (best is None or best[1].cost > MENDED * fit.chi2):
-        best = _searched(model_fit, fit, start, FIRST_DAMPING)
+    start = SearchPoint(inversion.state.theta, inversion.trial_effects, law, 0.0 * linear.amplitude, list(motions))
+    best = _gauss_newton(fit, inversion, start, 0.0)
+    if thorough and (best is None or best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force):
+        best = _gauss_newton(fit, inversion, start, FIRST_DAMPING)
     if best is None:
         return None
-    place, normal = best
-    p, q = place.theta.size, place.amplitude.size
-    inflated = max(1.0, normal.cost / fit.points)
-    sigma = np.sqrt(np.maximum(np.diag(_inverse(normal.square)), 0.0) * inflated)
-    relative = gain.sigma / max(float(np.hypot.reduce(gain.amplitude)), 1e-300)
-    return Refined(
-        law=place.law if isinstance(place.law, Law) else law,
-        amplitude=place.amplitude,
-        sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(place.amplitude))),
+    point, normal = best
+    p, q = point.theta.size, point.amplitude.size
+    inflation = max(1.0, normal.cost / inversion.n_points)
+    covariance = scaled_pseudo_inverse(normal.matrix, SHAPE_CUTOFF)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0) * inflation)
+    relative = linear.sigma / max(float(np.hypot.reduce(linear.amplitude)), 1e-300)
+    return RefinedLaw(
+        law=point.law if isinstance(point.law, Law) else law,
+        amplitude=point.amplitude,
+        sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(point.amplitude))),
         chi2=normal.cost,
-        numbers=place.theta - fit.state.theta,
+        parameter_shift=point.theta - inversion.state.theta,
     )
 
 
-def followed(model_fit: Fit, fit: ForceFit, place: Place) -> Place | None:
-    """Where a force with amplitudes of its own precision leads, all other numbers free beside it.
+def optimise_smooth_force(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint | None:
+    """Find the most probable smooth force under the prior of its amplitudes, with all other unknowns free.
 
     Parameters
     ----------
-    model_fit : the fit that lacks the force.
-    fit : its linear answers to forces.
-    place : where to begin. What is not driven settles on its motions first.
+    fit : the fit that lacks the force.
+    inversion : its linearisation.
+    start : where the search starts. If its motions do not include the force, the parameters first settle on them.
 
     Returns
     -------
-    Place, or None where it cannot be followed
+    SearchPoint, or None where the motions cannot be simulated
     """
-    begin = place if place.driven else _on_tracks(model_fit, fit, place)
-    best = _searched(model_fit, fit, begin, LEAST_DAMPING)
+    begin = start if start.motions_include_force else _settled_on_tracks(fit, inversion, start)
+    best = _gauss_newton(fit, inversion, begin, LEAST_DAMPING)
     return None if best is None else best[0]
 
 
-def _searched(model_fit: Fit, fit: ForceFit, start: Place, damping: float) -> tuple[Place, Normal] | None:
-    """The best place on the way down from `start`; without damping the first steps may lead up."""
-    best: tuple[Place, Normal] | None = None
-    place, bare = start, 0 if damping else BARE
-    for turn in range(STEPS):
+def _gauss_newton(
+    fit: Fit, inversion: LinearInversion, start: SearchPoint, damping: float
+) -> tuple[SearchPoint, NormalEquations] | None:
+    """The point of least cost on the way from `start`; without damping the first steps may raise the cost."""
+    best: tuple[SearchPoint, NormalEquations] | None = None
+    point, undamped = start, 0 if damping else UNDAMPED_STEPS
+    for iteration in range(MAX_STEPS):
         try:
             with np.errstate(all="raise", under="ignore"):
-                place = _as_driven(model_fit, place)
-                normal = normal_equations(model_fit, fit, place)
+                point = _with_updated_motions(fit, point)
+                normal = normal_equations(fit, inversion, point)
         except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
             break
         before = best
         if best is None or normal.cost < best[1].cost:
-            best = place, normal
-        if turn < bare:
-            place = _stepped(fit, place, normal, 0.0, shaped=turn >= SHAPED)
+            best = point, normal
+        if iteration < undamped:
+            point = _step(inversion, point, normal, 0.0, shape_free=iteration >= STEPS_WITH_SHAPE_HELD)
             continue
-        if bare and best[1].cost > MENDED * fit.chi2:
+        if undamped and best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force:
             break
         if before is not None and best is not before:
             damping *= 0.3
-            if best[1].cost > before[1].cost * (1 - SETTLED):
+            if best[1].cost > before[1].cost * (1 - CONVERGENCE_TOLERANCE):
                 break
-        elif before is not None and turn > bare:
+        elif before is not None and iteration > undamped:
             damping = max(5 * damping, LEAST_DAMPING)
-        place = _stepped(fit, *best, damping, shaped=turn >= SHAPED)
+        point = _step(inversion, *best, damping, shape_free=iteration >= STEPS_WITH_SHAPE_HELD)
     return best
 
 
-def _on_tracks(model_fit: Fit, fit: ForceFit, place: Place) -> Place:
-    """The numbers settled on motions that lie on the tracks, where the model is linear in all but its own numbers."""
-    damping, best, tried = FIRST_DAMPING, None, place
-    for _ in range(NEAR):
+def _settled_on_tracks(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint:
+    """All unknowns optimised with the motions held on the tracks, where only the parameters enter nonlinearly."""
+    damping, best, point = FIRST_DAMPING, None, start
+    for _ in range(MAX_STEPS_ON_TRACKS):
         try:
             with np.errstate(all="raise", under="ignore"):
-                tried = _as_driven(model_fit, tried)
-                normal = normal_equations(model_fit, fit, tried)
+                point = _with_updated_motions(fit, point)
+                normal = normal_equations(fit, inversion, point)
         except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
             normal = None
         if normal is not None and (best is None or normal.cost < best[1].cost):
-            best, damping = (tried, normal), 0.1 * damping
+            best, damping = (point, normal), 0.1 * damping
         else:
             damping *= 30
         if best is None:
             break
-        tried = replace(_stepped(fit, *best, damping, shaped=True), driven=False)
-    return replace(place if best is None else best[0], driven=True)
+        point = replace(_step(inversion, *best, damping, shape_free=True), motions_include_force=False)
+    return replace(start if best is None else best[0], motions_include_force=True)
 
 
-def _force(place: Place, motion: FittedMotion) -> Floats:
-    law = place.law
-    # Of many splines the sum costs far less than each.
-    return law.force(motion, place.amplitude) if isinstance(law, Surface) else law.along(motion) @ place.amplitude
-
-
-def _as_driven(fit: Fit, place: Place) -> Place:
-    """The motions of these numbers and this force, corrected from those of the place before."""
-    jobs = fit.predictor.jobs(place.theta, place.trial_effects)
-    motions = [with_derivatives(_with_numbers(fit, *pair)) for pair in zip(place.motions, jobs, strict=True)]
-    return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS if place.driven else 0))
-
-
-def _with_numbers(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
-    """The motion as it is, its model and trial with other numbers."""
-    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
-    trial = as_it_was(fit.predictor.data[job.trial].trial, job)
-    return replace(motion, model=fit.model.with_values(values), trial=trial)
-
-
-def normal_equations(model_fit: Fit, fit: ForceFit, place: Place) -> Normal:
-    """Normal equations of all unknowns at a place.
+def normal_equations(fit: Fit, inversion: LinearInversion, point: SearchPoint) -> NormalEquations:
+    """Gauss-Newton equations of all unknowns at a point.
 
     Parameters
     ----------
-    model_fit : the fit that lacks the force.
-    fit : its linear answers to forces.
-    place : where they are taken.
+    fit : the fit that lacks the force.
+    inversion : its linearisation, which holds the noise and the priors.
+    point : where the equations are taken.
 
     Returns
     -------
-    Normal
+    NormalEquations
     """
-    theta, trial_effects, q, s = place.theta, place.trial_effects, place.amplitude.size, len(place.law.shape_names)
+    theta, trial_effects, q, s = point.theta, point.trial_effects, point.amplitude.size, len(point.law.shape_names)
+    problem = inversion.problem
     p, n = theta.size, trial_effects.shape[0]
-    columns = push_sensitivities(model_fit, trial_effects, place.motions, _pushes(model_fit, place))
-    centre, precision = trial_effect_prior(fit.problem, fit.state)
+    sensitivities = acceleration_sensitivities(fit, trial_effects, point.motions, _acceleration_derivatives(fit, point))
+    centre, precision = trial_effect_prior(problem, inversion.state)
     size = p + q + s + n * N_TRIAL_EFFECTS
-    square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
+    matrix, score = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     cost = float(np.sum(precision * (trial_effects - centre) ** 2))
-    cost += float(np.sum(fit.problem.prior_precision * (theta - fit.problem.prior_mean) ** 2))
-    cost += place.law.precision * float(place.amplitude @ place.amplitude)
-    for i, trial_data in enumerate(model_fit.predictor.data):
-        position, velocity = _seen(place.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
-        left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
-        answers = columns[i]
-        if not place.driven:
-            answers, lacking = answers[:, :-1], answers[:, -1]
-            left = left - lacking
-        rows = np.column_stack([answers[:, 2:], -velocity, np.ones(left.size), answers[:, :2], left])
-        growing = _growing(trial_data, trial_effects[i])
-        relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[growing]
-        white = whiten(rows[growing], trial_data.first[growing], fit.state.rho, relative_sd) / math.sqrt(
-            fit.state.variance[i]
+    cost += float(np.sum(problem.prior_precision * (theta - problem.prior_mean) ** 2))
+    cost += point.law.amplitude_precision * float(point.amplitude @ point.amplitude)
+    for i, trial_data in enumerate(fit.predictor.data):
+        position, velocity = _observed(point.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
+        residual = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
+        of_trial = sensitivities[i]
+        if not point.motions_include_force:
+            of_trial, of_defect = of_trial[:, :-1], of_trial[:, -1]
+            residual = residual - of_defect
+        rows = np.column_stack([of_trial[:, 2:], -velocity, np.ones(residual.size), of_trial[:, :2], residual])
+        used = _points_before_end(trial_data, trial_effects[i])
+        relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[used]
+        white = whiten(rows[used], trial_data.first[used], inversion.state.rho, relative_sd) / math.sqrt(
+            inversion.state.variance[i]
         )
         gram = white.T @ white
-        mine = p + q + s + i * N_TRIAL_EFFECTS + np.arange(N_TRIAL_EFFECTS)
-        keys = np.where(fit.problem.index[i] >= 0, fit.problem.index[i], size)
-        index = np.concatenate([keys, p + np.arange(q + s), mine])
-        square[np.ix_(index, index)] += gram[:-1, :-1]
-        np.add.at(slope, index, gram[:-1, -1])
-        square[mine, mine] += precision[i]
-        slope[mine] -= precision[i] * (trial_effects[i] - centre[i])
+        effects = p + q + s + i * N_TRIAL_EFFECTS + np.arange(N_TRIAL_EFFECTS)
+        keys = np.where(problem.index[i] >= 0, problem.index[i], size)
+        index = np.concatenate([keys, p + np.arange(q + s), effects])
+        matrix[np.ix_(index, index)] += gram[:-1, :-1]
+        np.add.at(score, index, gram[:-1, -1])
+        matrix[effects, effects] += precision[i]
+        score[effects] -= precision[i] * (trial_effects[i] - centre[i])
         cost += float(gram[-1, -1])
-    square, slope = square[:size, :size], slope[:size]
-    square[np.arange(p), np.arange(p)] += fit.problem.prior_precision
-    slope[:p] -= fit.problem.prior_precision * (theta - fit.problem.prior_mean)
-    square[np.arange(p, p + q), np.arange(p, p + q)] += place.law.precision
-    slope[p : p + q] -= place.law.precision * place.amplitude
-    still = np.flatnonzero(~fit.problem.free)
-    square[still, :] = square[:, still] = slope[still] = 0.0
-    return Normal(cost, square, slope)
+    matrix, score = matrix[:size, :size], score[:size]
+    matrix[np.arange(p), np.arange(p)] += problem.prior_precision
+    score[:p] -= problem.prior_precision * (theta - problem.prior_mean)
+    matrix[np.arange(p, p + q), np.arange(p, p + q)] += point.law.amplitude_precision
+    score[p : p + q] -= point.law.amplitude_precision * point.amplitude
+    held = np.flatnonzero(~problem.free)
+    matrix[held, :] = matrix[:, held] = score[held] = 0.0
+    return NormalEquations(cost, matrix, score)
 
 
-def _inverse(square: Floats) -> Floats:
-    scale = np.where(np.diag(square) > 0, 1 / np.sqrt(np.maximum(np.diag(square), 1e-300)), 0.0)
-    inverse = np.linalg.pinv(square * scale[:, None] * scale, rcond=1e-12, hermitian=True)
-    return np.asarray(inverse * scale[:, None] * scale)
+def _step(
+    inversion: LinearInversion, point: SearchPoint, normal: NormalEquations, damping: float, *, shape_free: bool
+) -> SearchPoint:
+    """The next point, with steps of shape parameters and releases limited and parameters kept inside their bounds."""
+    p, q = point.theta.size, point.amplitude.size
+    law = point.law
+    matrix = normal.matrix + damping * np.diag(np.diag(normal.matrix))
+    if not shape_free:
+        held = p + q + np.arange(len(law.shape_names))
+        matrix[held, :] = matrix[:, held] = 0.0
+    step = scaled_pseudo_inverse(matrix, SHAPE_CUTOFF) @ normal.score
+    for k, name in enumerate(law.shape_names):
+        limit = MAX_RELATIVE_SHAPE_STEP * law.size_of(name)
+        law = law.shifted(name, float(np.clip(step[p + q + k], -limit, limit)))
+    law = law.within_growth(max(float(motion.lead_position_m.max()) for motion in point.motions))
+    release_limit_s = 2 * np.array([trial_data.frame_s for trial_data in inversion.data])
+    trial_effects = point.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, N_TRIAL_EFFECTS)
+    trial_effects[:, RELEASE] = point.trial_effects[:, RELEASE] + np.clip(
+        trial_effects[:, RELEASE] - point.trial_effects[:, RELEASE], -release_limit_s, release_limit_s
+    )
+    theta = np.clip(point.theta + step[:p], inversion.problem.lower, inversion.problem.upper)
+    return replace(
+        point,
+        theta=theta,
+        trial_effects=trial_effects,
+        law=law,
+        amplitude=point.amplitude + step[p : p + q],
+    )
 
 
-def _growing(trial_data: FitTrial, trial_effects: Floats) -> slice:
-    """The points before the end of growth: a motion that is corrected does not end where it ought to."""
+def _with_updated_motions(fit: Fit, point: SearchPoint) -> SearchPoint:
+    """The point with its motions corrected for its parameters and, where they include it, its force."""
+    jobs = fit.predictor.jobs(point.theta, point.trial_effects)
+    motions = [with_model_terms(_with_parameters_of_job(fit, *pair)) for pair in zip(point.motions, jobs, strict=True)]
+    corrections = MOTION_CORRECTIONS if point.motions_include_force else 0
+    return replace(point, motions=with_force(motions, lambda motion: _force_along(point, motion), corrections))
+
+
+def _force_along(point: SearchPoint, motion: FittedMotion) -> Floats:
+    law = point.law
+    # Summing many splines with their coefficients costs far less than evaluating each.
+    if isinstance(law, SmoothForce):
+        return law.force(motion, point.amplitude)
+    return law.unit_force(motion) @ point.amplitude
+
+
+def _points_before_end(trial_data: FitTrial, trial_effects: Floats) -> slice:
+    """The points before the end of growth, since a corrected motion does not end where its model would."""
     length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
-    beyond = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > END * length_m)
-    return slice(0, int(beyond[0]) if beyond.size else trial_data.time_s.size)
+    after_end = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > LAST_LENGTH_FRACTION * length_m)
+    return slice(0, int(after_end[0]) if after_end.size else trial_data.time_s.size)
 
 
-def _seen(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
-    """Position and speed of the leading edge as the camera sees them, cubic between the points of the grid."""
+def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
+    """Observed position and velocity of the leading edge, by cubic interpolation between the points of the grid."""
     from scipy.interpolate import CubicHermiteSpline
 
     curve = CubicHermiteSpline(motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s)
     at = np.clip(since_s, 0.0, motion.time_s[-1])
     moving = (since_s > 0) & (since_s < motion.time_s[-1])
-    offset = np.interp(at, motion.time_s, motion.offset_m)
-    seen = np.interp(at, motion.time_s, motion.seen)
-    return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * seen, 0.0)
+    offset = np.interp(at, motion.time_s, motion.observation_offset_m)
+    slope = np.interp(at, motion.time_s, motion.observed_slope)
+    return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * slope, 0.0)
 
 
-def _pushes(fit: Fit, place: Place) -> list[Floats]:
-    """Accelerations by a unit of [pressure, B of the trial, every key, amplitudes, shapes], (n_times, n) each.
+def _acceleration_derivatives(fit: Fit, point: SearchPoint) -> list[Floats]:
+    """Derivatives of the acceleration along each motion, shape (n_times, n).
 
-    Where motions are not driven a last column holds what they lack.
+    By [pressure and B of the trial, every model parameter, amplitudes, shape parameters]. Where the motions do not
+    include the force, a last column holds their defect.
     """
-    layout, theta = fit.predictor.layout, place.theta
-    jobs = fit.predictor.jobs(theta, place.trial_effects)
+    layout, theta = fit.predictor.layout, point.theta
+    jobs = fit.predictor.jobs(theta, point.trial_effects)
     damping = fit.predictor.damping_column
-    pushes = []
-    for i, (motion, job) in enumerate(zip(place.motions, jobs, strict=True)):
-        varied = [job._replace(pressure_deviation=job.pressure_deviation + SMALL)]
-        varied.append(_with(job, damping, job.row[damping] * math.exp(SMALL)) if damping >= 0 else job)
+    derivatives = []
+    for i, (motion, job) in enumerate(zip(point.motions, jobs, strict=True)):
+        varied = [job._replace(pressure_deviation=job.pressure_deviation + DIFFERENCE_STEP)]
+        varied.append(
+            _with_parameter(job, damping, job.row[damping] * math.exp(DIFFERENCE_STEP)) if damping >= 0 else job
+        )
         for column, key in enumerate(layout.keys):
             number = layout.free[layout.index[i, column]] if layout.index[i, column] >= 0 else None
             if number is None:
                 varied.append(job)
                 continue
             at = theta[layout.index[i, column]]
-            change = number.from_scaled(at + SMALL) - number.from_scaled(at)
+            change = number.from_scaled(at + DIFFERENCE_STEP) - number.from_scaled(at)
             if key == YIELD_PRESSURE:
                 varied.append(job._replace(yield_pressure_Pa=job.yield_pressure_Pa + change))
             else:
                 k = layout.model.parameter_names.index(key)
-                factor = number.from_scaled(at + SMALL) / number.from_scaled(at) if number.logarithmic else 0.0
-                varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
-        felt = [
+                factor = (
+                    number.from_scaled(at + DIFFERENCE_STEP) / number.from_scaled(at) if number.logarithmic else 0.0
+                )
+                changed = job.row[k] * factor if number.logarithmic else job.row[k] + change
+                varied.append(_with_parameter(job, k, changed))
+        affected = [
             fit.predictor.has_pressure_deviation[i],
             fit.predictor.has_damping_deviation[i],
             *[True] * len(layout.keys),
         ]
-        changes = [
-            (_acceleration(fit, place, motion, moved) - motion.free) / SMALL
-            if feels and moved is not job
-            else 0.0 * motion.free
-            for moved, feels in zip(varied, felt, strict=True)
+        columns = [
+            (_acceleration(fit, point, motion, changed_job) - motion.model_acceleration) / DIFFERENCE_STEP
+            if affects and changed_job is not job
+            else 0.0 * motion.model_acceleration
+            for changed_job, affects in zip(varied, affected, strict=True)
         ]
-        lacks = [] if place.driven else [motion.free + _force(place, motion) / motion.mass_kg - motion.actual]
-        pushes.append(np.column_stack([*changes, _law_pushes(place, motion), *lacks]))
-    return pushes
+        defect = (
+            []
+            if point.motions_include_force
+            else [motion.model_acceleration + _force_along(point, motion) / motion.mass_kg - motion.acceleration]
+        )
+        derivatives.append(np.column_stack([*columns, _law_derivatives(point, motion), *defect]))
+    return derivatives
 
 
-def _with(job: Job, column: int, value: float) -> Job:
+def _acceleration(fit: Fit, point: SearchPoint, motion: FittedMotion, job: Job) -> Floats:
+    """Acceleration along a motion with a job's parameters, with the change of a force that depends on the pressure."""
+    changed = _with_parameters_of_job(fit, motion, job)
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    terms = evaluate(changed.model, changed.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
+    if not point.amplitude.any() or np.array_equal(np.broadcast_to(terms.pressure_Pa, y.shape), motion.pressure_Pa):
+        return terms.acceleration_m_s2
+    at_pressure = replace(motion, pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape))
+    return terms.acceleration_m_s2 + (_force_along(point, at_pressure) - _force_along(point, motion)) / motion.mass_kg
+
+
+def _law_derivatives(point: SearchPoint, motion: FittedMotion) -> Floats:
+    """Derivatives of the acceleration by each amplitude and each shape parameter of the law."""
+    unit_force = point.law.unit_force(motion)
+    by_shape = [
+        (point.law.shifted(name, step).unit_force(motion) - unit_force) @ point.amplitude / step
+        for name, step in ((name, DIFFERENCE_STEP * point.law.size_of(name)) for name in point.law.shape_names)
+    ]
+    return np.column_stack([unit_force, *by_shape]) / motion.mass_kg[:, None]
+
+
+def _with_parameters_of_job(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
+    """The same motion, its model and trial with the parameters of a job."""
+    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
+    trial = trial_of_job(fit.predictor.data[job.trial].trial, job)
+    return replace(motion, model=fit.model.with_values(values), trial=trial)
+
+
+def _with_parameter(job: Job, column: int, value: float) -> Job:
     row = job.row.copy()
     row[column] = value
     return job._replace(row=row)
-
-
-def _acceleration(fit: Fit, place: Place, motion: FittedMotion, job: Job) -> Floats:
-    """What the model with a job's numbers says along a motion, and what a law of the pressure adds for these."""
-    other = _with_numbers(fit, motion, job)
-    y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    terms = evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
-    if not place.amplitude.any() or np.array_equal(np.broadcast_to(terms.pressure_Pa, y.shape), motion.pressure_Pa):
-        return terms.acceleration_m_s2
-    felt = replace(motion, pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape))
-    return terms.acceleration_m_s2 + (_force(place, felt) - _force(place, motion)) / motion.mass_kg
-
-
-def _law_pushes(place: Place, motion: FittedMotion) -> Floats:
-    """Accelerations by a unit of each amplitude and of each number that shapes the law."""
-    shape = place.law.along(motion)
-    changes = [
-        (place.law.shifted(name, step).along(motion) - shape) @ place.amplitude / step
-        for name, step in ((name, SMALL * place.law.size_of(name)) for name in place.law.shape_names)
-    ]
-    return np.column_stack([shape, *changes]) / motion.mass_kg[:, None]
-
-
-def _stepped(fit: ForceFit, place: Place, normal: Normal, damping: float, *, shaped: bool) -> Place:
-    """The next place; a law's place or scale moves by no more than a fifth of its size at once."""
-    p, q = place.theta.size, place.amplitude.size
-    law = place.law
-    square = normal.square + damping * np.diag(np.diag(normal.square))
-    if not shaped:
-        held = p + q + np.arange(len(law.shape_names))
-        square[held, :] = square[:, held] = 0.0
-    step = _inverse(square) @ normal.slope
-    for k, name in enumerate(law.shape_names):
-        reach = 0.2 * law.size_of(name)
-        law = law.shifted(name, float(np.clip(step[p + q + k], -reach, reach)))
-    law = law.kept_inside(max(float(motion.lead_position_m.max()) for motion in place.motions))
-    reach_s = 2 * np.array([trial_data.frame_s for trial_data in fit.data])
-    trial_effects = place.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, N_TRIAL_EFFECTS)
-    trial_effects[:, RELEASE] = place.trial_effects[:, RELEASE] + np.clip(
-        trial_effects[:, RELEASE] - place.trial_effects[:, RELEASE], -reach_s, reach_s
-    )
-    theta = np.clip(place.theta + step[:p], fit.problem.lower, fit.problem.upper)
-    return replace(
-        place,
-        theta=theta,
-        trial_effects=trial_effects,
-        law=law,
-        amplitude=place.amplitude + step[p : p + q],
-    )

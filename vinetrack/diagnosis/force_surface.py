@@ -1,22 +1,22 @@
-"""A force drawn freely over one variable or over two together: cubic B-splines with a Gaussian process behind them.
+"""Smooth forces over one variable or two: cubic B-splines with a Gaussian-process prior on their coefficients.
 
-The coefficients of the splines are taken as values of a Gaussian process at the splines' places, of covariance
+The coefficients are the values of a Gaussian process at the centres of the splines, with covariance
 
     a² Π_d (1 + s_d + s_d²/3) exp(−s_d),   s_d = √5 |u_d − u'_d|/ℓ_d
 
-with u the variables as parts of what the trials visited (Matérn's of order 5/2, Rasmussen & Williams 2006, §4.2). Its
-forces can be differentiated twice, no more: bands of infinitely smooth ones, exp(−½ s²), are too narrow by far for a
-force such as a power of the growth (a third of the points in them for nearly all, in a linear fit to draws). That is
-a penalised spline whose penalty has a size a, N, and lengths ℓ_d of its own (Wahba, JASA 73, 364, 1978; Wilson &
-Nickisch, ICML 2015). In the coordinates z in which this covariance is a² times the unit matrix many directions are of
-no size and are left out: `Surface` holds those that stay.
+where u are the variables scaled to the range that the trials visited: the Matérn kernel of order 5/2 (Rasmussen &
+Williams 2006, §4.2). Its functions are twice differentiable. The squared-exponential kernel exp(−½ s²), whose functions
+are infinitely smooth, gives bands that are far too narrow for a force such as a power of the growth: in a linear fit to
+draws they contain a third of the points instead of nearly all. The model is a penalised spline with an amplitude a, N,
+and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015). Its covariance
+matrix is diagonalised, and modes of negligible variance are dropped: `SmoothForce` holds the coefficients of the rest.
 
-Part of any force can be taken over by B, n and P_y: with ½ΔB ẋⁿ more of a force that is the same all along the growth,
-and ΔB more of B, positions are the same. No data decide between the two, so what is drawn follows a convention: B, n
-and P_y are those of the vine where growth begins, and the missing force is what is added to them from there on. The
-process is conditioned on being nothing there (§2.2 of the same), at a growth of 0, or without the growth at 0 s since
-release. Where the tracks are against it (`force_evidence`) a constant is added, or any function of the other variable,
-`WIDER` times as large as the surface (functional ANOVA, Gu 2013, ch. 2).
+B, n and P_y can take over part of any force: ½ΔB ẋⁿ more of a force that is the same all along the growth gives the
+same positions as ΔB more of B. No data identify the two separately, so that the force drawn follows a convention: B, n
+and P_y are those of the vine where growth begins, and the missing force is what acts in addition from there on. The
+process is conditioned on being zero there (§2.2 of the same book): at a growth of 0 or, without the growth, at 0 s
+since release. Where the tracks contradict this (`force_evidence`), a constant is added, or any function of the other
+variable with `START_FORCE_RATIO` times the amplitude (functional ANOVA, Gu 2013, ch. 2).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from functools import lru_cache
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.cubic_splines import ACTING, acting_splines, splines
+from vinetrack.diagnosis.cubic_splines import N_NONZERO, nonzero_splines, uniform_knots
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
 VARIABLES = {
@@ -41,71 +41,54 @@ VARIABLES = {
 }
 """What a force may depend on, and the attribute of a motion that holds it."""
 
-ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-TOGETHER = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-"""Splines along a variable, alone and beside another. Chosen: as fine as positions tell, which feel a force through two
-integrals; half as many miss waves of a quarter of the growth, twice as many cost four times the time."""
+SPLINES_ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+SPLINES_IN_PAIR = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
+"""Splines along a variable, when it is alone and when it is one of two. Chosen: as fine as positions resolve, which
+respond to the second integral of a force; half as many miss waves of a quarter of the growth, twice as many cost four
+times the time."""
 
-LENGTHS = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
-"""Lengths of the process that are tried, as parts of what was visited. Chosen: from the finest that the splines follow
-to one that leaves a curve hardly more than a slope; finer steps move no weight by more than a tenth."""
+LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
+"""Length scales that are averaged over, as parts of the visited range. Chosen: from the finest that the splines resolve
+to one that leaves hardly more than a straight line; a finer grid changes no weight by more than a tenth."""
 
-AMPLITUDES = np.geomspace(0.003, 0.3, 9)
-"""Amplitudes that are tried, as parts of the largest drive. Chosen: from what no trial feels to a gross failure;
-larger forces that B and n balance lead astray where the model is far off."""
+RELATIVE_AMPLITUDES = np.geomspace(0.003, 0.3, 9)
+"""Amplitudes that are averaged over, as parts of the largest drive. Chosen: from what no trial responds to up to a
+gross failure of the model; larger forces that B and n balance mislead the search where the model is far off."""
 
-KEPT, FOLLOWED = 1e-6, 1e-4
-"""Variances of directions, as parts of the largest, below which they are left out: of what positions are held against,
-and of what a search follows. Chosen: forces of a thousandth and of a hundredth of the largest; at a tenth of the second
-a search takes half as long again, at a hundred times the first bands miss half of the truth where noise is small."""
+KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4
+"""Relative variances below which a mode is dropped: from the marginal likelihood, and from the nonlinear search.
+Chosen: forces of a thousandth and of a hundredth of the largest; at a tenth of the second a search takes half as long
+again, at a hundred times the first bands miss half of the truth where noise is small."""
 
-NOTHING, CONSTANT, ANY = "nothing", "a constant", "anything"
+ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
 """What a force may be where growth begins."""
 
-WIDER = 3.0
-"""How much larger than the surface a force where growth begins may be. Chosen: B, n and P_y could hold most of it, so
-that the data say little; at half of it and at twice the band there is as much narrower and wider."""
+START_FORCE_RATIO = 3.0
+"""Prior amplitude of the force where growth begins, as a multiple of that of the rest of the surface. Chosen: B, n and
+P_y could hold most of it, so that the data say little; at half and at twice of it the band there is narrower and wider
+by as much."""
 
-OVER_DECADES = ("speed", "time")
-"""Variables that are taken as logarithms beyond their median. Chosen: they differ tenfold between slow and fast trials
-where growth and pressures do not."""
+LOGARITHMIC_VARIABLES = ("speed", "time")
+"""Variables on a logarithmic scale above their median. Chosen: they differ tenfold between slow and fast trials, where
+growth and pressure do not."""
 
-FASTEST = 0.98
-"""Quantile of a trial's speeds that counts as its highest: the model's peak after release is not seen. Chosen."""
+SPEED_QUANTILE = 0.98
+"""Quantile of a trial's speeds that counts as its highest: the model's peak just after release is not observed.
+Chosen."""
 
-DIFFERENT = 0.02
-"""Part of the highest pressure by which pressures must differ to be a variable. Chosen: what single trials err by."""
-
-
-MARGIN = 0.03
-"""Part by which a force of the pressure goes on beyond the lowest and the highest: trials differ from the sheet, and a
-force that is constant there has a bend at what was set. Chosen: three times what single trials err by."""
+LEAST_PRESSURE_RANGE = 0.02
+"""Part of the highest pressure by which pressures must differ for pressure to be a variable. Chosen: the pressure error
+of single trials."""
 
 
-@lru_cache
-def _even_knots(count: int) -> tuple[float, ...]:
-    return tuple(np.linspace(0.0, 1.0, count - 2).tolist())
-
-
-def curves(at: Floats, count: int) -> Floats:
-    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide.
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-        Places from 0 to 1.
-    count : int
-        Number of splines.
-
-    Returns
-    -------
-    array, shape (n, count)
-    """
-    return splines(at, np.array(_even_knots(count)))
+PRESSURE_MARGIN = 0.03
+"""Part by which the range of pressures is extended at both ends: the pressures of trials deviate from the sheet, and a
+force that is constant beyond the set pressures would have a kink there. Chosen: three times the pressure error of
+single trials."""
 
 
 def standard_error(basis: Floats, covariance: Floats) -> Floats:
-    """Standard error of what coefficients of this covariance make of a basis, shape (n,).
+    """Standard error of a linear combination of coefficients, for each row of a basis.
 
     Parameters
     ----------
@@ -121,51 +104,55 @@ def standard_error(basis: Floats, covariance: Floats) -> Floats:
 
 
 @lru_cache(maxsize=256)
-def covariance_root(count: int, length: float, *, from_nothing: bool = False) -> tuple[Floats, Floats]:
-    """Directions and variances of a process of unit size and this length, at the places of so many splines.
+def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) -> tuple[Floats, Floats]:
+    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines.
 
     Parameters
     ----------
     count : int
         Number of splines.
     length : float
-        As part of the whole.
-    from_nothing : bool
-        Whether it is nothing at the first place: conditioned on that.
+        Length scale, as part of the range.
+    zero_at_start : bool
+        Whether the process is conditioned on being zero at the first centre.
 
     Returns
     -------
-    directions : array, shape (count, count)
+    eigenvectors : array, shape (count, count)
     variances : array, shape (count,)
     """
     knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
     at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
-    apart = math.sqrt(5) * np.abs(at[:, None] - at) / length
-    covariance = (1 + apart + apart**2 / 3) * np.exp(-apart)
-    if from_nothing:
+    distance = math.sqrt(5) * np.abs(at[:, None] - at) / length
+    covariance = (1 + distance + distance**2 / 3) * np.exp(-distance)
+    if zero_at_start:
         covariance = covariance - np.outer(covariance[:, 0], covariance[0])
-    variances, directions = np.linalg.eigh(covariance)
+    variances, eigenvectors = np.linalg.eigh(covariance)
     variances = np.maximum(variances, 0.0)
-    # The same few are asked for thousands of times: kept, and so not to be written to.
-    for array in (directions, variances):
+    # Cached and shared, so made read-only: the same few are needed thousands of times.
+    for array in (eigenvectors, variances):
         array.flags.writeable = False
-    return directions, variances
+    return eigenvectors, variances
 
 
 @dataclass(frozen=True)
 class Domain:
-    """The variables of a force with what of each the trials visited, SI, and the splines along each."""
+    """The variables of a force, their visited ranges (SI), and the number of splines along each.
+
+    `log_scale` is the distance above the lowest value from which a variable is taken as its logarithm; infinite for
+    never.
+    """
 
     variables: tuple[str, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
     counts: tuple[int, ...]
-    usual: tuple[float, ...]
+    log_scale: tuple[float, ...]
 
-    def parts(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables as parts of what was visited: beyond what is `usual` above the lowest as its logarithm.
+    def normalised(self, values: Sequence[Floats]) -> list[Floats]:
+        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`.
 
-        Speeds and durations of a campaign span decades, and forces change over parts of them.
+        Speeds and durations of a campaign span decades, and forces change over fractions of them.
 
         Parameters
         ----------
@@ -176,25 +163,25 @@ class Domain:
         -------
         list of arrays
         """
-        limits = zip(values, self.low, self.high, self.usual, strict=True)
+        limits = zip(values, self.low, self.high, self.log_scale, strict=True)
         return [
-            np.log1p(np.maximum(at - low, 0.0) / usual) / math.log1p((high - low) / usual)
-            if math.isfinite(usual)
+            np.log1p(np.maximum(at - low, 0.0) / log_scale) / math.log1p((high - low) / log_scale)
+            if math.isfinite(log_scale)
             else (at - low) / (high - low)
-            for at, low, high, usual in limits
+            for at, low, high, log_scale in limits
         ]
 
     @property
     def name(self) -> str:
-        """The variables in a word: `growth`, `growth+speed`."""
+        """The variables joined by +: `growth`, `growth+speed`."""
         return "+".join(self.variables)
 
     @property
     def size(self) -> int:
-        """Splines in all."""
+        """Total number of splines (products of splines, for two variables)."""
         return math.prod(self.counts)
 
-    def of_motion(self, motion: FittedMotion) -> list[Floats]:
+    def values_along(self, motion: FittedMotion) -> list[Floats]:
         """The variables along a motion, SI, each of shape (n_times,).
 
         Parameters
@@ -208,7 +195,7 @@ class Domain:
         return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
 
     def basis(self, values: Sequence[Floats]) -> Floats:
-        """All splines, or products of splines, at these values, shape (n, size).
+        """Design matrix: all splines, or products of splines, at these values.
 
         Parameters
         ----------
@@ -219,13 +206,13 @@ class Domain:
         -------
         array, shape (n, size)
         """
-        which, weights = self._acting(values)
-        whole = np.zeros((len(which), self.size))
-        np.put_along_axis(whole, which, weights, axis=1)
-        return whole
+        indices, products = self._nonzero_products(values)
+        design = np.zeros((len(indices), self.size))
+        np.put_along_axis(design, indices, products, axis=1)
+        return design
 
-    def sum(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
-        """The splines, each times its coefficient, summed at these values, shape (n,).
+    def evaluate(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
+        """Sum of all splines times their coefficients at these values.
 
         Parameters
         ----------
@@ -237,99 +224,108 @@ class Domain:
         -------
         array, shape (n,)
         """
-        which, weights = self._acting(values)
-        return np.asarray(np.einsum("ns,ns->n", weights, coefficients[which]))
+        indices, products = self._nonzero_products(values)
+        return np.asarray(np.einsum("ns,ns->n", products, coefficients[indices]))
 
-    def _acting(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
-        """Which products of splines act at these values, and how much of each, shape (n, 4^n_variables)."""
-        which, weights = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
-        for part, count in zip(self.parts(values), self.counts, strict=True):
-            first, more = acting_splines(part, _even_knots(count))
-            here = first[:, None] + np.arange(ACTING)
-            which = (which[:, :, None] * count + here[:, None, :]).reshape(len(part), -1)
-            weights = (weights[:, :, None] * more[:, None, :]).reshape(len(part), -1)
-        return which, weights
+    def _nonzero_products(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
+        """Indices and values of the nonzero products of splines, shape (n, 4^n_variables)."""
+        indices, products = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
+        for position, count in zip(self.normalised(values), self.counts, strict=True):
+            first, splines = nonzero_splines(position, uniform_knots(count))
+            along_axis = first[:, None] + np.arange(N_NONZERO)
+            indices = (indices[:, :, None] * count + along_axis[:, None, :]).reshape(len(position), -1)
+            products = (products[:, :, None] * splines[:, None, :]).reshape(len(position), -1)
+        return indices, products
 
     @property
-    def course(self) -> int:
-        """Which variable says that growth has begun: growth, or else the time since release; −1 where none does."""
+    def start_axis(self) -> int:
+        """Index of the variable that marks the start of growth: growth, else time since release; else −1."""
         return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
 
     @property
-    def beginnings(self) -> tuple[str, ...]:
+    def start_conditions(self) -> tuple[str, ...]:
         """What a force over these variables may be where growth begins."""
-        if self.course < 0:
-            return (ANY,)
-        return (NOTHING, CONSTANT) if len(self.variables) == 1 else (NOTHING, CONSTANT, ANY)
+        if self.start_axis < 0:
+            return (FREE_AT_START,)
+        return (
+            (ZERO_AT_START, CONSTANT_AT_START)
+            if len(self.variables) == 1
+            else (ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START)
+        )
 
-    def mix(self, lengths: Sequence[float], begins: str = ANY, kept: float = KEPT) -> Floats:
-        """Coefficients of the splines by unit of each direction that stays, shape (size, n_directions).
+    def prior_modes(
+        self, lengths: Sequence[float], at_start: str = FREE_AT_START, least_variance: float = KEPT_VARIANCE
+    ) -> Floats:
+        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude.
 
         Parameters
         ----------
         lengths : sequence of float
-            Of the process, as parts of what was visited.
-        begins : str
+            Length scales, as parts of the visited ranges.
+        at_start : str
             What the force is where growth begins.
-        kept : float
-            Variance of a direction, as part of the largest, below which it is left out.
+        least_variance : float
+            Relative variance below which a mode is dropped.
 
         Returns
         -------
-        array, shape (size, n_directions)
+        array, shape (size, n_modes)
         """
-        course = self.course
-        roots = [
-            covariance_root(count, length, from_nothing=k == course)
+        start_axis = self.start_axis
+        by_axis = [
+            covariance_modes(count, length, zero_at_start=k == start_axis)
             for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
         ]
-        columns = [_product(roots, kept)]
-        if course >= 0 and begins == CONSTANT:
+        columns = [_product(by_axis, least_variance)]
+        if start_axis >= 0 and at_start == CONSTANT_AT_START:
             columns.append(np.ones((self.size, 1)))
-        if course >= 0 and begins == ANY:
-            same = [(np.ones((count, 1)), np.array([WIDER**2])) if k == course else root
-                    for k, (count, root) in enumerate(zip(self.counts, roots, strict=True))]  # fmt: skip
-            columns.append(_product(same, kept))
+        if start_axis >= 0 and at_start == FREE_AT_START:
+            constant_along_start_axis = [
+                (np.ones((count, 1)), np.array([START_FORCE_RATIO**2])) if k == start_axis else modes
+                for k, (count, modes) in enumerate(zip(self.counts, by_axis, strict=True))
+            ]
+            columns.append(_product(constant_along_start_axis, least_variance))
         return np.hstack(columns)
 
 
-def _product(roots: Sequence[tuple[Floats, Floats]], kept: float) -> Floats:
-    """Directions of a product of processes, each by its root, shape (n_splines, n_directions that stay)."""
+def _product(by_axis: Sequence[tuple[Floats, Floats]], least_variance: float) -> Floats:
+    """Modes of a product of processes, scaled by the root of their variance, shape (n_splines, n_modes kept)."""
     variances: Floats = np.ones(1)
-    for _, strength in roots:
-        variances = np.asarray(np.kron(variances, strength))
-    stays = np.flatnonzero(variances > kept * variances.max())
-    directions: Floats = np.ones((1, stays.size))
-    parts = np.unravel_index(stays, [strength.size for _, strength in roots])
-    for (more, _), part in zip(roots, parts, strict=True):
-        directions = (directions[:, None, :] * more[None, :, part]).reshape(-1, stays.size)
-    return np.asarray(directions * np.sqrt(variances[stays]))
+    for _, of_axis in by_axis:
+        variances = np.asarray(np.kron(variances, of_axis))
+    kept = np.flatnonzero(variances > least_variance * variances.max())
+    vectors: Floats = np.ones((1, kept.size))
+    indices = np.unravel_index(kept, [of_axis.size for _, of_axis in by_axis])
+    for (eigenvectors, _), index in zip(by_axis, indices, strict=True):
+        vectors = (vectors[:, None, :] * eigenvectors[None, :, index]).reshape(-1, kept.size)
+    return np.asarray(vectors * np.sqrt(variances[kept]))
 
 
 @dataclass(frozen=True)
-class Surface:
-    """A force over a domain, as `vinetrack.diagnosis.force_refinement` follows it: amplitudes are normal of `sd_N`.
+class SmoothForce:
+    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`.
 
-    `mix`, shape (n_splines, n_columns), are the coefficients of the splines by unit of each amplitude. An infinite
-    `sd_N` leaves the amplitudes free.
+    `modes`, shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves
+    the amplitudes free. It has the same methods as `vinetrack.diagnosis.force_laws.Law`, so that
+    `vinetrack.diagnosis.force_refinement` fits either.
     """
 
     domain: Domain
-    mix: Floats
+    modes: Floats
     sd_N: float = math.inf
 
     @property
-    def precision(self) -> float:
-        """Of each amplitude, 1/N²."""
+    def amplitude_precision(self) -> float:
+        """Prior precision of each amplitude, 1/N²."""
         return self.sd_N**-2
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """None: what shapes it are its amplitudes."""
+        """No shape parameters: the amplitudes are the only unknowns."""
         return ()
 
     def size_of(self, name: str) -> float:  # pragma: no cover
-        """No number shapes it; see `shape_names`.
+        """Not applicable: there are no shape parameters.
 
         Parameters
         ----------
@@ -346,8 +342,8 @@ class Surface:
         """
         raise KeyError(name)
 
-    def shifted(self, name: str, by: float) -> Surface:  # pragma: no cover
-        """No number shapes it; see `shape_names`.
+    def shifted(self, name: str, by: float) -> SmoothForce:  # pragma: no cover
+        """Not applicable: there are no shape parameters.
 
         Parameters
         ----------
@@ -356,7 +352,7 @@ class Surface:
 
         Returns
         -------
-        Surface
+        SmoothForce
 
         Raises
         ------
@@ -365,8 +361,8 @@ class Surface:
         """
         raise KeyError(name, by)
 
-    def kept_inside(self, growth_m: float) -> Surface:  # noqa: ARG002
-        """Itself: beyond what was visited it is constant.
+    def within_growth(self, growth_m: float) -> SmoothForce:  # noqa: ARG002
+        """Return itself: the force is constant beyond the visited range.
 
         Parameters
         ----------
@@ -374,12 +370,12 @@ class Surface:
 
         Returns
         -------
-        Surface
+        SmoothForce
         """
         return self
 
     def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force of these amplitudes along a motion, N, shape (n_times,).
+        """The force with these amplitudes along a motion.
 
         Parameters
         ----------
@@ -390,10 +386,10 @@ class Surface:
         -------
         array, shape (n_times,), N
         """
-        return self.domain.sum(self.domain.of_motion(motion), self.mix @ amplitude)
+        return self.domain.evaluate(self.domain.values_along(motion), self.modes @ amplitude)
 
-    def along(self, motion: FittedMotion) -> Floats:
-        """The force of amplitude 1 along a motion, N, shape (n_times, n_columns).
+    def unit_force(self, motion: FittedMotion) -> Floats:
+        """The force of each unit amplitude along a motion.
 
         Parameters
         ----------
@@ -403,11 +399,11 @@ class Surface:
         -------
         array, shape (n_times, n_columns), N
         """
-        return np.asarray(self.domain.basis(self.domain.of_motion(motion)) @ self.mix)
+        return np.asarray(self.domain.basis(self.domain.values_along(motion)) @ self.modes)
 
 
-def domains(motions: Sequence[FittedMotion]) -> list[Domain]:
-    """Every variable alone, then every two together, over what these motions visit.
+def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
+    """Every variable alone, then every pair, over the ranges that the motions visit.
 
     Parameters
     ----------
@@ -417,21 +413,25 @@ def domains(motions: Sequence[FittedMotion]) -> list[Domain]:
     -------
     list of Domain
     """
-    reach: dict[str, tuple[float, float, float]] = {}
+    ranges: dict[str, tuple[float, float, float]] = {}
     for name, attribute in VARIABLES.items():
-        along = [np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions]
-        high = max(float(np.quantile(course, FASTEST) if name == "speed" else course.max()) for course in along)
-        low = min(float(course.min()) for course in along) if name == "pressure" else 0.0
-        if high - low > DIFFERENT * abs(high):
+        by_trial = [
+            np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions
+        ]
+        high = max(
+            float(np.quantile(values, SPEED_QUANTILE) if name == "speed" else values.max()) for values in by_trial
+        )
+        low = min(float(values.min()) for values in by_trial) if name == "pressure" else 0.0
+        if high - low > LEAST_PRESSURE_RANGE * abs(high):
             if name == "pressure":
-                low, high = (1 - MARGIN) * low, (1 + MARGIN) * high
-            usual = float(np.median([np.median(course) for course in along])) if name in OVER_DECADES else math.inf
-            reach[name] = low, high, usual
+                low, high = (1 - PRESSURE_MARGIN) * low, (1 + PRESSURE_MARGIN) * high
+            typical = float(np.median([np.median(values) for values in by_trial]))
+            ranges[name] = low, high, typical if name in LOGARITHMIC_VARIABLES else math.inf
 
-    def over(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
-        lows, highs, usual = zip(*(reach[name] for name in names), strict=True)
-        return Domain(names, lows, highs, tuple(counts[name] for name in names), usual)
+    def domain(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
+        lows, highs, log_scales = zip(*(ranges[name] for name in names), strict=True)
+        return Domain(names, lows, highs, tuple(counts[name] for name in names), log_scales)
 
-    return [over((name,), ALONE) for name in reach] + [
-        over(pair, TOGETHER) for pair in itertools.combinations(reach, 2)
+    return [domain((name,), SPLINES_ALONE) for name in ranges] + [
+        domain(pair, SPLINES_IN_PAIR) for pair in itertools.combinations(ranges, 2)
     ]

@@ -1,12 +1,13 @@
-"""A learned force as an effect file: a table of splines over one variable or two, and no law.
+"""A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
 
-Where no formula does what the learned force does, the force itself can stand in the equation of motion. The file holds
-the coefficients of its splines, N, on even steps of each variable as the learning saw it (`force_surface.Domain`), and
-a function that adds up the four that are not nothing:
+Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
+coefficients of its splines, N, at even steps of each normalised variable (`force_surface.Domain`), and a function that
+sums the four splines that are nonzero:
 
     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
 
-β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter is the size of the table, 1 as learned.
+β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter scales the table; 1 is the force as
+learned.
 """
 
 from __future__ import annotations
@@ -17,26 +18,27 @@ import textwrap
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_surface import VARIABLES, Domain, curves
+from vinetrack.diagnosis.cubic_splines import uniform_splines
+from vinetrack.diagnosis.force_surface import VARIABLES, Domain
 from vinetrack.diagnosis.learned_force import LearnedForce
-from vinetrack.diagnosis.learned_variables import named
+from vinetrack.diagnosis.learned_variables import variables_in_words
 from vinetrack.narrative.verdict_summary import joined
 
-STEP = 4
-"""Places by step of a table at which both kinds of splines are held against each other. Chosen: more than each has
-coefficients; a change of splines is exact at any number."""
+CHECKS_PER_SPLINE = 4
+"""Positions per spline at which the two sets of splines are matched by least squares. Chosen: more than there are
+coefficients; both span the same functions, so that the result is exact for any number above that."""
 
-DIGITS = 6
-"""Significant digits of a number in the file. Chosen: a thousandth of what positions tell of a force; at half of it
-1e-3 of the force is lost, at twice the table is harder to read."""
+TABLE_DIGITS = 6
+"""Significant digits of a coefficient in the file. Chosen: a thousandth of the precision to which positions determine a
+force; at half of it 1e-3 of the force is lost, at twice the table is harder to read."""
 
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 _SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
-_RANGE = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
+_UNIT = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
 
 
 def table_name(learned: LearnedForce) -> str:
-    """Name of the effect that holds a learned force: `learned_growth_speed`.
+    """Name of the effect that holds a learned force, such as `learned_growth_speed`.
 
     Parameters
     ----------
@@ -50,46 +52,47 @@ def table_name(learned: LearnedForce) -> str:
 
 
 def table_text(learned: LearnedForce, remark: str = "") -> str:
-    """An effect file that holds a learned force: docstring, table, its size, the function, a worked number.
+    """Source of an effect file that holds a learned force: docstring, table, parameter, function and a worked example.
 
     Parameters
     ----------
     learned : the force.
-    remark : sentences about the data that it comes from, for the docstring.
+    remark : sentences for the docstring about the data that the force comes from.
 
     Returns
     -------
     str
     """
     domain = learned.domain
-    table = even_coefficients(domain, learned.best.mean)
-    over = named(domain.name)
+    table = uniform_table(domain, learned.best.mean)
+    variables = variables_in_words(domain.name)
     symbols = ", ".join(_SYMBOL[name] for name in domain.variables)
+    units = [_UNIT[name] for name in domain.variables]
     ranges = joined(
         [
-            f"{named(name)} from {low * _RANGE[name][1]:.3g} to {high * _RANGE[name][1]:.3g} {_RANGE[name][0]}"
-            for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
+            f"{variables_in_words(name)} from {low * factor:.3g} to {high * factor:.3g} {unit}"
+            for name, low, high, (unit, factor) in zip(domain.variables, domain.low, domain.high, units, strict=True)
         ]
     )
-    state, worked = _worked(learned)
-    axes = [line for k in range(len(domain.variables)) for line in _axis(domain, k)]
+    state, worked = _worked_example(learned)
+    axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
     counts = " × ".join(str(count) for count in domain.counts)
     parts = [
-        f'"""Learned force: a table over {over}, and no law.\n',
+        f'"""Learned force: a table over {variables}, without a law.\n',
         *textwrap.wrap(remark, 118),
         "" if remark else None,
         *textwrap.wrap(learned.sentence, 118),
         "",
         *textwrap.wrap(
-            f"It holds for {ranges}, where trials have been; beyond, it stays as at the edge and says nothing."
-            " Forces count along the growth, so that a friction is"
-            " negative. It reproduces these trials and explains nothing: look at its picture, and find the formula.",
+            f"It is valid for {ranges}, the range that trials visited; outside, it keeps its value at the edge, which"
+            " has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
+            " reproduces these trials but explains nothing: look at its figure, and find the formula.",
             118,
         ),
         "",
         f"    tail force a T({symbols}), T the sum of {counts} cubic splines on even steps",
         "",
-        "Measure it in trials that differ in what it hangs on, and hold the next ones against its prediction.",
+        "Make trials that differ in the variables it depends on, and compare new trials with its prediction.",
         '"""\n',
         "import numpy as np\n",
         "from vinetrack.effects import Parameter, Worked\n",
@@ -106,7 +109,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
         "    Worked(",
         '        "tail_force",',
         f"        {worked:.8g},",
-        '        "the force that was learned, at this state",',
+        '        "the learned force at this state",',
         f"        state={state!r},",
         '        parameters={"a": 1.0},',
         "    ),",
@@ -125,10 +128,11 @@ _SUM_OF_TWO = (
 )
 
 
-def even_coefficients(domain: Domain, coefficients: Floats) -> Floats:
-    """Coefficients of splines of even steps that make the same function as those of a domain, N.
+def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
+    """Convert the coefficients of a domain's splines to those of identical splines at even steps, N.
 
-    The splines of a domain end at its ends; those of the file are all alike. Both span the same functions.
+    The splines of a domain have repeated knots at its ends; those of the file are all alike. Both span the same
+    functions.
 
     Parameters
     ----------
@@ -141,9 +145,9 @@ def even_coefficients(domain: Domain, coefficients: Floats) -> Floats:
     """
     table = coefficients.reshape(domain.counts)
     for axis, count in enumerate(domain.counts):
-        at = np.linspace(0.0, 1.0, STEP * count)
-        change = np.linalg.lstsq(_even_splines(at, count), curves(at, count), rcond=None)[0]
-        table = np.moveaxis(np.tensordot(change, table, axes=(1, axis)), 0, axis)
+        at = np.linspace(0.0, 1.0, CHECKS_PER_SPLINE * count)
+        conversion = np.linalg.lstsq(_even_splines(at, count), uniform_splines(at, count), rcond=None)[0]
+        table = np.moveaxis(np.tensordot(conversion, table, axes=(1, axis)), 0, axis)
     return np.asarray(table)
 
 
@@ -152,18 +156,18 @@ def _even_splines(at: Floats, count: int) -> Floats:
     return np.asarray((np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0)
 
 
-def _axis(domain: Domain, k: int) -> list[str]:
-    """Lines of code that say between which steps of the table a state is, and the weights of the four splines there."""
-    low, high, usual, steps = domain.low[k], domain.high[k], domain.usual[k], domain.counts[k] - 3
+def _axis_code(domain: Domain, k: int) -> list[str]:
+    """Lines of code that find the interval of the table in which a state lies, and the four nonzero splines there."""
+    low, high, log_scale, steps = domain.low[k], domain.high[k], domain.log_scale[k], domain.counts[k] - 3
     at, step, weight = "uv"[k], "ij"[k], "fg"[k]
     state = f"s.{_STATE[domain.variables[k]]}"
-    from_low = f"({state} - {_number(low)})" if low else state
-    inside = f"np.minimum(np.maximum({from_low} / {_number(high - low)}, 0.0), 1.0)"
-    if math.isfinite(usual):
-        ratio = (high - low) / usual
-        inside = f"np.log1p({_number(ratio)} * {inside}) / {_number(math.log1p(ratio))}"
+    from_low = f"({state} - {_code_number(low)})" if low else state
+    position = f"np.minimum(np.maximum({from_low} / {_code_number(high - low)}, 0.0), 1.0)"
+    if math.isfinite(log_scale):
+        ratio = (high - low) / log_scale
+        position = f"np.log1p({_code_number(ratio)} * {position}) / {_code_number(math.log1p(ratio))}"
     return [
-        f"{at} = {steps}.0 * {inside}",
+        f"{at} = {steps}.0 * {position}",
         f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",
         f"{at} = {at} - {step}",
         f"{weight}0, {weight}3 = (1.0 - {at}) ** 3 / 6.0, {at}**3 / 6.0",
@@ -172,27 +176,27 @@ def _axis(domain: Domain, k: int) -> list[str]:
     ]
 
 
-def _number(value: float) -> str:
+def _code_number(value: float) -> str:
     return repr(float(f"{value:.12g}"))
 
 
 def _table_lines(table: Floats) -> list[str]:
-    """The table as a tuple, or as a tuple of rows, in lines that are not too long."""
+    """The table as lines of code: a tuple of numbers, or a tuple of rows."""
     if table.ndim == 1:
-        numbers = ", ".join(f"{value:.{DIGITS}g}" for value in table.tolist())
+        numbers = ", ".join(f"{value:.{TABLE_DIGITS}g}" for value in table.tolist())
         return [
             "TABLE = np.array((  # N",
             *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
             "))",
         ]
-    rows = [f"    ({', '.join(f'{value:.{DIGITS}g}' for value in row)})," for row in table.tolist()]
+    rows = [f"    ({', '.join(f'{value:.{TABLE_DIGITS}g}' for value in row)})," for row in table.tolist()]
     return ["TABLE = np.array((  # N", *rows, "))"]
 
 
-def _worked(learned: LearnedForce) -> tuple[dict[str, float], float]:
-    """The state of the worked number, where the force is largest among places that trials came to, and the force."""
-    seen = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
-    largest = int(np.argmax(np.abs(seen["force_N"].to_numpy(float))))
-    at = {name: float(f"{seen[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
+def _worked_example(learned: LearnedForce) -> tuple[dict[str, float], float]:
+    """The visited state at which the force is largest, as arguments of an effect, and the force there, N."""
+    visited = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
+    largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
+    at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
     force_N, _ = learned.best.force([np.array([value]) for value in at.values()])
     return {_STATE[name]: value for name, value in at.items()}, float(force_N[0])

@@ -1,25 +1,26 @@
-"""The missing force learned as a smooth function of one or two variables, inside the trajectory fit.
+"""The missing force as a smooth function of one or two variables, estimated inside the trajectory fit.
 
 The force is a Gaussian process over growth, speed, time since release or pressure, or over two of them together
-(`vinetrack.diagnosis.force_surface`). Its coefficients are fitted to positions, through what a force does to them, with
-B, n, yield pressures and the release, origin, pressure and B of every trial free beside it, each with its own prior;
-nothing is differentiated. For each choice of variables
+(`vinetrack.diagnosis.force_surface`). Its coefficients are fitted to positions, through the response of the trajectory
+to a force, with B, n, yield pressures and the release, origin, pressure and B of every trial free, each under its own
+prior; positions are never differentiated. For each choice of variables
 
     ln Z = −½ χ²(ĉ) − ½ ln |H| + ½ ln |K⁻¹|,   H = ∇∇ ½χ² + K⁻¹
 
-is the marginal likelihood in Laplace's approximation (exact where positions are linear in the force), χ² with the
-priors of all numbers, averaged over the amplitude and the lengths of the process. Forces that are not small bend that:
-the best choices are followed to where their force leads (`force_refinement`) and weighed there. Posterior weights of
-the choices then follow from ln Z, with equal odds beforehand for one variable and for two (Rasmussen & Williams 2006,
-ch. 5).
+is the log marginal likelihood in Laplace's approximation (exact where positions are linear in the force), with χ²
+including the priors of all parameters, and averaged over the amplitude and the length scales of the process. Positions
+are not linear in a large force: for the best choices the nonlinear problem is solved (`force_refinement`) and ln Z is
+computed at its solution. Posterior weights of the choices follow from ln Z, with equal prior odds for one variable and
+for two (Rasmussen & Williams 2006, ch. 5).
 
-What no force explains is no noise, but is weighed as if it were: χ² is divided by what the best leaves per point. Steps
-end once χ² falls by less than a part of itself (`SETTLED`); differences of ln Z are counted in units of that.
-A force that B, n and P_y could take over as well is not decided by these data: it is counted from where growth begins
-(`force_surface`). The band holds everything beside that: noise, scatter, lengths and amplitude, and a constant. Growth,
-speed and time are hardly three variables where speeds are steady: weights then lean to whichever surface is smoother.
-Choices that the tracks themselves do not exclude are named beside the best (`learned_variables`).
-`vinetrack.diagnosis.propose` seeks a law for the force, or writes it as a table.
+Misfit that no force explains is treated as further noise: χ² is divided by what the best force leaves per point. The
+search ends once χ² falls by less than a fraction of itself (`CONVERGENCE_TOLERANCE`); differences of ln Z are measured
+in units of that. These data cannot decide on a force that B, n and P_y could take over as well: the force is measured
+from the start of growth (`force_surface`). The band includes everything else: noise, between-trial scatter, length
+scales and amplitude, and a constant. Where speeds are steady, growth, speed and time are hardly three separate
+variables, and the weights then favour whichever surface is smoother; choices that the tracks themselves do not exclude
+are reported with the best (`learned_variables`). `vinetrack.diagnosis.propose` looks for a law for the force, or
+writes it as a table.
 """
 
 from __future__ import annotations
@@ -33,18 +34,30 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_evidence import (
-    Beginning,
-    Posterior,
+    CoefficientLikelihood,
+    ForcePosterior,
     VariableChoice,
-    posterior,
-    posterior_weights,
-    weighed,
+    coefficient_likelihood,
+    marginal_likelihood,
+    variable_weights,
 )
-from vinetrack.diagnosis.force_inversion import ForceFit
-from vinetrack.diagnosis.force_refinement import SETTLED, Place, followed, normal_equations
+from vinetrack.diagnosis.force_inversion import LinearInversion
+from vinetrack.diagnosis.force_refinement import (
+    CONVERGENCE_TOLERANCE,
+    SearchPoint,
+    normal_equations,
+    optimise_smooth_force,
+)
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
-from vinetrack.diagnosis.force_surface import ANY, CONSTANT, VARIABLES, Domain, Surface, domains
-from vinetrack.diagnosis.learned_variables import dependence, named, not_excluded, reference
+from vinetrack.diagnosis.force_surface import (
+    CONSTANT_AT_START,
+    FREE_AT_START,
+    VARIABLES,
+    Domain,
+    SmoothForce,
+    candidate_domains,
+)
+from vinetrack.diagnosis.learned_variables import dependence, not_excluded, reference, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
@@ -54,54 +67,56 @@ if TYPE_CHECKING:
 
 LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
-HEARD = 18.0
-"""ln Z beyond that of no force at all, for a force to be learned. Chosen: six standard deviations; at half of it noise
-that is not quite what it is taken for is drawn as a force now and then, at twice a weak force goes undrawn."""
+LEAST_LOG_BAYES_FACTOR = 18.0
+"""ln Z in excess of that of no force from which a force is reported. Chosen: six standard deviations; at half of it
+noise that differs somewhat from its model is drawn as a force now and then, at twice a weak force is not drawn."""
 
-MISSES = 2.0
-"""χ² per point of a model from which a force is learned: below, noise and scatter that are not quite what they are
-taken for would pass for one. Chosen as in the words for what is missing."""
+LEAST_CHI2_PER_POINT = 2.0
+"""χ² per point of the fit from which a force is estimated: below, noise and scatter that differ somewhat from their
+models would be taken for one. Chosen as in the words for what is missing."""
 
-TRIED = {1: 1, 2: 3}
-"""Choices of one variable and of two that are followed, the best where all is taken as linear. Chosen for time."""
+CHOICES_REFINED = {1: 1, 2: 3}
+"""Choices of one variable and of two for which the nonlinear problem is solved: the best by the linear inversion.
+Chosen for time."""
 
-ROUNDED = 1e-3
-"""Part of the strongest direction below which splines are not set by a force along the motions. Chosen: places that
-trials hardly came to are left at nothing; only the start of a search depends on it."""
+PROJECTION_CUTOFF = 1e-3
+"""Relative singular value below which a force along the motions does not determine a combination of splines. Chosen:
+splines where there are hardly any trials stay at zero; only the start of a search depends on it."""
 
-PIECES = 20
-"""Parts of a trial that err by themselves where a model leaves more than noise. Chosen as the pieces of an acceleration
-in `smoothed_motions`: points within a part err together, and count as one (the design effect of Kish 1965, §5.4). At
-half and at twice of it weights are that much nearer to each other, or farther apart."""
+INDEPENDENT_PARTS_PER_TRIAL = 20
+"""Effective number of independent residuals in a trial where a model leaves more than noise. Chosen as the number of
+splines of an acceleration in `smoothed_motions`: points within a part err together, and count as one (the design effect
+of Kish 1965, §5.4). At half of it weights are nearer to each other, at twice farther apart, by as much."""
 
-ROUNDS = 2
-"""Turns of following a force and of choosing its amplitude and lengths anew. Chosen: the third moves no weight."""
+HYPERPARAMETER_UPDATES = 2
+"""Rounds of optimising the force and then its amplitude and length scales. Chosen: a third changes no weight."""
 
-MENDS = 0.95
-"""Part of the misfit that a force must take away once it is followed, to be told. Chosen: what leaves more has not
-settled, or something else is missing beside it, and weights of variables say nothing then. At half of the misfit wrong
-variables are named where a force is of the drive's own size."""
+LEAST_EXPLAINED = 0.95
+"""Part of the misfit that the refined force must take away to be reported. Chosen: if it leaves more, the search has
+not converged or something else is missing as well, and the weights of the variables mean nothing. At half of the misfit
+wrong variables are named where a force is as large as the drive."""
 
-DRAWN, NEAR = (60, 30), 0.06
-"""Points of a curve, and along each side of a map; and how near to a point of the map, as a part of each side, a trial
-must have come to have been there. Chosen for the picture."""
+PLOT_POINTS, VISITED_DISTANCE = (60, 30), 0.06
+"""Points of a curve, and along each side of a map; and the distance to a point of the map, as a part of each side,
+within which a trial counts as having visited it. Chosen for the picture."""
 
 
 @dataclass(frozen=True)
 class LearnedForce:
     """The missing force over the variables that it most likely depends on.
 
-    `best` is the force itself, with its error; `motions` are those of the trials where its fit ended. `weights` are
-    posterior, by `growth`, `growth+speed`, …; `beside` names the choices that are not excluded either. `table`, columns
-    `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` counts those that came near) and along the
-    first trial of each condition; variables that do not count are NaN. `undecided_N` is the standard error of a part of
-    it that is the same all along the growth, N: beside B, n and P_y, which are the vine's where growth begins.
+    `best` is the posterior of the force; `motions` are those of the trials at the solution. `weights` are posterior
+    weights of choices of variables (`growth`, `growth+speed`, …); `not_excluded` names further choices that the tracks
+    do not exclude. `table`, columns `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` those near
+    each point) and along the first trial of each condition; variables that the force does not depend on are NaN.
+    `undecided_N` is the standard error, N, of a part of the force that is the same all along the growth, which B, n and
+    P_y could take over.
     """
 
-    best: Beginning
+    best: ForcePosterior
     motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
-    beside: tuple[str, ...]
+    not_excluded: tuple[str, ...]
     log_bayes_factor: float
     explained: float
     table: pd.DataFrame
@@ -110,254 +125,288 @@ class LearnedForce:
 
     @property
     def domain(self) -> Domain:
-        """The variables that it depends on, with their ranges."""
-        return self.best.surface.domain
+        """The variables that the force depends on, with their ranges."""
+        return self.best.domain
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
             "variables": list(self.domain.variables),
             "weights": dict(self.weights),
-            "not_excluded": list(self.beside),
-            "length_scales": dict(zip(self.domain.variables, self.best.lengths, strict=True)),
+            "not_excluded": list(self.not_excluded),
+            "length_scales": dict(zip(self.domain.variables, self.best.length_scales, strict=True)),
             "amplitude_N": self.best.surface.sd_N,
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": self.best.begins,
+            "begins": self.best.at_start,
             "undecided_N": self.undecided_N,
             "sentence": self.sentence,
         }
 
 
+@dataclass(frozen=True)
+class _RefinedChoice:
+    """A choice of variables after the nonlinear fit: where the search ended, and the likelihood there."""
+
+    choice: VariableChoice
+    point: SearchPoint
+    likelihood: CoefficientLikelihood
+
+
 def learned_force(
-    model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], replicates: int
+    fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion], replicates: int
 ) -> LearnedForce | None:
-    """Learn the missing force over the variables that make the tracks most likely.
+    """Estimate the missing force over the variables with the highest marginal likelihood.
 
     Parameters
     ----------
-    model_fit : the fit that lacks the force.
-    fit : its linear answers to forces.
+    fit : the fit that lacks the force.
+    inversion : its linearisation.
     motions : sequence of FittedMotion
-        The fitted motions that those belong to.
+        The fitted motions about which it is linear.
     replicates : int
         Trials beyond the first of each condition.
 
     Returns
     -------
-    LearnedForce, or None where no force is heard, or none can be followed
+    LearnedForce, or None where no force is detected, or none can be simulated
     """
-    if fit.chi2 < MISSES * fit.points:
+    if inversion.chi2_without_force < LEAST_CHI2_PER_POINT * inversion.n_points:
         return None
     largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
-    effects = np.zeros_like(fit.trial_effects)
-    effects[:, : fit.problem.release_origin_mean.shape[1]] = fit.problem.release_origin_mean
-    motions = on_tracks(fit, effects, motions_of(model_fit, effects))
-    begins = [
-        Place(fit.state.theta, effects, surface, np.zeros(surface.domain.size), list(motions), driven=False)
-        for surface in (Surface(domain, np.eye(domain.size)) for domain in domains(motions))
+    effects = np.zeros_like(inversion.trial_effects)
+    effects[:, : inversion.problem.release_origin_mean.shape[1]] = inversion.problem.release_origin_mean
+    motions = on_tracks(inversion, effects, motions_of(fit, effects))
+    starts = [
+        SearchPoint(
+            inversion.state.theta,
+            effects,
+            surface,
+            np.zeros(surface.domain.size),
+            list(motions),
+            motions_include_force=False,
+        )
+        for surface in (SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(motions))
     ]
-    about = [posterior(place, normal_equations(model_fit, fit, place)) for place in begins]
-    if not all(told.finite for told in about):
+    likelihoods = [coefficient_likelihood(start, normal_equations(fit, inversion, start)) for start in starts]
+    if not all(likelihood.is_finite for likelihood in likelihoods):
         return None
-    inflation = max(min(told.lowest for told in about) / fit.points, 1.0)
-    silent = -0.5 * about[0].cost / inflation - 0.5 * about[0].log_determinant
+    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / inversion.n_points, 1.0)
+    log_evidence_without_force = -0.5 * likelihoods[0].chi2_at_zero / inflation - 0.5 * likelihoods[0].log_determinant
     linear = [
-        (weighed(place.law.domain, told, inflation, largest_N), place)
-        for place, told in zip(begins, about, strict=True)
-        if isinstance(place.law, Surface)
+        (marginal_likelihood(start.law.domain, likelihood, inflation, largest_N), start)
+        for start, likelihood in zip(starts, likelihoods, strict=True)
+        if isinstance(start.law, SmoothForce)
     ]
     linear.sort(key=lambda pair: -pair[0].log_evidence)
-    gain = linear[0][0].log_evidence - silent
-    if gain < HEARD:
+    if linear[0][0].log_evidence - log_evidence_without_force < LEAST_LOG_BAYES_FACTOR:
         return None
-    # Where the model is far off linear answers err, most for what has few numbers: the best alone is followed too.
-    near = [
-        pair
-        for size, most in TRIED.items()
-        for pair in [pair for pair in linear if len(pair[0].domain.variables) == size][:most]
-    ]
-    places = [(choice, _followed(model_fit, fit, place, choice, inflation, largest_N)) for choice, place in near]
-    there = [(choice, *settled) for choice, settled in places if settled is not None]
-    if not there:
+    refined = _refined_choices(fit, inversion, linear, inflation, largest_N)
+    if not refined:
         return None
-    there = _again(model_fit, fit, there, inflation, largest_N)
-    inflation = max(min(settled.lowest for _, _, settled in there) / fit.points, 1.0)
-    choices = [weighed(choice.domain, settled, inflation, largest_N) for choice, _, settled in there]
-    left = min(choice.best().left for choice in choices)
-    if fit.chi2 - left < MENDS * (fit.chi2 - fit.points):
+    refined = _restarted_from_best(fit, inversion, refined, inflation, largest_N)
+    inflation = max(min(each.likelihood.least_chi2 for each in refined) / inversion.n_points, 1.0)
+    choices = [marginal_likelihood(each.choice.domain, each.likelihood, inflation, largest_N) for each in refined]
+    chi2 = min(choice.best().chi2 for choice in choices)
+    noise_chi2 = inversion.n_points
+    if inversion.chi2_without_force - chi2 < LEAST_EXPLAINED * (inversion.chi2_without_force - noise_chi2):
         return None
-    # A fit that has settled within a part of χ² tells no smaller difference; nor do points that err together.
-    together = max(fit.points / (PIECES * len(fit.data)), 1.0)
-    shared = (1 + (inflation - 1) * together) / inflation
-    error = max(0.5 * SETTLED * left / inflation, shared)
-    weights = posterior_weights(choices, error)
-    choice, place = max(
-        zip(choices, (place for _, place, _ in there), strict=True), key=lambda pair: weights[pair[0].domain.name]
+    # Errors of ln Z: the tolerance of the search, and points that err together and so count as fewer.
+    points_per_part = max(inversion.n_points / (INDEPENDENT_PARTS_PER_TRIAL * len(inversion.data)), 1.0)
+    correlation_error = (1 + (inflation - 1) * points_per_part) / inflation
+    error = max(0.5 * CONVERGENCE_TOLERANCE * chi2 / inflation, correlation_error)
+    weights = variable_weights(choices, error)
+    choice, solution = max(
+        zip(choices, (each.point for each in refined), strict=True), key=lambda pair: weights[pair[0].domain.name]
     )
-    # Forces that begin in different ways are weighed at one place: how far the fit has settled they share.
-    best = choice.best(shared)
-    bayes = next(choice.log_evidence for choice, _ in linear if choice.domain == best.surface.domain) - silent
+    # Start conditions are compared at one solution, so that the tolerance of the search cancels.
+    best = choice.best(correlation_error)
+    log_bayes_factor = (
+        next(choice.log_evidence for choice, _ in linear if choice.domain == best.domain) - log_evidence_without_force
+    )
     remarks = []
     if not replicates:
         remarks.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
     if not any("pressure" in choice.domain.variables for choice, _ in linear):
-        remarks.append("All trials had one pressure: whether the force depends on it they do not tell.")
-    # What the splines of a choice leave at best, whatever the prior says of how smooth they are.
-    lowest = {choice.domain.name: told.lowest for choice, _, told in there}
-    losses = {name: (value - lowest[best.surface.domain.name]) / inflation for name, value in lowest.items()}
-    everything = [choice.domain for choice, _ in linear]
-    beside = not_excluded(best.surface.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, everything, motions)
-    if beside:
-        remarks.append("Trials that pass the same growth otherwise, at further pressures or payloads, tell.")
-    return _told(fit, best, place.motions, weights, bayes, remarks, beside, choice.undecided_N)
+        remarks.append("All trials had one pressure, so they do not show whether the force depends on it.")
+    # Choices are excluded by the χ² of their best coefficients, without regard to how smooth those are.
+    least_chi2 = {each.choice.domain.name: each.likelihood.least_chi2 for each in refined}
+    losses = {name: (value - least_chi2[best.domain.name]) / inflation for name, value in least_chi2.items()}
+    all_domains = [choice.domain for choice, _ in linear]
+    alternatives = not_excluded(best.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, all_domains, motions)
+    if alternatives:
+        remarks.append(
+            "Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
+            " them apart."
+        )
+    misfit = max(inversion.chi2_without_force - inversion.n_points, 1e-300)
+    table = _table(best, solution.motions)
+    explained = min(max((inversion.chi2_without_force - best.chi2) / misfit, 0.0), 1.0)
+    sentence = _sentence(best, weights, alternatives, explained, table, choice.undecided_N)
+    return LearnedForce(
+        best=best,
+        motions=solution.motions,
+        weights=weights,
+        not_excluded=tuple(alternatives),
+        log_bayes_factor=log_bayes_factor,
+        explained=explained,
+        table=table,
+        sentence=" ".join([sentence, *remarks]),
+        undecided_N=choice.undecided_N,
+    )
 
 
-def _again(
-    model_fit: Fit,
-    fit: ForceFit,
-    there: Sequence[tuple[VariableChoice, Place, Posterior]],
+def _refined_choices(
+    fit: Fit,
+    inversion: LinearInversion,
+    linear: Sequence[tuple[VariableChoice, SearchPoint]],
     inflation: float,
     largest_N: float,
-) -> list[tuple[VariableChoice, Place, Posterior]]:
-    """Every choice of two variables begun once more from where the best ended, and kept where that leads further down.
+) -> list[_RefinedChoice]:
+    """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated.
 
-    Each is begun from its own linear answer. Where that is far off, one stops short of what it could explain, and is
-    set aside though it could hold the very force of the best.
+    One variable is refined too, even where two are more likely: far from the solution the linear inversion errs, most
+    for what has few coefficients.
     """
-    best, end, settled = min(there, key=lambda ended: ended[2].cost - ended[2].gain)
-    lowest = settled.lowest
-    force_N = np.concatenate(
-        [best.domain.basis(best.domain.of_motion(motion)) @ end.amplitude for motion in end.motions]
-    )
+    best_of_size = [
+        pair
+        for size, most in CHOICES_REFINED.items()
+        for pair in [pair for pair in linear if len(pair[0].domain.variables) == size][:most]
+    ]
+    refined = [_refined(fit, inversion, start, choice, inflation, largest_N) for choice, start in best_of_size]
+    return [
+        _RefinedChoice(choice, *solution)
+        for (choice, _), solution in zip(best_of_size, refined, strict=True)
+        if solution is not None
+    ]
+
+
+def _restarted_from_best(
+    fit: Fit,
+    inversion: LinearInversion,
+    refined: Sequence[_RefinedChoice],
+    inflation: float,
+    largest_N: float,
+) -> list[_RefinedChoice]:
+    """Every choice of two variables searched again from the solution of the best, and the lower χ² kept.
+
+    The first search starts from the choice's own linear inversion. Where that is far off it may stop in a local
+    minimum, and the choice would be excluded though it could represent the very force of the best.
+    """
+    best = min(refined, key=lambda each: each.likelihood.chi2_at_zero - each.likelihood.delta_chi2)
+    least_chi2 = best.likelihood.least_chi2
+    motions, domain = best.point.motions, best.choice.domain
+    force_N = np.concatenate([domain.basis(domain.values_along(motion)) @ best.point.amplitude for motion in motions])
     kept = []
-    for choice, place, told in there:
-        kept.append((choice, place, told))
-        lacks = told.lowest - lowest
-        if choice.domain == best.domain or len(choice.domain.variables) < 2 or lacks < SETTLED * lowest:
+    for each in refined:
+        kept.append(each)
+        choice = each.choice
+        excess = each.likelihood.least_chi2 - least_chi2
+        if choice.domain == domain or len(choice.domain.variables) < 2 or excess < CONVERGENCE_TOLERANCE * least_chi2:
             continue
-        basis = np.concatenate([choice.domain.basis(choice.domain.of_motion(motion)) for motion in end.motions])
-        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=ROUNDED)[0])
-        begin = replace(end, law=Surface(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
-        other = _followed(model_fit, fit, begin, choice, inflation, largest_N)
-        if other is not None and other[1].lowest < told.lowest:
-            kept[-1] = (choice, *other)
+        basis = np.concatenate([choice.domain.basis(choice.domain.values_along(motion)) for motion in motions])
+        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=PROJECTION_CUTOFF)[0])
+        start = replace(best.point, law=SmoothForce(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
+        again = _refined(fit, inversion, start, choice, inflation, largest_N)
+        if again is not None and again[1].least_chi2 < each.likelihood.least_chi2:
+            kept[-1] = _RefinedChoice(choice, *again)
     return kept
 
 
-def _followed(
-    model_fit: Fit, fit: ForceFit, place: Place, choice: VariableChoice, inflation: float, largest_N: float
-) -> tuple[Place, Posterior] | None:
-    """Where a force over these variables leads, and what positions say of it there."""
-    settled: tuple[Place, Posterior] | None = None
-    free = Surface(choice.domain, np.eye(choice.domain.size))
-    for turn in range(ROUNDS + 1):
+def _refined(
+    fit: Fit,
+    inversion: LinearInversion,
+    point: SearchPoint,
+    choice: VariableChoice,
+    inflation: float,
+    largest_N: float,
+) -> tuple[SearchPoint, CoefficientLikelihood] | None:
+    """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters.
+
+    The force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
+    """
+    solution: tuple[SearchPoint, CoefficientLikelihood] | None = None
+    every_spline = SmoothForce(choice.domain, np.eye(choice.domain.size))
+    for update in range(HYPERPARAMETER_UPDATES + 1):
         likely = choice.best()
-        surface = choice.smooth_from(CONSTANT) if turn < ROUNDS else likely.surface
-        if turn == ROUNDS and likely.begins != ANY:
+        surface = choice.with_start(CONSTANT_AT_START) if update < HYPERPARAMETER_UPDATES else likely.surface
+        if update == HYPERPARAMETER_UPDATES and likely.at_start != FREE_AT_START:
             break
-        # The fit weighs positions by the noise alone: so the process is as much narrower as the noise is wider.
+        # The search weighs positions by the noise alone, so the prior is narrowed as much as the noise is inflated.
         surface = replace(surface, sd_N=surface.sd_N / math.sqrt(inflation))
-        amplitude = np.asarray(np.linalg.lstsq(surface.mix, place.amplitude, rcond=None)[0])
-        after = followed(model_fit, fit, replace(place, law=surface, amplitude=amplitude))
-        if after is None:
+        amplitude = np.asarray(np.linalg.lstsq(surface.modes, point.amplitude, rcond=None)[0])
+        optimum = optimise_smooth_force(fit, inversion, replace(point, law=surface, amplitude=amplitude))
+        if optimum is None:
             break
-        place = replace(after, law=free, amplitude=surface.mix @ after.amplitude)
-        told = posterior(place, normal_equations(model_fit, fit, place))
-        # Another amplitude may lead away: what has been reached is kept.
-        if not told.finite or (settled is not None and told.lowest > settled[1].lowest):
+        point = replace(optimum, law=every_spline, amplitude=surface.modes @ optimum.amplitude)
+        likelihood = coefficient_likelihood(point, normal_equations(fit, inversion, point))
+        # New hyperparameters may lead to a worse fit: the last solution is then kept.
+        if not likelihood.is_finite or (solution is not None and likelihood.least_chi2 > solution[1].least_chi2):
             break
-        settled = place, told
-        inflation = max(told.lowest / fit.points, 1.0)
-        choice = weighed(choice.domain, told, inflation, largest_N)
-    return settled
+        solution = point, likelihood
+        inflation = max(likelihood.least_chi2 / inversion.n_points, 1.0)
+        choice = marginal_likelihood(choice.domain, likelihood, inflation, largest_N)
+    return solution
 
 
-def _told(
-    fit: ForceFit,
-    best: Beginning,
-    motions: Sequence[FittedMotion],
-    weights: Mapping[str, float],
-    bayes: float,
-    remarks: Sequence[str],
-    beside: Sequence[str],
-    undecided_N: float,
-) -> LearnedForce:
-    """The force of the best choice with its table and the words for it."""
-    misfit = max(fit.chi2 - fit.points, 1e-300)
-    table = _table(best, motions)
-    explained = min(max((fit.chi2 - best.left) / misfit, 0.0), 1.0)
-    return LearnedForce(
-        best=best,
-        motions=motions,
-        weights=weights,
-        beside=tuple(beside),
-        log_bayes_factor=bayes,
-        explained=explained,
-        table=table,
-        sentence=" ".join([_sentence(best, weights, beside, explained, table, undecided_N), *remarks]),
-        undecided_N=undecided_N,
-    )
-
-
-def _table(best: Beginning, motions: Sequence[FittedMotion]) -> pd.DataFrame:
-    """The force on a grid, with the trials that came near each point, and along the first trial of each condition."""
+def _table(best: ForcePosterior, motions: Sequence[FittedMotion]) -> pd.DataFrame:
+    """The force on a grid, with the trials that visited each point, and along the first trial of each condition."""
     import pandas as pd
 
-    domain = best.surface.domain
-    grid = [
-        np.linspace(low, high, DRAWN[len(domain.variables) - 1])
+    domain = best.domain
+    axes = [
+        np.linspace(low, high, PLOT_POINTS[len(domain.variables) - 1])
         for low, high in zip(domain.low, domain.high, strict=True)
     ]
-    places = [axis.ravel() for axis in np.meshgrid(*grid, indexing="ij")]
-    trials = np.zeros(places[0].size)
+    grid = [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
+    trials = np.zeros(grid[0].size)
     for motion in motions:
-        near = np.ones((places[0].size, motion.time_s.size), dtype=bool)
+        near = np.ones((grid[0].size, motion.time_s.size), dtype=bool)
         near &= motion.time_s <= motion.counts_until_s
-        for at, along in zip(domain.parts(places), domain.parts(domain.of_motion(motion)), strict=True):
-            near &= np.abs(at[:, None] - along) < NEAR
+        visited = domain.normalised(domain.values_along(motion))
+        for at, along in zip(domain.normalised(grid), visited, strict=True):
+            near &= np.abs(at[:, None] - along) < VISITED_DISTANCE
         trials += near.any(axis=1)
-    parts = [_rows(best, places, trials, "")]
-    seen: set[str] = set()
+    parts = [_rows(best, grid, trials, "")]
+    drawn: set[str] = set()
     for motion in motions:
-        if motion.trial.condition not in seen:
-            seen.add(motion.trial.condition)
+        if motion.trial.condition not in drawn:
+            drawn.add(motion.trial.condition)
             last = int(np.count_nonzero(motion.time_s <= motion.counts_until_s)) - 1
-            every = np.linspace(0, last, DRAWN[0]).astype(int)
-            courses = [course[every] for course in domain.of_motion(motion)]
-            parts.append(_rows(best, courses, np.ones(every.size), motion.trial.condition))
+            points = np.linspace(0, last, PLOT_POINTS[0]).astype(int)
+            values = [along[points] for along in domain.values_along(motion)]
+            parts.append(_rows(best, values, np.ones(points.size), motion.trial.condition))
     return pd.concat(parts, ignore_index=True)
 
 
-def _rows(best: Beginning, places: Sequence[Floats], trials: Floats, condition: str) -> pd.DataFrame:
+def _rows(best: ForcePosterior, values: Sequence[Floats], trials: Floats, condition: str) -> pd.DataFrame:
     import pandas as pd
 
-    force, sigma = best.force(places)
-    known = {VARIABLES[name]: at for name, at in zip(best.surface.domain.variables, places, strict=True)}
-    columns = {name: known.get(name, np.full(force.size, math.nan)) for name in VARIABLES.values()}
+    force, sigma = best.force(values)
+    given = {VARIABLES[name]: at for name, at in zip(best.domain.variables, values, strict=True)}
+    columns = {name: given.get(name, np.full(force.size, math.nan)) for name in VARIABLES.values()}
     return pd.DataFrame(
         columns | {"force_N": force, "sigma_N": sigma, "trials": trials.astype(int), "condition": condition}
     )
 
 
 def _sentence(
-    best: Beginning,
+    best: ForcePosterior,
     weights: Mapping[str, float],
-    beside: Sequence[str],
+    alternatives: Sequence[str],
     explained: float,
     table: pd.DataFrame,
     undecided_N: float,
 ) -> str:
-    """What describes it and how sure that is, how large it is, and from what it is counted."""
-    seen = table[(table["condition"] == "") & (table["trials"] > 0)]
+    """The variables of the force and how sure they are, its range and error, and from where it is measured."""
+    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
     low, high, sigma = (
-        float(value) for value in (seen["force_N"].min(), seen["force_N"].max(), seen["sigma_N"].median())
+        float(value) for value in (visited["force_N"].min(), visited["force_N"].max(), visited["sigma_N"].median())
     )
-    name = best.surface.domain.name
-    drawn = f" Over {named(name)} it" if beside else " It"
+    name = best.domain.name
+    subject = f" As a function of {variables_in_words(name)} it" if alternatives else " It"
     return (
-        f"{dependence(name, weights, beside)}.{drawn} lies between {low:.2f} and {high:.2f} N where trials have been,"
-        f" with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
-        f" {reference(best.surface.domain, best.begins, undecided_N)} A law over other variables may leave the same"
-        " tracks."
+        f"{dependence(name, weights, alternatives)}.{subject} ranges from {low:.2f} to {high:.2f} N where there are"
+        f" trials, with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
+        f" {reference(best.domain, best.at_start, undecided_N)} A law over other variables may fit the tracks as well."
     ).replace("-", "−")

@@ -1,4 +1,4 @@
-"""What a fit leaves, linear in a missing force about one place: where every search for that force begins."""
+"""The misfit of a fit, linearised in a missing force: the starting point of every search for that force."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.cubic_splines import splines
-from vinetrack.diagnosis.force_inversion import ForceFit, Gain
+from vinetrack.diagnosis.force_inversion import ForceEstimate, LinearInversion
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
 from vinetrack.diagnosis.per_trial_estimates import lay
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
@@ -16,32 +16,35 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
-PIECES, EARLY = 15, (0.01, 0.03, 0.06)
-"""Smooth pieces of a force along the growth of one condition; and further knots in the first tenth of it. Chosen:
-finer than any force that leaves a trace of its own in positions."""
+N_SPLINES, EARLY_KNOTS = 15, (0.01, 0.03, 0.06)
+"""Splines of a force along the growth of one condition, and the extra knots in the first tenth of it. Chosen: finer
+than any force that positions resolve."""
 
 
 @dataclass(frozen=True)
 class LinearMisfit:
-    """The trials about one place: their motions, what smooth pieces of force do to them, and what all pieces explain.
+    """A fit linearised about one set of trial effects, and a smooth force estimated in every condition.
 
-    `longest` is the largest lead position of each condition, m; `pieces` has an array of every trial, shape
-    (frames, PIECES), of positions per newton; `everything` is the gain of all pieces in every condition.
+    `motions` are those about which it is linear; `longest` is the largest lead position of each condition, m;
+    `sensitivities` has an array for every trial, shape (n_points, N_SPLINES), m/N, of the positions to each spline of
+    the force along the growth; `smooth_force` is the estimate of all these splines, separately in every condition.
     """
 
-    fit: ForceFit
+    inversion: LinearInversion
     motions: list[FittedMotion]
     longest: dict[str, float]
-    pieces: list[Floats]
-    everything: Gain
+    sensitivities: list[Floats]
+    smooth_force: ForceEstimate
 
 
-def linear_misfit(model_fit: Fit) -> LinearMisfit:
-    """Lay the trials out about the fit or about the estimates of single trials, whichever leaves less unexplained.
+def linear_misfit(fit: Fit) -> LinearMisfit:
+    """Linearise about the trial effects of the fit or about those estimated trial by trial.
+
+    Of the two, the one is taken whose misfit a smooth force in every condition explains further.
 
     Parameters
     ----------
-    model_fit : the fit that is questioned.
+    fit : the fit that lacks a force.
 
     Returns
     -------
@@ -50,19 +53,19 @@ def linear_misfit(model_fit: Fit) -> LinearMisfit:
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
     try:
-        scatter = replicate_scatter(model_fit, courses_of(model_fit)[0])
-        begins = [model_fit.solution.state.trial_effects, lay(model_fit).trial_effects]
-        tried = [_about(model_fit, ForceFit(model_fit, trial_effects, scatter)) for trial_effects in begins]
+        scatter = replicate_scatter(fit, courses_of(fit)[0])
+        starts = [fit.solution.state.trial_effects, lay(fit).trial_effects]
+        linearised = [_linearised(fit, LinearInversion(fit, trial_effects, scatter)) for trial_effects in starts]
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed: {error}") from error
-    return min(tried, key=lambda linear: linear.fit.chi2 - linear.everything.chi2)
+        raise FitError(f"The model cannot be simulated: {error}") from error
+    return min(linearised, key=lambda each: each.inversion.chi2_without_force - each.smooth_force.delta_chi2)
 
 
-def pieces_along(part: Floats) -> Floats:
-    """Smooth pieces of a force along the growth: narrower at the start, where speed rises.
+def growth_splines(part: Floats) -> Floats:
+    """Splines of a force along the growth, narrower at the start, where the vine accelerates.
 
     Parameters
     ----------
@@ -71,19 +74,19 @@ def pieces_along(part: Floats) -> Floats:
 
     Returns
     -------
-    array, shape (n, PIECES)
-        Each piece at each place, 1.
+    array, shape (n, N_SPLINES)
     """
-    return splines(part, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
+    uniform_knots = np.linspace(0.0, 1.0, N_SPLINES - 2 - len(EARLY_KNOTS))[1:]
+    return splines(part, np.concatenate([[0.0, *EARLY_KNOTS], uniform_knots]))
 
 
-def _about(model_fit: Fit, fit: ForceFit) -> LinearMisfit:
-    motions = motions_of(model_fit, fit.trial_effects)
-    # A vine that stands still by its model is at the start of its growth throughout.
+def _linearised(fit: Fit, inversion: LinearInversion) -> LinearMisfit:
+    motions = motions_of(fit, inversion.trial_effects)
+    # In a condition where the model predicts no motion, every position is at the start of growth.
     longest = {motion.trial.condition: float(np.finfo(float).tiny) for motion in motions}
     for motion in motions:
         longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
-    pieces = force_sensitivities(
-        model_fit, fit.trial_effects, motions, lambda m: pieces_along(m.lead_position_m / longest[m.trial.condition])
+    sensitivities = force_sensitivities(
+        fit, inversion.trial_effects, motions, lambda m: growth_splines(m.lead_position_m / longest[m.trial.condition])
     )
-    return LinearMisfit(fit, motions, longest, pieces, fit.by_condition(pieces))
+    return LinearMisfit(inversion, motions, longest, sensitivities, inversion.estimate_by_condition(sensitivities))

@@ -1,8 +1,9 @@
-"""From a missing force to an effect: laws that it looks like, each fitted in the equation of motion, the best a file.
+"""From a missing force to an effect: laws fitted in the equation of motion, the best written as a file.
 
-The force that a model lacks is held against simple laws along the fitted motions (`missing_force`). Here the laws that
-explain most of it become effects with their numbers as parameters. Each is fitted with the model, like any effect that
-is added by hand; they are compared as the diagnosis compares hypotheses, and by their error on conditions left out.
+The missing force is compared with simple laws along the fitted motions (`missing_force`). The laws that explain most of
+it become effects with their amplitudes and shapes as parameters. Each is fitted with the model like any effect that is
+added by hand; they are compared by likelihood ratio, as hypotheses are in the diagnosis, and by their error on left-out
+conditions.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from vinetrack.diagnosis.add import both_fits
-from vinetrack.diagnosis.force_laws import EDGE
+from vinetrack.diagnosis.force_laws import EDGE_FRACTION
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.likelihood_ratio import (
@@ -29,28 +30,29 @@ from vinetrack.diagnosis.likelihood_ratio import (
     likelihood_ratio,
 )
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
-from vinetrack.diagnosis.missing_force import MENDS, SeenLaw, missing_force
+from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, missing_force
 from vinetrack.diagnosis.multi_start import restart_exponents
-from vinetrack.diagnosis.proposed_table import WORTH, ProposedTable, proposed_table
+from vinetrack.diagnosis.proposed_table import LEAST_SIGMAS, ProposedTable, proposed_table
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
 
-MOST_PROPOSED = 4
-"""Laws that are fitted in the equation of motion at most. Chosen for time: a fit each, 5 to 20 s."""
+MAX_LAWS_FITTED = 4
+"""Most laws that are fitted in the equation of motion. Chosen for time: a fit each, 5 to 20 s."""
 
-BEHIND = 0.2
-"""Laws that explain less than the best by more than this part are not fitted. Chosen: twice what single trials make of
-it; at half a right law whose linear fit errs is dropped, at twice laws are fitted that no likelihood comes back to."""
+MAX_EXPLAINED_DEFICIT = 0.2
+"""Laws that explain less than the best by more than this part are not fitted. Chosen: twice the scatter from trial to
+trial; at half a correct law whose linear fit errs is dropped, at twice laws are fitted that the likelihood then
+rejects."""
 
 
 @dataclass(frozen=True)
 class _Expression:
-    """How a law is written: its size, the shape in code and in symbols, and the numbers that shape it.
+    """How a law is written: its size parameter, its shape as code and as a formula, and its shape parameters.
 
-    The size has a name, a symbol and a unit, by its exponents of N, m, s and Pa.
+    The size has a name, a symbol and a unit, the unit given by its exponents of N, m, s and Pa.
     """
 
     size: tuple[str, str, tuple[int, int, int, int]]
@@ -91,9 +93,9 @@ _EXPRESSIONS = {
     "fading_along": _Expression(_FORCE, "np.exp(-s.lead_position / reach)", "F exp(−y/ℓ)", (_LENGTH,)),
     "patch": _Expression(
         _FORCE,
-        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE} * width))"
-        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE} * width)))",
-        f"½F (tanh((y − y₁)/{EDGE}w) − tanh((y − y₁ − w)/{EDGE}w))",
+        f"0.5 * (np.tanh((s.lead_position - y_1) / ({EDGE_FRACTION} * width))"
+        f" - np.tanh((s.lead_position - y_1 - width) / ({EDGE_FRACTION} * width)))",
+        f"½F (tanh((y − y₁)/{EDGE_FRACTION}w) − tanh((y − y₁ − w)/{EDGE_FRACTION}w))",
         (("y_1", "y₁", "m"), ("width", "w", "m")),
     ),
     "periodic": _Expression(
@@ -104,44 +106,44 @@ _EXPRESSIONS = {
     ),
 }
 
-_TIMES = {
+_FACTORS = {
     "position": ("s.tail_position", "x", (0, -1, 0, 0)),
     "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
     "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
 }
-"""What a law may be multiplied by: code, symbol, and what it does to the unit of the size."""
+"""What a law may be multiplied by: code, symbol, and the change of the unit of the size."""
 
-_AT = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
-"""State of the worked number; a convention of this file."""
+_WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
+"""State of the worked example; a convention of this file."""
 
-_UNITS = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
-"""What the names in a state end with in a `FittedMotion`."""
+_SUFFIX = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
+"""Endings that turn the names of a state into those of a `FittedMotion`."""
 
 
 @dataclass(frozen=True)
 class ProposedLaw:
-    """A law as an effect that was fitted.
+    """A law that was fitted as an effect.
 
-    `rms_left_out_m` is its error on conditions left out, m; NaN where others fit far better.
+    `rms_left_out_m` is its error on left-out conditions, m; NaN where the likelihood of others is far higher.
     """
 
-    seen: SeenLaw
+    law: DetectedLaw
     effect: Effect
     ratio: LikelihoodRatio
     rms_left_out_m: float
 
     @property
     def words(self) -> str:
-        """What it looks like, with its size."""
-        return self.seen.words
+        """Description of the law with its size."""
+        return self.law.words
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Laws that mend a model, best first, and what the model without them errs by, m.
+    """Fitted laws, best first, and the error on left-out conditions of the model without them, m.
 
-    `tied` are those that the data do not exclude; none where no law is worth proposing, and `reason` says why.
-    `table` is the learned force where it takes away what no law does.
+    `tied` are those that the data do not exclude; empty where no law is proposed, for the `reason` given. `table` is
+    the learned force, where it explains what no law does.
     """
 
     before: Fit
@@ -152,7 +154,7 @@ class Proposal:
     table: ProposedTable | None = None
 
     def sentences(self) -> list[str]:
-        """What was tried and what came of it, a line a sentence."""
+        """What was fitted and what resulted, a line a sentence."""
         return [*self._of_laws(), *([] if self.table is None else self.table.sentences(self.before))]
 
     def _of_laws(self) -> list[str]:
@@ -171,12 +173,12 @@ class Proposal:
         ]
         lines.append(f"Proposed: {best.words}.")
         if len(self.tied) > 1:
-            lines.append(f"These data would nearly as well have {joined([law.words for law in self.tied[1:]])}.")
+            lines.append(f"These data fit nearly as well with {joined([law.words for law in self.tied[1:]])}.")
         return lines
 
 
 def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Proposal:
-    """The laws of force that mend a model, each fitted in the equation of motion.
+    """Find laws of force that explain the misfit of a model, and fit each in the equation of motion.
 
     Parameters
     ----------
@@ -187,37 +189,37 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     Returns
     -------
     Proposal
-        With the learned force as a table where no law takes away what that does.
+        With the learned force as a table where no law reproduces it.
 
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
-    questioned = candidates_of(model, None, {})
+    candidates = candidates_of(model, None, {})
     report("fitting the model")
-    before = initial_fit(model, pairs, questioned, profile=False)
+    before = initial_fit(model, pairs, candidates, profile=False)
     if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
         before = restart_exponents(before)
-    report("drawing the missing force")
-    seen = missing_force(before, learn=False).seen
-    near = [law for law in seen if law.explained > seen[0].explained - BEHIND][:MOST_PROPOSED]
-    proposal = _of_laws(model, before, near, report)
+    report("estimating the missing force")
+    detected = missing_force(before, learn=False).detected
+    best = [law for law in detected if law.explained > detected[0].explained - MAX_EXPLAINED_DEFICIT]
+    proposal = _fitted_laws(model, before, best[:MAX_LAWS_FITTED], report)
     fits = [law.ratio.fit for law in proposal.tied]
     return replace(proposal, table=proposed_table(model, proposal.before, fits, report))
 
 
-def _of_laws(model: Model, before: Fit, near: Sequence[SeenLaw], report: Callable[[str], None]) -> Proposal:
-    """The laws fitted in the equation of motion, with those that the data do not exclude."""
-    if not near:
-        reason = "No simple law of force is seen in what the model leaves."
+def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], report: Callable[[str], None]) -> Proposal:
+    """Fit the laws in the equation of motion, and find those that the data do not exclude."""
+    if not detected:
+        reason = "No simple law of force is detected in the misfit of the model."
         return Proposal(before, left_out(before).rms_m, (), (), reason)
     with tempfile.TemporaryDirectory() as folder:
-        effects = [_written(law, Path(folder)) for law in near]
-        # Compiled without the catalogue, which nothing here asks for.
+        effects = [_loaded(law, Path(folder)) for law in detected]
+        # Compiled without the catalogue, which is not needed here.
         before = with_host(before, Model((*model, *effects)))
         fitted = []
-        for law, effect in zip(near, effects, strict=True):
+        for law, effect in zip(detected, effects, strict=True):
             try:
                 start, after = both_fits(before, effect, report)
             except FitError:
@@ -225,96 +227,96 @@ def _of_laws(model: Model, before: Fit, near: Sequence[SeenLaw], report: Callabl
             before = max((before, start), key=lambda fit: fit.log_likelihood)
             fitted.append((law, effect, likelihood_ratio(before, (effect,), after)))
         report("errors on left-out conditions")
-        most = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)
+        highest = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)
         laws = [
-            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if _may_tie(ratio, most) else math.nan)
+            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if _may_tie(ratio, highest) else math.nan)
             for law, effect, ratio in fitted
         ]
-    return _judged(before, laws)
+    return _proposal(before, laws)
 
 
-def _may_tie(ratio: LikelihoodRatio, most: float) -> bool:
-    """Whether a law can be in the answer set, however much single trials disagree; of others nothing more is asked."""
-    return 2 * (most - ratio.fit.log_likelihood) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
+def _may_tie(ratio: LikelihoodRatio, highest: float) -> bool:
+    """Whether a law could be in the answer set at the largest inflation; only for these are more errors computed."""
+    return 2 * (highest - ratio.fit.log_likelihood) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
 
 
-def _judged(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
-    """The laws in the order of their likelihood, with those that cannot be excluded."""
+def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
+    """The laws in order of their likelihood, with the significant ones that cannot be excluded."""
     error_m = left_out(before).rms_m
     laws = tuple(sorted(laws, key=lambda law: -law.ratio.fit.log_likelihood))
     misfit = max(before.chi2_per_dof - 1, 0.0)
-    worth = [
+    significant = [
         law
         for law in laws
-        if law.ratio.sigma > WORTH
+        if law.ratio.sigma > LEAST_SIGMAS
         and law.rms_left_out_m < error_m
-        and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > MENDS * misfit)
+        and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit)
     ]
-    if not worth:
-        reason = "No simple law of force mends the model and predicts left-out conditions better."
+    if not significant:
+        reason = "No simple law of force both explains the misfit and predicts left-out conditions better."
         return Proposal(before, error_m, laws, (), reason)
-    kept, _ = answer_set([law.ratio for law in worth])
-    tied = tuple(law for ratio in kept for law in worth if law.ratio is ratio)
+    not_excluded, _ = answer_set([law.ratio for law in significant])
+    tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)
     return Proposal(before, error_m, laws, tied)
 
 
-def _written(law: SeenLaw, folder: Path) -> Effect:
-    """A law as an effect, its file in this folder."""
+def _loaded(law: DetectedLaw, folder: Path) -> Effect:
+    """A law as an effect, written to a file in this folder and loaded from it."""
     path = folder / f"proposed_{law.law.name}.py"
     path.write_text(effect_text(law), encoding="utf-8")
     remember(path)
     return load_effect(path)
 
 
-def effect_text(seen: SeenLaw, remark: str = "") -> str:
-    """An effect file that holds a law: docstring, parameters with units and bounds, the function, a worked number.
+def effect_text(detected: DetectedLaw, remark: str = "") -> str:
+    """Source of an effect file that holds a law: docstring, parameters with units and bounds, function, worked example.
 
     Parameters
     ----------
-    seen : the law with its size.
-    remark : sentences about the data that it comes from, for the docstring.
+    detected : the law with its size.
+    remark : sentences for the docstring about the data that the law comes from.
 
     Returns
     -------
     str
     """
-    law, written = seen.law, _EXPRESSIONS[seen.law.kind]
-    by_code, by_symbol, by_unit = _TIMES.get(law.times, ("", "", (0, 0, 0, 0)))
-    unit = _unit([a + b for a, b in zip(written.size[2], by_unit, strict=True)])
-    size, shapes = _values(seen)
-    names = [written.size[0], *(name for name, _, _ in written.shapes)]
-    area = " * (s.area / AREA)" if law.by_area else ""
-    at = _AT | ({"area": law.by_area} if law.by_area else {})
-    worked = _force_N(seen)
-    times = f" * {by_code}" if by_code else ""
-    symbols = f" {by_symbol}" if by_symbol else ""
-    formula = f"tail force {written.formula}{symbols}" + (
+    law, expression = detected.law, _EXPRESSIONS[detected.law.kind]
+    factor_code, factor_symbol, factor_unit = _FACTORS.get(law.factor, ("", "", (0, 0, 0, 0)))
+    unit = _unit([a + b for a, b in zip(expression.size[2], factor_unit, strict=True)])
+    size, shapes = _values(detected)
+    names = [expression.size[0], *(name for name, _, _ in expression.shapes)]
+    area = " * (s.area / AREA)" if law.reference_area_m2 else ""
+    state = _WORKED_STATE | ({"area": law.reference_area_m2} if law.reference_area_m2 else {})
+    worked = _force_N(detected)
+    times = f" * {factor_code}" if factor_code else ""
+    symbols = f" {factor_symbol}" if factor_symbol else ""
+    formula = f"tail force {expression.formula}{symbols}" + (
         " A/A₀, A₀ the mean cross-section of these vines" if area else ""
     )
     parts = [
-        f'"""Proposed law: {seen.words}.\n',
+        f'"""Proposed law: {detected.words}.\n',
         *textwrap.wrap(remark, 118),
         "" if remark else None,
-        "It describes these data and explains nothing: what it stands for is for you to find. Forces count along the",
-        "growth, so that a friction is negative.\n",
+        "It describes these data but explains nothing: its physical cause is for you to find. Forces are positive",
+        "along the growth, so that a friction is negative.\n",
         f"    {formula}\n",
-        "Measure it in trials that differ in what it hangs on, and hold the next ones against its prediction.",
+        "Make trials that differ in the variables it depends on, and compare new trials with its prediction.",
         '"""\n',
         "import numpy as np\n",
         "from vinetrack.effects import Parameter, Worked\n",
-        f"AREA = {law.by_area:.6g}  # m²\n" if area else None,
+        f"AREA = {law.reference_area_m2:.6g}  # m²\n" if area else None,
         "PARAMETERS = (",
-        f"    {_size_parameter(written.size[0], written.size[1], unit, size)},",
-        *(f"    {_shape_parameter(*number)}," for number in zip(written.shapes, shapes, strict=True)),
+        f"    {_size_parameter(expression.size[0], expression.size[1], unit, size)},",
+        *(f"    {_shape_parameter(*number)}," for number in zip(expression.shapes, shapes, strict=True)),
         ")\n\n",
         f"def tail_force(s, rig, {', '.join(names)}):",
-        f"    return {names[0]} * ({written.code}){times}{area}\n\n",
+        f"    return {names[0]} * ({expression.code}){times}{area}\n\n",
         "WORKED = (",
         "    Worked(",
         '        "tail_force",',
         f"        {worked:.8g},",
-        f'        "the law that was fitted, at this state: {size:.6g} × {worked / size:.6g}",',
-        f"        state={at!r},",
+        f'        "the fitted law at this state: {size:.6g} × {worked / size:.6g}",',
+        f"        state={state!r},",
         f"        parameters={dict(zip(names, (size, *shapes), strict=True))!r},",
         "    ),",
         ")",
@@ -322,33 +324,33 @@ def effect_text(seen: SeenLaw, remark: str = "") -> str:
     return "\n".join(part for part in parts if part is not None) + "\n"
 
 
-def _values(seen: SeenLaw) -> tuple[float, tuple[float, ...]]:
-    """Size and shape numbers of a law as its effect holds them, SI, rounded to what is printed."""
-    law, amplitude = seen.law, seen.amplitude_N
+def _values(detected: DetectedLaw) -> tuple[float, tuple[float, ...]]:
+    """Size and shape parameters of a law as its effect holds them, SI, rounded to what is printed."""
+    law, amplitude = detected.law, detected.amplitude_N
 
-    def short(*values: float) -> tuple[float, ...]:
+    def rounded(*values: float) -> tuple[float, ...]:
         return tuple(float(f"{value:.6g}") for value in values)
 
     if law.kind == "periodic":
-        return short(math.hypot(*amplitude))[0], short(law.scale, math.atan2(amplitude[1], amplitude[0]))
+        return rounded(math.hypot(*amplitude))[0], rounded(law.scale, math.atan2(amplitude[1], amplitude[0]))
     if law.kind == "patch":
-        return short(amplitude[0] / law.largest)[0], short(law.low, law.high - law.low)
+        return rounded(amplitude[0] / law.peak)[0], rounded(law.low, law.high - law.low)
     if law.kind == "inverse_speed":
-        return short(amplitude[0] / law.largest / law.scale)[0], short(law.scale)
-    return short(amplitude[0] / law.largest)[0], short(law.scale) if _EXPRESSIONS[law.kind].shapes else ()
+        return rounded(amplitude[0] / law.peak / law.scale)[0], rounded(law.scale)
+    return rounded(amplitude[0] / law.peak)[0], rounded(law.scale) if _EXPRESSIONS[law.kind].shapes else ()
 
 
-def _force_N(seen: SeenLaw) -> float:
-    """The force of a law at the state of the worked number, from the law itself: it tries the formula of the file."""
-    at = {f"{name}{unit}": np.array([_AT[name]]) for name, unit in _UNITS.items()}
-    motion = SimpleNamespace(**at, trial=SimpleNamespace(area_m2=seen.law.by_area))
-    return float((seen.law.along(motion) @ np.array(seen.amplitude_N))[0])  # type: ignore[arg-type]
+def _force_N(detected: DetectedLaw) -> float:
+    """The force of a law in the state of the worked example, from the law itself: it checks the formula of the file."""
+    state = {f"{name}{suffix}": np.array([_WORKED_STATE[name]]) for name, suffix in _SUFFIX.items()}
+    motion = SimpleNamespace(**state, trial=SimpleNamespace(area_m2=detected.law.reference_area_m2))
+    return float((detected.law.unit_force(motion) @ np.array(detected.amplitude_N))[0])  # type: ignore[arg-type]
 
 
 def _unit(powers: Sequence[int]) -> str:
     """A unit by its exponents of N, m, s and Pa."""
 
-    def joined_up(sign: int) -> list[str]:
+    def product(sign: int) -> list[str]:
         raised = {2: "²", 3: "³", 4: "⁴"}
         return [
             name + raised.get(sign * power, "")
@@ -356,15 +358,17 @@ def _unit(powers: Sequence[int]) -> str:
             if sign * power > 0
         ]
 
-    below = "·".join(joined_up(-1))
-    return "·".join(joined_up(1)) + (f"/({below})" if "·" in below else f"/{below}" if below else "")
+    denominator = "·".join(product(-1))
+    return "·".join(product(1)) + (
+        f"/({denominator})" if "·" in denominator else f"/{denominator}" if denominator else ""
+    )
 
 
 def _size_parameter(name: str, symbol: str, unit: str, value: float) -> str:
     low, high = sorted((0.0, 10 * value))
-    most = 100 * abs(value)
+    limit = 100 * abs(value)
     return (
-        f'Parameter("{name}", "{symbol}", "{unit}", {value!r}, bounds=({-most:.6g}, {most:.6g}), '
+        f'Parameter("{name}", "{symbol}", "{unit}", {value!r}, bounds=({-limit:.6g}, {limit:.6g}), '
         f'plausible=({low:.6g}, {high:.6g}), meaning="size of the law")'
     )
 
@@ -372,8 +376,8 @@ def _size_parameter(name: str, symbol: str, unit: str, value: float) -> str:
 def _shape_parameter(names: tuple[str, str, str], value: float) -> str:
     name, symbol, unit = names
     if name in ("phi", "y_1"):
-        reach = math.pi if name == "phi" else max(abs(value), 0.01)
-        bounds, plausible = (value - 2 * reach, value + 2 * reach), (value - reach, value + reach)
+        half_range = math.pi if name == "phi" else max(abs(value), 0.01)
+        bounds, plausible = (value - 2 * half_range, value + 2 * half_range), (value - half_range, value + half_range)
     else:
         bounds, plausible = (value / 10, value * 10), (value / 3, value * 3)
     return (

@@ -1,4 +1,4 @@
-"""The learned force fitted as an effect, where no formula takes away what it does."""
+"""The learned force fitted as an effect, where no formula reproduces it."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from vinetrack.diagnosis.add import both_fits
 from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.learned_effect import table_name, table_text
-from vinetrack.diagnosis.learned_force import MISSES, LearnedForce
+from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, LikelihoodRatio, likelihood_ratio
-from vinetrack.diagnosis.missing_force import MENDS, learned_alone
+from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, learn_missing_force
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
-WORTH = 6.0
-"""Standard deviations by which a law must mend the model to be proposed: some hundred laws are tried, and none is known
-beforehand. Chosen as SEARCH_SIGMAS of the misfit tests; at half one is found in noise, at twice in gross misfits
-alone."""
+LEAST_SIGMAS = 6.0
+"""Standard deviations by which a law must improve the fit to be proposed: some hundred laws are tried, and none is
+known beforehand. Chosen as SEARCH_SIGMAS of the misfit tests; at half one is found in noise, at twice only in gross
+misfits."""
 
-REPRODUCES = 0.9
-"""Part of the misfit that a law must take away, for the learned force not to be asked for as a table. Chosen: with it
-the noise is within a third of what is left where a model misses by four times its noise; at 0.8 a law that bends where
-the force does not passes for the force, at 0.95 nearly every law is followed by a table."""
+LAW_REPRODUCES = 0.9
+"""Part of the misfit that a law must take away for the learned force not to be tried as a table. Chosen: the noise is
+then within a third of what is left, where a model misses by four times its noise; at 0.8 a law that bends where the
+force does not is accepted, at 0.95 nearly every law is followed by a table."""
 
 
 @dataclass(frozen=True)
 class ProposedTable:
-    """A learned force as an effect that was fitted; `rms_left_out_m` with the table learned from all trials."""
+    """A learned force that was fitted as an effect; `rms_left_out_m` is with the table learned from all trials."""
 
     learned: LearnedForce
     effect: Effect
@@ -40,7 +40,7 @@ class ProposedTable:
     rms_left_out_m: float
 
     def sentences(self, before: Fit) -> list[str]:
-        """What the table does.
+        """How much of the misfit the table explains.
 
         Parameters
         ----------
@@ -52,16 +52,16 @@ class ProposedTable:
         """
         after = self.ratio.fit
         return [
-            f"No formula tried does what the learned force does. As a table ({self.effect.name}) it takes χ² per point"
-            f" from {before.chi2_per_dof:.1f} to {after.chi2_per_dof:.1f}; error on left-out conditions, the table"
-            f" itself learned from all: {1e3 * self.rms_left_out_m:.2f} mm."
+            f"No formula in the list reproduces the learned force. As a table ({self.effect.name}) it reduces χ² per"
+            f" point from {before.chi2_per_dof:.1f} to {after.chi2_per_dof:.1f}; the error on left-out conditions, with"
+            f" the table itself learned from all trials, is {1e3 * self.rms_left_out_m:.2f} mm."
         ]
 
 
 def proposed_table(
     model: Model, before: Fit, laws: Sequence[Fit], report: Callable[[str], None]
 ) -> ProposedTable | None:
-    """Learn the missing force and fit it as a table.
+    """Estimate the missing force as a smooth function and fit it as a table.
 
     Parameters
     ----------
@@ -73,14 +73,14 @@ def proposed_table(
 
     Returns
     -------
-    ProposedTable, or None where a law does as well, or none is learned that mends the model
+    ProposedTable, or None where a law does as well, or where the learned force does not explain the misfit
     """
     misfit = before.chi2_per_dof - 1
-    left = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
-    if misfit < MISSES - 1 or left < (1 - REPRODUCES) * misfit:
+    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
+    if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - LAW_REPRODUCES) * misfit:
         return None
-    report("learning the missing force as a table")
-    learned = learned_alone(before)
+    report("estimating the missing force as a table")
+    learned = learn_missing_force(before)
     if learned is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
@@ -94,8 +94,8 @@ def proposed_table(
             return None
         ratio = likelihood_ratio(start, (effect,), after)
         better = all(2 * (after.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
-        mends = start.chi2_per_dof - after.chi2_per_dof > MENDS * misfit
-        if not (better and mends and ratio.sigma > WORTH):
+        explains = start.chi2_per_dof - after.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit
+        if not (better and explains and ratio.sigma > LEAST_SIGMAS):
             return None
         report("errors with the table")
         return ProposedTable(learned, effect, ratio, left_out(after).rms_m)

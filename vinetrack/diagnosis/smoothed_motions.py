@@ -1,9 +1,10 @@
-"""Motions that lie on the tracks, whatever the model says: where a force that is not small is begun to be followed.
+"""Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 
-Every trial's acceleration is a sum of splines, integrated twice from rest at its release and held against positions, as
-smooth as generalised cross-validation finds best (Wahba 1990, ch. 4). Nothing is read off it: the equation of motion
-is linear about this motion, and what it lacks there is a push like any other, so that noise in it is undone to first
-order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a large force it is not.
+The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
+with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4). The acceleration itself is not used as
+data: the equation of motion is linearised about this motion, and the defect there (what the model's forces lack) enters
+as one more known acceleration, so that noise in the smoothed motion cancels to first order (quasilinearisation, Bellman
+& Kalaba 1965). About the motion of a model that lacks a large force the linearisation would be poor.
 """
 
 from __future__ import annotations
@@ -15,29 +16,30 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_inversion import ForceFit
-from vinetrack.diagnosis.force_sensitivities import FittedMotion, with_derivatives
-from vinetrack.diagnosis.force_surface import curves
+from vinetrack.diagnosis.cubic_splines import uniform_splines
+from vinetrack.diagnosis.force_inversion import LinearInversion
+from vinetrack.diagnosis.force_sensitivities import FittedMotion, with_model_terms
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE
 
-PIECES = 20
-"""Splines of an acceleration, along the root of time: narrower where a vine gathers speed. Chosen: as many as forces
-along the growth of a condition have."""
+N_SPLINES = 20
+"""Splines of an acceleration, even in the square root of time and so denser where a vine accelerates. Chosen: as many
+as a force along the growth of one condition has."""
 
-SMOOTHNESS = np.geomspace(1e-8, 1e2, 21)
-"""Penalties tried, relative to what positions say. Chosen: from none that is felt to a straight line."""
+SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
+"""Penalties on second differences, relative to the information from positions. Chosen: from no visible smoothing to a
+straight line."""
 
-END = 0.96
-"""Part of the length up to which points count. Chosen as in `force_refinement`."""
+LAST_LENGTH_FRACTION = 0.96
+"""Part of the length up to which points are used. Chosen as in `force_refinement`."""
 
 
-def on_tracks(fit: ForceFit, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
-    """The motions moved onto their tracks, with what the model says along them.
+def on_tracks(inversion: LinearInversion, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
+    """Move motions onto their tracks and evaluate the model along them.
 
     Parameters
     ----------
-    fit : the trials.
+    inversion : holds the trials.
     trial_effects : array, shape (n_trials, 4)
         Their releases and origins.
     motions : sequence of FittedMotion
@@ -46,57 +48,59 @@ def on_tracks(fit: ForceFit, trial_effects: Floats, motions: Sequence[FittedMoti
     Returns
     -------
     list of FittedMotion
-        `actual` is the acceleration of the track, not that of the model.
+        `acceleration` is that of the track, not that of the model.
     """
-    return [_on_track(fit.data[i], trial_effects[i], motion) for i, motion in enumerate(motions)]
+    return [_on_track(inversion.data[i], trial_effects[i], motion) for i, motion in enumerate(motions)]
 
 
 def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
     since_s = data.time_s - trial_effects[RELEASE]
-    shown = data.lead_position_m - trial_effects[ORIGIN]
-    position_m = shown - np.interp(since_s, motion.time_s, motion.offset_m)
+    observed_m = data.lead_position_m - trial_effects[ORIGIN]
+    position_m = observed_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
     length_m = motion.trial.length_m
-    grows = (since_s > 0) & ~(position_m > END * length_m)
-    if np.count_nonzero(grows) <= 2:
+    growing = (since_s > 0) & ~(position_m > LAST_LENGTH_FRACTION * length_m)
+    if np.count_nonzero(growing) <= 2:
         return motion
     grid_s = motion.time_s
-    last_s = float(since_s[grows].max())
-    pieces = curves(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), PIECES)
-    speeds = _integrated(grid_s, pieces)
-    places = _integrated(grid_s, speeds)
-    k = np.clip(np.searchsorted(grid_s, since_s[grows]), 1, grid_s.size - 1)
-    part = ((since_s[grows] - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]))[:, None]
-    coefficients = _smooth(places[k - 1] + part * (places[k] - places[k - 1]), position_m[grows])
+    last_s = float(since_s[growing].max())
+    accelerations = uniform_splines(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), N_SPLINES)
+    velocities = _integrated(grid_s, accelerations)
+    positions = _integrated(grid_s, velocities)
+    k = np.clip(np.searchsorted(grid_s, since_s[growing]), 1, grid_s.size - 1)
+    part = ((since_s[growing] - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]))[:, None]
+    at_frames = positions[k - 1] + part * (positions[k] - positions[k - 1])
+    coefficients = _penalised_fit(at_frames, position_m[growing])
     r = motion.trial.travel_ratio
     moved = replace(
         motion,
-        lead_position_m=np.maximum.accumulate(np.maximum(places @ coefficients, 0.0)),
-        lead_velocity_m_s=np.maximum(speeds @ coefficients, 0.0),
-        actual=r * (pieces @ coefficients),
-        # Where the model would have ended is no end of the track: there, too, forces move it.
+        lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
+        lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
+        acceleration=r * (accelerations @ coefficients),
+        # The model's end of growth is not that of the track: the vine responds to forces beyond it.
         end_s=math.inf,
         counts_until_s=last_s,
     )
-    return with_derivatives(moved)
+    return with_model_terms(moved)
 
 
-def _integrated(at_s: Floats, columns: Floats) -> Floats:
-    """Integrals from the first time on, of the shape of `columns`."""
-    steps = 0.5 * (columns[1:] + columns[:-1]) * np.diff(at_s)[:, None]
+def _integrated(time_s: Floats, columns: Floats) -> Floats:
+    """Cumulative integrals of the columns by the trapezoidal rule, 0 at the first time."""
+    steps = 0.5 * (columns[1:] + columns[:-1]) * np.diff(time_s)[:, None]
     return np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def _smooth(design: Floats, values: Floats) -> Floats:
-    """Coefficients whose second differences are as small as generalised cross-validation finds best."""
-    bend = np.diff(np.eye(design.shape[1]), 2, axis=0)
-    square = design.T @ design
-    rough = float(np.trace(square)) / design.shape[1] * (bend.T @ bend + 1e-9 * np.eye(design.shape[1]))
+def _penalised_fit(design: Floats, values: Floats) -> Floats:
+    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
+    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
+    gram = design.T @ design
+    unit = float(np.trace(gram)) / design.shape[1]
+    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
     best: tuple[float, Floats] | None = None
-    for strength in SMOOTHNESS:
-        inverse = np.linalg.pinv(square + strength * rough, hermitian=True)
+    for penalty in SMOOTHING_PENALTIES:
+        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
         coefficients = inverse @ (design.T @ values)
-        freedom = min(float(np.trace(inverse @ square)), values.size - 1.0)
-        score = float(np.sum((values - design @ coefficients) ** 2)) / (values.size - freedom) ** 2
+        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
+        score = float(np.sum((values - design @ coefficients) ** 2)) / (values.size - degrees_of_freedom) ** 2
         if best is None or score < best[0]:
             best = score, coefficients
     assert best is not None

@@ -74,7 +74,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     if proposal.tied:
         best = proposal.tied[0]
         remark = f"{misses} law by {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
-        files.append((best.effect.path.name, effect_text(best.seen, remark)))
+        files.append((best.effect.path.name, effect_text(best.law, remark)))
     if proposal.table is not None:
         table = proposal.table
         remark = f"{misses} table, which was learned from them all, by {1e3 * table.rms_left_out_m:.2f} mm."
