@@ -35,15 +35,15 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
     growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
     steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
     force = -0.5 * np.outer(*steep).ravel()
-    effects = linear.fit.trial_effects
-    motions = on_tracks(linear.fit, effects, linear.motions)
-    place = SearchPoint(fit.solution.state.theta, effects, SmoothForce(domain, np.eye(domain.size)), force, motions)
-    settled = place
-    for _ in range(12):  # where a place far off the tracks is settled depends on where it begins
+    effects = linear.inversion.trial_effects
+    motions = on_tracks(linear.inversion, effects, linear.motions)
+    point = SearchPoint(fit.solution.state.theta, effects, SmoothForce(domain, np.eye(domain.size)), force, motions)
+    settled = point
+    for _ in range(12):  # where a point far off the tracks is settled depends on where it begins
         settled = _with_updated_motions(fit, settled)
     trial = 0
-    mine = place.theta.size + domain.size + trial * N_TRIAL_EFFECTS + PRESSURE
-    slope = normal_equations(fit, linear.fit, settled).slope[mine]
+    mine = point.theta.size + domain.size + trial * N_TRIAL_EFFECTS + PRESSURE
+    slope = normal_equations(fit, linear.inversion, settled).score[mine]
     costs = []
     for step in (-1e-4, 1e-4):
         effects = settled.trial_effects.copy()
@@ -51,15 +51,15 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
         moved = replace(settled, trial_effects=effects)
         for _ in range(3):
             moved = _with_updated_motions(fit, moved)
-        costs.append(normal_equations(fit, linear.fit, moved).cost)
+        costs.append(normal_equations(fit, linear.inversion, moved).cost)
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
 
 
 def test_a_force_moves_a_vine_that_grows_on_where_the_model_would_have_ended(slowed: tuple[Fit, LinearMisfit]) -> None:
     fit, linear = slowed
     early = [replace(motion, end_s=0.5 * float(motion.time_s[-1])) for motion in linear.motions]
-    effects = linear.fit.trial_effects
-    at_tracks = on_tracks(linear.fit, effects, early)
+    effects = linear.inversion.trial_effects
+    at_tracks = on_tracks(linear.inversion, effects, early)
     assert all(motion.end_s == math.inf for motion in at_tracks)
     answers = force_sensitivities(fit, effects, at_tracks, lambda motion: np.ones((motion.time_s.size, 1)))
     seen = 0

@@ -380,16 +380,13 @@ def _acceleration_derivatives(fit: Fit, point: SearchPoint) -> list[Floats]:
                 varied.append(job._replace(yield_pressure_Pa=job.yield_pressure_Pa + change))
             else:
                 k = layout.model.parameter_names.index(key)
-                factor = (
-                    number.from_scaled(at + DIFFERENCE_STEP) / number.from_scaled(at) if number.logarithmic else 0.0
-                )
-                changed = job.row[k] * factor if number.logarithmic else job.row[k] + change
-                varied.append(_with_parameter(job, k, changed))
-        affected = [
-            fit.predictor.has_pressure_deviation[i],
-            fit.predictor.has_damping_deviation[i],
-            *[True] * len(layout.keys),
-        ]
+                if number.logarithmic:
+                    factor = number.from_scaled(at + DIFFERENCE_STEP) / number.from_scaled(at)
+                    varied.append(_with_parameter(job, k, job.row[k] * factor))
+                else:
+                    varied.append(_with_parameter(job, k, job.row[k] + change))
+        has_deviation = (fit.predictor.has_pressure_deviation[i], fit.predictor.has_damping_deviation[i])
+        affected = [*has_deviation, *[True] * len(layout.keys)]
         columns = [
             (_acceleration(fit, point, motion, changed_job) - motion.model_acceleration) / DIFFERENCE_STEP
             if affects and changed_job is not job

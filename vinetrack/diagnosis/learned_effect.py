@@ -78,7 +78,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
     axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
     counts = " × ".join(str(count) for count in domain.counts)
     parts = [
-        f'"""Learned force: a table over {variables}, without a law.\n',
+        f'"""Learned force: a table over {variables}, no law.\n',
         *textwrap.wrap(remark, 118),
         "" if remark else None,
         *textwrap.wrap(learned.sentence, 118),

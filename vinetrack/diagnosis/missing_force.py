@@ -289,7 +289,7 @@ def _sentence(laws: Sequence[RankedLaw], depends_on: Mapping[str, float], misfit
     if not best.is_detected and math.isfinite(misfit_reduction):
         return "What is missing is no simple law of force that single trials agree on."
     if not best.is_detected:
-        return "No further force on the tail can be distinguished from the differences between single trials."
+        return "No further force on the tail is significant beyond the scatter between trials."
     if best.explained < LEAST_EXPLAINED_TO_NAME:
         return _no_law_sentence(best, depends_on)
     # Misfit that not even a free force takes away limits how well laws can be told apart.
