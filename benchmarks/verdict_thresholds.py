@@ -49,7 +49,7 @@ THRESHOLDS = (
         for name in ("ANSWER_SET_DELTA_CHI2", "MAX_INFLATION", "CREDIBLE_RANGE_FACTOR", "MIN_SIZE_SIGMAS")
     ),
     *(("selection", name) for name in ("CLEAR_SCORE_EXCESS", "STALLED_CHI2_SHARE", "PARTIAL_SHARE")),
-    ("weighing", "RANGE_EDGE_DISTANCE"),
+    ("plausibility_prior", "RANGE_EDGE_DISTANCE"),
     *(("candidate_fits", name) for name in ("MIN_SHARE_OF_SUBSET_GAIN", "LINEAR_REACH")),
     *(("between_trials", name) for name in ("MIN_LINEAR_GAIN", "PLAUSIBLE_DRIFT", "SYSTEMATICS_CHECK_P_VALUE")),
     ("contradictions", "CONTRADICTING_DRIFT_SIGMAS"),

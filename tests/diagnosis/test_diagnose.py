@@ -259,4 +259,4 @@ def test_a_measured_pressure_already_holds_what_happens_in_the_chamber() -> None
     ]
     found = vt.diagnose(pairs, ladder=False, advice=False)
     blind = {one.effect: one.reason for one in found.rounds[0].ranking if one.status == NOT_TESTABLE}
-    assert "already holds it" in blind["reservoir_depletion"]
+    assert "already includes it" in blind["reservoir_depletion"]

@@ -19,7 +19,7 @@ from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.film_allowance import film_gain
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_nothing, _in_sigmas, answer_set
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_none, _in_sigmas, answer_set
 from vinetrack.diagnosis.multi_start import distinct_starts, start_values
 from vinetrack.effects import catalogue
 from vinetrack.inference.systematics import FILM_ERROR
@@ -100,9 +100,9 @@ def test_a_size_that_is_something_in_one_vine_is_something(answered):
     after = vt.refit(answered[1].fits[0], answered[1].fits[0].model + "film_mass")
     first, second = (number for number in after.numbers if number.key == "film_mass.eps")
     nothing = replace(first, value=0.1 * first.sigma)
-    assert not _compatible_with_nothing((FILM,), _numbers(after, nothing, second))
+    assert not _compatible_with_none((FILM,), _numbers(after, nothing, second))
     again = replace(second, value=0.1 * second.sigma)
-    assert "compatible with none" in _compatible_with_nothing((FILM,), _numbers(after, nothing, again))
+    assert "compatible with none" in _compatible_with_none((FILM,), _numbers(after, nothing, again))
 
 
 def test_film_gains_what_a_fit_with_free_film_gains_less_its_prior(answered):

@@ -85,6 +85,6 @@ def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_bette
         SelectionStep("missing", questions, (slack,), (slack,), (), slack.names),
         SelectionStep("adequate", questions),
     ]
-    monkeypatch.setattr("vinetrack.diagnosis.selection._slack", lambda *_: steps)
+    monkeypatch.setattr("vinetrack.diagnosis.selection._slack_rounds", lambda *_: steps)
     named = select_effects(found, effects, lambda _: None)[0].answer_names
     assert named == (("tail_friction",) if suspect else ("tail_slack",))

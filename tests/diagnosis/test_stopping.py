@@ -83,7 +83,7 @@ def test_a_smaller_risk_asks_for_more() -> None:
 
 def test_a_richer_form_of_the_same_name_is_no_rival() -> None:
     given = diagnosis()
-    richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason="it holds leak as a limit")
+    richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason="it contains leak as a limit")
     first = replace(given.rounds[0], ranking=(*given.rounds[0].ranking, richer))
     assert look_at(replace(given, rounds=(first, given.rounds[1])), 12, 0.03).decision == STOP
 

@@ -1,4 +1,4 @@
-"""What may be missing: the candidates of a diagnosis, in which shapes each is tried, and which cannot be tested."""
+"""Candidates of a diagnosis: which effects the trials can test, and in which shapes each is tried."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import group_names
 
 WIDE_RANGE = 10.0
-"""Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
-linear scale meets every size within a factor of two."""
+"""Ratio of the ends of a plausible range from which values are tried in geometric steps. Chosen: within a factor of ten
+a linear scale meets every size within a factor of two."""
 
 NARROW_RANGE, BELOW_RANGE_FACTOR = 2.0, 3.0
-"""Where plausible values differ by more than the first, an effect may be smaller than them by the second. Chosen: a
-narrow plausible range would else exclude small sizes."""
+"""Where the ends of a plausible range differ by more than the first factor, a size may lie below it by the second.
+Chosen: such a range is no reason to exclude small sizes."""
 
 AMPLITUDES = (0.03, 0.2, 0.7)
-"""Fractions of the plausible range at which an effect is tried whose small sizes do nothing. Chosen: near nothing,
-small, large."""
+"""Fractions of the plausible range at which an effect is tried that has no response to an infinitesimal size. Chosen:
+near zero, small, large."""
 
 THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
-"""The same for a threshold: its answer jumps, and a start too far below or above leads nowhere. Chosen: steps of about
-1.3, less than the width of the jump."""
+"""The same for an effect with a threshold: its response jumps, and a fit started too far below or above does not
+converge. Chosen: steps of about 1.3, less than the width of the jump."""
 
 RANGE_SHARE_BESIDE_SLIP = 0.5
-"""Part of its plausible range that an error may have beside a slip. Chosen: both at once are rare; at twice film that
-is 60 % too heavy would pass for half of its thickness, at half a tube measured flat that is 2 % off would be missed."""
+"""Fraction of the plausible range within which a size may differ from that of a slip in the sheet. Chosen: a slip and a
+large error together are rare; at twice film that is 60 % too heavy would pass for half of its thickness, at half a tube
+measured flat that is 2 % off would be missed."""
 
 TUBE_ONLY_COLUMNS = {
     "length_mm": "a tube",
@@ -43,16 +44,16 @@ TUBE_ONLY_COLUMNS = {
     "inlet_mm": "the gas of a chamber",
     "yield_pressure_kPa": "a tube under pressure",
 }
-"""Columns that only a tube fills, and what an effect that needs them acts on."""
+"""Columns that only a tube has, and what an effect that needs them acts on."""
 
 
 @dataclass(frozen=True)
 class CandidateShape:
-    """One way to try an effect: its first parameter is the size, the others are held at `other_values`.
+    """An effect in the form in which its size is tested: the first parameter is the size, the others are fixed.
 
-    `step` is how much of the size is put in to see what it does; a `whole` one is a size in itself, because small
-    sizes of this effect do something else or nothing. With `group`, it acts on the trials of that vine or day alone,
-    and `other_groups` are those without it.
+    The others are fixed at `other_values`. `step` is the step of the size in the finite difference. Where `whole`, the
+    step is a finite size, because the effect has no or another response to small sizes. With `group`, the effect acts
+    on the trials of that vine or day only; `other_groups` are those without it.
     """
 
     effect: Effect
@@ -64,17 +65,17 @@ class CandidateShape:
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Parameters of the effect with the step put in."""
+        """Parameter values with the size one step from zero."""
         return (self.size.zero + self.step, *self.other_values) if self.effect.parameters else ()
 
     @property
     def size(self) -> Parameter:
-        """The parameter that makes it large or small."""
+        """The parameter that is the size of the effect."""
         return self.effect.parameters[0]
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
-    """Candidates that the sheet lets act, and for the others the reason why not, by name.
+    """Candidates that these trials can test, and for the others the reason why not.
 
     Parameters
     ----------
@@ -83,11 +84,11 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
 
     Returns
     -------
-    able : tuple of Effect
+    testable : tuple of Effect
     reasons : dict
-        By name of the others.
+        Why each of the others cannot be tested, by name.
     """
-    able, reasons = [], {}
+    can_act, reasons = [], {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
         if no_tube and (absent := [column for column in effect.needs if column in TUBE_ONLY_COLUMNS]):
@@ -96,7 +97,7 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
             )
             continue
         if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
-            reasons[effect.name] = "the measured pressure already holds it"
+            reasons[effect.name] = "the measured pressure already includes it"
             continue
         if "trace_time" in effect.functions and all(trial_data.trace is None for trial_data in data):
             reasons[effect.name] = "it needs a pressure measured during growth, and no trial has one"
@@ -112,21 +113,21 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
             blank = " and ".join(f"`{column}`" for column in effect.needs)
             reasons[effect.name] = f"it needs {blank}, which the sheet leaves blank for some trials"
             continue
-        able.append(effect)
-    return tuple(able), reasons
+        can_act.append(effect)
+    return tuple(can_act), reasons
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
-    """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it.
+    """Shapes in which an effect is tried: every combination of typical values of its shape parameters.
 
-    One whose size each vine or day has for itself is tried in all alike, and in each of several alone.
+    An effect whose size may differ between vines or days is tried with one size for all, and in each group alone.
 
     Parameters
     ----------
     effect
         An effect of the catalogue or of the user.
     trials : sequence of Trial
-        Those that are asked about.
+        The trials of the fit.
 
     Returns
     -------
@@ -150,14 +151,14 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
 
 
 def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
-    """An effect at finite sizes of its plausible range.
+    """Shapes of an effect at finite sizes within its plausible range.
 
     Parameters
     ----------
     effect
         An effect of the catalogue or of the user.
     other_values : sequence of tuple of float
-        Values of the parameters behind the first, SI; several are tried.
+        Values of the parameters after the first, SI, one tuple for each combination.
 
     Returns
     -------
@@ -166,20 +167,22 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
-    parts = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else AMPLITUDES
+    fractions = THRESHOLD_AMPLITUDES if "rest_force" in effect.functions else AMPLITUDES
     return [
-        CandidateShape(effect, values, part * (largest - zero), whole=True) for values in other_values for part in parts
+        CandidateShape(effect, values, fraction * (largest - zero), whole=True)
+        for values in other_values
+        for fraction in fractions
     ]
 
 
 def _first_step(size: Parameter) -> float:
-    """A size small against what is plausible."""
+    """A size small compared with the plausible range."""
     low, high = plausible_range(size)
     return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
-    """Range that an experimenter would expect; where the effect does not say, a factor of three about its default.
+    """Plausible range of a parameter; where the effect states none, three times its default on either side of zero.
 
     Parameters
     ----------
@@ -198,7 +201,7 @@ def plausible_range(parameter: Parameter) -> tuple[float, float]:
 
 
 def _typical_values(parameter: Parameter) -> tuple[float, ...]:
-    """Values that the effect names; else three that span what is plausible, two where that is narrow."""
+    """Values that the effect names; else three that span the plausible range, or its middle where that is narrow."""
     if parameter.tried:
         return parameter.tried
     low, high = plausible_range(parameter)
@@ -206,11 +209,11 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
     if low > 0 and high / low < NARROW_RANGE:
         return ((low + high) / 2,)
-    return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
+    return tuple((low + fraction * (high - low)) for fraction in (0.15, 0.5, 0.85))
 
 
 def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0) -> tuple[float, str] | None:
-    """The slip in the sheet that a size is that of, but for an ordinary error beside it.
+    """Find the common slip in the sheet that would produce a fitted size, up to an ordinary error.
 
     Parameters
     ----------
@@ -219,27 +222,25 @@ def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 
     value, sigma : float
         Size, a relative error, and its standard error.
     reach : float
-        Standard errors by which what is left may lie outside of its range.
+        Standard errors by which the remaining error may lie outside its range.
 
     Returns
     -------
     (float, str) or None
-        Size that the slip leaves, and what was done; None where the size is that of none.
+        Size that the slip produces, and what was done; None where no slip fits.
     """
     if parameter.plausible is None:
         return None
     low, high = (RANGE_SHARE_BESIDE_SLIP * end for end in parameter.plausible)
-    for size, done in parameter.slips:
-        left, room = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
-        if low - room <= left <= high + room:
-            return size, done
+    for size, action in parameter.slips:
+        remaining, margin = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
+        if low - margin <= remaining <= high + margin:
+            return size, action
     return None
 
 
 def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, no further outside than `reach` of its errors, or is that of a slip.
-
-    `widened` is how many times further from zero it may lie.
+    """Whether a value lies in the plausible range, within `reach` standard errors of it, or is that of a slip.
 
     Parameters
     ----------
@@ -248,9 +249,9 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     value, sigma : float, SI
         Size and its standard error.
     reach : float
-        Standard errors by which a value may lie outside.
+        Standard errors by which a value may lie outside the range.
     widened : float
-        How many times further from zero it may lie.
+        Factor by which the range is widened.
 
     Returns
     -------
@@ -268,5 +269,5 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     if low > 0 and high / low > NARROW_RANGE:
         low /= BELOW_RANGE_FACTOR
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)
-    room = reach * sigma if math.isfinite(sigma) else math.inf
-    return bool(low - room <= value <= high + room)
+    margin = reach * sigma if math.isfinite(sigma) else math.inf
+    return bool(low - margin <= value <= high + margin)

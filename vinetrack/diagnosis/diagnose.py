@@ -322,7 +322,7 @@ def _promised(finding: SelectionStep, name: str, z: float) -> float:
 def _holds(effect: Effect, finding: SelectionStep) -> str:
     """That an effect contains one that was found, where it does: it can be no worse, and need not be tried."""
     held = [name for name in effect.replaces if name in finding.answer_names]
-    return f"it holds {held[0]} as a limit" if held else ""
+    return f"it contains {held[0]} as a limit" if held else ""
 
 
 def _behind(finding: SelectionStep, name: str) -> str:

@@ -1,18 +1,19 @@
-"""A test of all candidates at once that gives each of them an equal share of the false alarms.
+"""Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
 
-A candidate that is tried in many shapes has many chances to stand out, a candidate of one shape has one. Held against
-one threshold for all scores, the first takes most of the false alarms and lifts the threshold of the second. So the
-largest score of every candidate becomes its own p-value, and the family is tested by the least of them (min-p;
-Westfall & Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold that it alone exceeds
-with probability q, and q is such that any of them exceeds its own with probability `level`.
+A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
+for all scores the first would take most of the false alarms and raise the threshold of the second. The largest score of
+each candidate is therefore converted to a p-value of its own, and the family is tested by the smallest (min-p; Westfall
+& Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold that it alone exceeds with
+probability q, and q is such that any candidate exceeds its own with probability `level`.
 
-Probabilities that any of many correlated normal scores exceeds its threshold come from importance sampling (Adler,
-Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its own tail, drawn
-beyond its threshold, and the others given it; with N the number that exceed theirs then,
+The probability that any of many correlated normal scores exceeds its threshold is found by importance sampling (Adler,
+Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail probability
+and drawn beyond its threshold, and the others are drawn conditionally on it. With N the number of scores that exceed
+their thresholds,
 
     P(any) = Σ_j P(j) · E[1 / N],
 
-as exact at a chance of one in a million as at one in ten.
+with the same relative accuracy at a probability of one in a million as at one in ten.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from scipy.special import ndtr, ndtri
 from vinetrack.core.records import Floats
 
 DRAWS, SEED = 2000, 20
-"""Draws of the scores. Measured: with 2000 the thresholds of 13 to 134 shapes differ by 0.01 standard deviations from
-seed to seed (tests/diagnosis/test_family_test.py)."""
+"""Draws of the scores, and the seed. Measured: with 2000 the thresholds of 13 to 134 shapes differ by 0.01 standard
+deviations from seed to seed (tests/diagnosis/test_family_test.py)."""
 
 NODES = 6
-"""Thresholds at which a candidate's own chance is worked out, linear between them in ln p over z². Chosen: steps of a
-quarter of a standard deviation, where what is left of curvature is a thousandth of ln p."""
+"""Thresholds at which a candidate's exceedance probability p is computed; ln p is interpolated linearly in z². Chosen:
+steps of a quarter of a standard deviation, where the remaining curvature is a thousandth of ln p."""
 
 HALVINGS = 30
-"""Derived: halvings of the range of ln q, which spans less than 10, down to 1e-8."""
+"""Bisection steps for ln q. Derived: its range spans less than 10 and is reduced to 1e-8."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class FamilyTest:
     thresholds: Mapping[str, float]
 
     def threshold(self, name: str) -> float:
-        """The threshold of a candidate; of one without shapes, that of a single score of either sign.
+        """Threshold of a candidate; of one without shapes, that of a single two-sided score.
 
         Parameters
         ----------
@@ -66,54 +67,55 @@ class FamilyTest:
 
     @property
     def single_shape_threshold(self) -> float:
-        """Threshold of a candidate that is tried in one shape, of either sign."""
+        """Threshold of a candidate with one shape and a size of either sign (two-sided)."""
         return -float(ndtri(self.candidate_level / 2))
 
 
 class _Scores:
-    """Correlated normal scores that count in one direction or in both, and how likely they exceed thresholds."""
+    """Correlated normal scores, one-sided or two-sided, and the probability that any exceeds its threshold."""
 
     def __init__(self, cosines: Floats, signs: Sequence[int]) -> None:
-        self.live = np.diag(cosines) > 0
+        self.informative = np.diag(cosines) > 0
         self.cosines, self.signs = cosines, np.array(signs)
         values, vectors = np.linalg.eigh(cosines)
         draw = np.random.default_rng(SEED)
         self.normal = draw.standard_normal((DRAWS, len(signs))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        self.beyond, self.coin = draw.random(DRAWS), draw.choice([-1.0, 1.0], DRAWS)
-        self.picks = (np.arange(DRAWS) + 0.5) / DRAWS
-        self.picks = draw.permutation(self.picks)
+        self.tail_uniform, self.random_sign = draw.random(DRAWS), draw.choice([-1.0, 1.0], DRAWS)
+        self.choice_uniform = (np.arange(DRAWS) + 0.5) / DRAWS
+        self.choice_uniform = draw.permutation(self.choice_uniform)
 
-    def chance(self, places: NDArray[np.intp], thresholds: Floats) -> float:
-        """Chance that any score at these places exceeds its threshold."""
-        signs = self.signs[places]
+    def exceedance(self, indices: NDArray[np.intp], thresholds: Floats) -> float:
+        """Probability that any of these scores exceeds its threshold."""
+        signs = self.signs[indices]
         tails = ndtr(-thresholds)
         weights = np.where(signs == 0, 2.0, 1.0) * tails
         total = float(weights.sum())
-        if len(places) == 1 or total == 0:
+        if len(indices) == 1 or total == 0:
             return total
-        chosen = np.minimum(np.searchsorted(np.cumsum(weights) / total, self.picks), len(places) - 1)
-        side = np.where(signs[chosen] == 0, self.coin, signs[chosen])
-        scores = self.normal[:, places]
-        new = -ndtri(self.beyond * tails[chosen]) * side
-        shift = new - scores[np.arange(DRAWS), chosen]
-        scores = scores + self.cosines[np.ix_(places, places)][chosen] * shift[:, None]
+        chosen = np.minimum(np.searchsorted(np.cumsum(weights) / total, self.choice_uniform), len(indices) - 1)
+        side = np.where(signs[chosen] == 0, self.random_sign, signs[chosen])
+        scores = self.normal[:, indices]
+        beyond = -ndtri(self.tail_uniform * tails[chosen]) * side
+        shift = beyond - scores[np.arange(DRAWS), chosen]
+        # The other scores move with the chosen one by their correlation with it.
+        scores = scores + self.cosines[np.ix_(indices, indices)][chosen] * shift[:, None]
         exceed = np.where(signs == 0, np.abs(scores), scores * signs) > thresholds
         return total * float(np.mean(1.0 / np.maximum(exceed.sum(axis=1), 1)))
 
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
-    """Work out the threshold of every candidate.
+    """Compute the threshold of every candidate.
 
     Parameters
     ----------
     cosines : array, shape (n_shapes, n_shapes)
         Correlations of the scores.
     signs : sequence of int
-        Sign of each size, 0 where it may have either.
+        Sign of each size, 0 where it may have either (two-sided).
     effects : sequence of str
         Name of the effect of each shape.
     level : float
-        Chance that any candidate exceeds its threshold where nothing is missing.
+        Probability that any candidate exceeds its threshold where nothing is missing.
 
     Returns
     -------
@@ -122,36 +124,36 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
     if not effects:
         return FamilyTest(level, level, {})
     scores = _Scores(cosines, signs)
-    of = np.array(effects)
-    places = {name: np.flatnonzero((of == name) & scores.live) for name in dict.fromkeys(effects)}
-    places = {name: where for name, where in places.items() if where.size}
-    if not places:
+    names = np.array(effects)
+    shapes = {name: np.flatnonzero((names == name) & scores.informative) for name in dict.fromkeys(effects)}
+    shapes = {name: indices for name, indices in shapes.items() if indices.size}
+    if not shapes:
         return FamilyTest(level, level, {})
-    tables = {name: _own_chances(scores, where, level, len(places)) for name, where in places.items()}
-    everywhere = np.concatenate(list(places.values()))
+    tables = {name: _exceedance_table(scores, indices, level, len(shapes)) for name, indices in shapes.items()}
+    all_shapes = np.concatenate(list(shapes.values()))
 
-    def thresholds(log_share: float) -> dict[str, float]:
-        squares = {name: float(np.interp(-log_share, -logs, nodes)) for name, (nodes, logs) in tables.items()}
+    def thresholds(log_q: float) -> dict[str, float]:
+        squares = {name: float(np.interp(-log_q, -logs, nodes)) for name, (nodes, logs) in tables.items()}
         return {name: math.sqrt(square) for name, square in squares.items()}
 
-    low, high = math.log(level / len(places)), math.log(level)
+    low, high = math.log(level / len(shapes)), math.log(level)
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        each = thresholds(middle)
-        asked = np.concatenate([np.full(where.size, each[name]) for name, where in places.items()])
-        low, high = (middle, high) if scores.chance(everywhere, asked) < level else (low, middle)
+        by_name = thresholds(middle)
+        by_shape = np.concatenate([np.full(indices.size, by_name[name]) for name, indices in shapes.items()])
+        low, high = (middle, high) if scores.exceedance(all_shapes, by_shape) < level else (low, middle)
     return FamilyTest(level, math.exp(low), thresholds(low))
 
 
 def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
-    """Chance that any candidate stands out as far as the one that does so most: the p-value of the family.
+    """Family-wise p-value of the most significant candidate.
 
     Parameters
     ----------
     cosines, signs, effects
         As in `family_test`.
     observed : array, shape (n_shapes,)
-        Scores where they count in their direction, 0 where they do not.
+        Scores in the direction that their sign allows, 0 in the other.
 
     Returns
     -------
@@ -159,23 +161,32 @@ def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str]
         1 where there is no candidate. Below 1e-12 it is no more than an order of magnitude.
     """
     scores = _Scores(cosines, signs) if effects else None
-    if scores is None or not scores.live.any():
+    if scores is None or not scores.informative.any():
         return 1.0
-    of = np.array(effects)
-    places = [where for name in dict.fromkeys(effects) if (where := np.flatnonzero((of == name) & scores.live)).size]
-    alone = [scores.chance(where, np.full(where.size, max(float(observed[where].max()), 0.0))) for where in places]
-    least = min(alone)
-    limits = []
-    for where in places:
-        nodes, logs = _own_chances(scores, where, least, len(places))
-        limits.append(math.sqrt(float(np.interp(-math.log(max(least, 1e-300)), -logs, nodes))))
-    asked = np.concatenate([np.full(where.size, limit) for where, limit in zip(places, limits, strict=True)])
-    return min(scores.chance(np.concatenate(places), asked), 1.0)
+    names = np.array(effects)
+    shapes = [
+        indices
+        for name in dict.fromkeys(effects)
+        if (indices := np.flatnonzero((names == name) & scores.informative)).size
+    ]
+    p_values = [
+        scores.exceedance(indices, np.full(indices.size, max(float(observed[indices].max()), 0.0)))
+        for indices in shapes
+    ]
+    smallest = min(p_values)
+    thresholds = []
+    for indices in shapes:
+        nodes, logs = _exceedance_table(scores, indices, smallest, len(shapes))
+        thresholds.append(math.sqrt(float(np.interp(-math.log(max(smallest, 1e-300)), -logs, nodes))))
+    by_shape = np.concatenate([np.full(k.size, threshold) for k, threshold in zip(shapes, thresholds, strict=True)])
+    return min(scores.exceedance(np.concatenate(shapes), by_shape), 1.0)
 
 
-def _own_chances(scores: _Scores, places: NDArray[np.intp], level: float, candidates: int) -> tuple[Floats, Floats]:
-    """Squares of thresholds of a candidate, increasing, and ln of the chance at which it exceeds each."""
-    most = 2.0 * len(places) * candidates
-    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / most)), NODES)
-    chances = [scores.chance(places, np.full(places.size, node)) for node in nodes]
-    return nodes**2, np.log(np.maximum(chances, 1e-300))
+def _exceedance_table(
+    scores: _Scores, indices: NDArray[np.intp], level: float, candidates: int
+) -> tuple[Floats, Floats]:
+    """Squares of thresholds of a candidate, increasing, and ln of the probability that it exceeds each."""
+    n_tests = 2.0 * len(indices) * candidates
+    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / n_tests)), NODES)
+    probabilities = [scores.exceedance(indices, np.full(indices.size, node)) for node in nodes]
+    return nodes**2, np.log(np.maximum(probabilities, 1e-300))

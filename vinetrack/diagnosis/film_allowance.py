@@ -1,9 +1,9 @@
-"""How much likelier a hypothesis would be if the film weighed a little other than the sheet says.
+"""Gain of a hypothesis if the film mass of each vine is a nuisance parameter.
 
-Which of two effects is likelier may hang on the mass of the film: a drag on film that is 1.5 % lighter than stated was
-less likely than a wrong scale, by Δχ² 27. So what is as likely as the best with the film of every vine free, within
-what nobody knows it better than, is not excluded. Whether anything is missing at all is asked without: there the film
-is a hypothesis of its own, `film_mass`.
+Which of two effects is likelier may depend on the mass of the film: a drag on film that is 1.5 % lighter than stated
+was less likely than a wrong scale, by Δχ² 27. A hypothesis is therefore not excluded if it is as likely as the best
+with the film mass of every vine free within its usual error. The tests of whether anything is missing use the stated
+mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vinetrack.inference.systematics import film_errors
 
 
 def film_gain(fit: Fit) -> float:
-    """Fall of −2 ln L with the film of each vine off by ε ~ N(0, `FILM_ERROR`), by linear algebra.
+    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`) of each vine's film mass, by linear algebra.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def film_gain(fit: Fit) -> float:
     Returns
     -------
     float
-        At least 0; 0 for a fit that is far off, has film of free mass already, or feels none.
+        At least 0; 0 for a fit that is far off, has a free film mass already, or does not depend on it.
     """
     if FILM in fit.model or is_poor_fit(fit.predictor, fit.solution):
         return 0.0
@@ -40,7 +40,7 @@ def film_gain(fit: Fit) -> float:
 
 
 def _deviance(solution: Solution, base: Solution) -> float:
-    """−2 ln L of a solution, its numbers and the spreads between trials that `base` estimates at their best."""
+    """−2 ln L of a solution, maximised over its parameters and the between-trial standard deviations of `base`."""
     part, problem, state = (
         marginal(solution.cross_products, solution.problem, solution.state),
         solution.problem,

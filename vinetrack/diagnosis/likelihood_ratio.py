@@ -1,4 +1,7 @@
-"""What refits say: by how much each hypothesis is better, what it needs for that, and whether that can be believed."""
+"""Likelihood ratios of refitted hypotheses, the plausibility of their sizes, and the answer set.
+
+The answer set holds every hypothesis that the data cannot exclude.
+"""
 
 from __future__ import annotations
 
@@ -11,42 +14,42 @@ from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.film_allowance import film_gain
+from vinetrack.diagnosis.plausibility_prior import log_evidence, posterior_weights, prior_penalty
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
-from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_penalty
 from vinetrack.effects import Effect
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 
 ANSWER_SET_DELTA_CHI2 = 9.0
-"""Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
+"""A hypothesis whose −2 ln L lies within this of the best cannot be excluded. Derived: three standard deviations."""
 
 MAX_INFLATION = 6.0
-"""How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little.
-Chosen: at half fewer differences count as scatter, at twice weak effects are missed."""
+"""Upper limit of the variance inflation, the observed scatter of trials over that of the noise model: a larger value
+from few trials is unreliable. Chosen: at half fewer differences count as scatter, at twice weak effects are missed."""
 
 CREDIBLE_RANGE_FACTOR = 3.0
-"""How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag.
-Chosen: plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
+"""Multiple of its plausible range within which a size is still credible: a drag that needs C_D 17 is no drag. Chosen:
+plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
 
 MIN_SIZE_SIGMAS = 1.0
-"""A size below this many of its own errors is none. Chosen: an effect that a likelihood ratio finds at 4 σ has a size
-of about 4 errors, unless its size and shape cannot be told apart; at half, C = 0.0000057 ± 0.0000095 N would pass, at
-twice, effects whose size and shape are correlated would be lost."""
+"""A size below this many of its standard errors is compatible with zero. Chosen: an effect that a likelihood ratio
+finds at 4 σ has a size of about 4 standard errors, unless size and shape are confounded; at half, C = 0.0000057 ±
+0.0000095 N would pass, at twice, effects whose size and shape are correlated would be lost."""
 
 SAME_CURVE_DISTANCE = 4.0
-"""Squared distance, in units of the noise, below which what two hypotheses predict is the same curve. Derived: two
-standard deviations of one number."""
+"""Squared distance of two predictions, in units of the noise, below which they count as the same curve. Derived: two
+standard deviations of one parameter."""
 
 
 @dataclass(frozen=True)
 class LikelihoodRatio:
-    """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
+    """A hypothesis compared with the fit without it: the effects it adds, its own fit, and the likelihood ratio.
 
-    `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
-    where trials scatter more than the model of the noise says. A size beyond what is `plausible` is said to be so; one
-    not even `credible`, several times beyond, loses a tie and is no explanation. `inflation` is how many times more the
-    sizes scatter than the model of the noise says, in variance, at least 1: by so much differences of −2 ln L do, too.
+    `delta_chi2` is the fall of −2 ln L, `sigma` the same in standard deviations, reduced where trials scatter more than
+    the noise model predicts. Sizes outside their range are not `plausible`; sizes several times outside it are not
+    `credible`, and the hypothesis is no explanation. `reason` states why. `inflation` (at least 1) is the variance of
+    the sizes from the scatter of trials over that of the noise model; differences of −2 ln L are inflated alike.
     """
 
     effects: tuple[Effect, ...]
@@ -57,31 +60,32 @@ class LikelihoodRatio:
     reason: str
     credible: bool = True
     inflation: float = 1.0
-    prior_penalty: float = 0.0  #: by how much its sizes lie beyond what is plausible, on the scale of −2 ln L
-    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.weighing`
+    prior_penalty: float = 0.0  #: penalty of sizes outside their plausible range, on the scale of −2 ln L
+    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.plausibility_prior`
     film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.film_allowance`
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the effects it adds."""
+        """Names of the effects that it adds."""
         return tuple(effect.name for effect in self.effects)
 
     @property
     def label(self) -> str:
-        """Names joined, by which it is kept."""
+        """Names of the effects, joined by `+`."""
         return "+".join(self.names)
 
     @property
     def log_bayes(self) -> float:
-        """Logarithm of its marginal likelihood over that of the fit without it, as far as trials bear it out.
+        """Logarithm of the Bayes factor against the fit without it, with the likelihood ratio reduced by `inflation`.
 
-        Shared numbers are at their best in both; what it brings pays for itself, see `vinetrack.diagnosis.weighing`.
+        Shared parameters are at their maximum likelihood in both; those added are integrated over their priors, see
+        `vinetrack.diagnosis.plausibility_prior`.
         """
         return 0.5 * self.delta_chi2 / self.inflation + self.log_evidence - self.fit.log_likelihood
 
     @property
     def numbers(self) -> tuple[Number, ...]:
-        """Its sizes; numbers that move no trajectory are left out."""
+        """Fitted sizes of its effects, without those that no trajectory depends on."""
         return tuple(
             number
             for number in self.fit.numbers
@@ -90,11 +94,11 @@ class LikelihoodRatio:
 
     @property
     def others(self) -> tuple[Number, ...]:
-        """All other numbers of its fit."""
+        """All other parameters of its fit."""
         return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
 
     def deviance_excess(self, other: LikelihoodRatio) -> float:
-        """By how much it is worse than another, in −2 ln L.
+        """−2 ln L of this hypothesis minus that of another.
 
         Parameters
         ----------
@@ -125,7 +129,7 @@ def best_of(hypotheses: Iterable[LikelihoodRatio]) -> LikelihoodRatio:
 def likelihood_ratio(
     before: Fit, effects: Sequence[Effect], after: Fit, *, widened_by: Collection[str] | None = None
 ) -> LikelihoodRatio:
-    """Hold a refit against the fit without the effects.
+    """Compare a refit with the fit without the effects.
 
     Parameters
     ----------
@@ -136,26 +140,26 @@ def likelihood_ratio(
     after
         The fit with them.
     widened_by : collection of str, optional
-        Names as of `robust_ratio` whose scatter from trial to trial takes away from significance; by default those of
-        the effects.
+        Names, as in `robust_ratio`, of the sizes whose scatter between trials reduces the significance; by default
+        those of the effects.
 
     Returns
     -------
     LikelihoodRatio
     """
-    fall = 2 * (after.log_likelihood - before.log_likelihood)
+    delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
     plausible, reason = plausibility(effects, after)
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
-    nothing = _compatible_with_nothing(effects, after)
+    compatible_with_none = _compatible_with_none(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
         fit=after,
-        delta_chi2=fall,
-        sigma=_in_sigmas(fall, effects, after) / ratio,
+        delta_chi2=delta_chi2,
+        sigma=_in_sigmas(delta_chi2, effects, after) / ratio,
         plausible=plausible,
-        reason=nothing or reason,
-        credible=not nothing and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
+        reason=compatible_with_none or reason,
+        credible=not compatible_with_none and plausibility(effects, after, CREDIBLE_RANGE_FACTOR)[0],
         inflation=min(ratio**2, MAX_INFLATION),
         prior_penalty=prior_penalty(after, parameters),
         log_evidence=log_evidence(after, parameters),
@@ -163,45 +167,42 @@ def likelihood_ratio(
     )
 
 
-def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
-    """That a size is nothing, or smaller than its own error, in words; blank where none is.
+def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> str:
+    """Say that a fitted size is smaller than its standard error; blank where none is.
 
-    Such a fit is better by the shape that its other numbers give it, not by an effect of which anything is known.
+    Such a fit is better because of the parameters that shape the effect, and its size is not determined.
     """
     for effect in effects:
-        # Differences between groups are contrasts: each group's own may be uncertain where their differences are not.
+        # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
         for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
             key = f"{effect.name}.{parameter.name}"
-            known = [number for number in after.numbers if number.key == key and math.isfinite(number.sigma)]
-            # Where each vine has a size of its own, one that is not nothing is enough.
-            away = [abs(number.value - parameter.zero) / number.sigma for number in known if number.sigma > 0]
-            if away and max(away) < MIN_SIZE_SIGMAS:
-                number = known[0]
+            numbers = [number for number in after.numbers if number.key == key and math.isfinite(number.sigma)]
+            # Where each vine has its own size, one that differs from zero is enough.
+            sigmas = [abs(number.value - parameter.zero) / number.sigma for number in numbers if number.sigma > 0]
+            if sigmas and max(sigmas) < MIN_SIZE_SIGMAS:
+                number = numbers[0]
                 return f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
     return ""
 
 
-def _in_sigmas(fall: float, effects: Sequence[Effect], after: Fit) -> float:
-    """A fall of −2 ln L in standard deviations of a normal deviate that is as rare, by Wilks' theorem.
+def _in_sigmas(delta_chi2: float, effects: Sequence[Effect], after: Fit) -> float:
+    """Convert Δχ² to the normal deviate of the same tail probability, by Wilks' theorem.
 
-    One number for each effect, whatever shapes it has; but where each vine or day has a size of its own, as many.
+    One degree of freedom, whatever shapes the effects have; but where each vine or day has its own size, one for each.
     """
     grouped = {f"{effect.name}.{p.name}" for effect in effects for p in effect.parameters if p.shared != "all"}
     count = sum(number.key in grouped for number in after.numbers)
-    if count < 2 or fall <= 0:
-        return math.copysign(math.sqrt(abs(fall)), fall)
-    # Where the chance underflows, the first terms of its asymptotic series: Abramowitz & Stegun 6.5.32.
-    a, x = 0.5 * count, 0.5 * fall
-    chance = float(gammaincc(a, x))
-    if chance > 0:
-        log_chance = math.log(chance)
-    else:
-        log_chance = (a - 1) * math.log(x) - x - math.lgamma(a) + math.log1p((a - 1) / x)
-    return max(float(-ndtri_exp(log_chance - math.log(2))), 0.0)
+    if count < 2 or delta_chi2 <= 0:
+        return math.copysign(math.sqrt(abs(delta_chi2)), delta_chi2)
+    # Where the tail probability underflows, the first terms of its asymptotic series: Abramowitz & Stegun 6.5.32.
+    a, x = 0.5 * count, 0.5 * delta_chi2
+    p = float(gammaincc(a, x))
+    log_p = math.log(p) if p > 0 else (a - 1) * math.log(x) - x - math.lgamma(a) + math.log1p((a - 1) / x)
+    return max(float(-ndtri_exp(log_p - math.log(2))), 0.0)
 
 
 def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
-    """Whether the fitted sizes are plausible, and why not.
+    """Whether the fitted sizes are plausible, and if not, why.
 
     Parameters
     ----------
@@ -209,13 +210,13 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
     after
         The fit with them.
     widened : float
-        Factor by which plausible ranges are stretched.
+        Factor by which plausible ranges are widened.
 
     Returns
     -------
     plausible : bool
     reason : str
-        Blank where they are.
+        Blank where they are plausible.
     """
     for effect in effects:
         for parameter in effect.parameters:
@@ -223,9 +224,9 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
                 if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
                     continue
                 low, high = parameter.plausible or (math.nan, math.nan)
-                # At its bound, beyond what is plausible, it wants more than any rig has, whatever its error says.
-                pressed = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
-                if pressed or not is_plausible(parameter, number.value, number.sigma, widened=widened):
+                # At a bound outside the plausible range the size is implausible whatever its standard error.
+                at_implausible_bound = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
+                if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
                     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                     needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"
                     return False, f"{needs}, and {low:.3g} to {high:.3g} is plausible"
@@ -233,7 +234,7 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:
-    """How much larger the error of a size is by the scatter of trials than by the noise model; at least 1.
+    """Ratio of the standard error of a size from the scatter of trials to that from the noise model; at least 1.
 
     Parameters
     ----------
@@ -245,45 +246,46 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     Returns
     -------
     float
-        The largest of all of them.
+        The largest ratio of all these sizes.
     """
     if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
     matrices = robust_covariance(after.predictor, after.solution)
     plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
-    mine = [
+    chosen = [
         k
         for k, number in enumerate(after.numbers)
         if (number.key.split(".")[0] in names or number.key in names) and plain[k] > 0
     ]
-    return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
+    return max([1.0, *(float(robust[k] / plain[k]) for k in chosen)])
 
 
 def _distance(fit: Fit, other: Fit) -> float:
-    """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
+    """Squared distance of the predictions of two fits, whitened by the AR(1) noise of the first."""
     rho = fit.noise_correlation
     total = 0.0
     data = fit.predictor.data
     for a, b, variance, trial_data in zip(fit.trials, other.trials, fit.solution.state.variance, data, strict=True):
-        gap = a.predicted_position_m - b.predicted_position_m
+        difference = a.predicted_position_m - b.predicted_position_m
         if trial_data.relative_sd is not None:
-            gap = gap / trial_data.relative_sd
-        total += float(np.sum((gap[1:] - rho * gap[:-1]) ** 2) + (1 - rho**2) * gap[0] ** 2) / float(variance)
+            difference = difference / trial_data.relative_sd
+        innovations = difference[1:] - rho * difference[:-1]
+        total += float(np.sum(innovations**2) + (1 - rho**2) * difference[0] ** 2) / float(variance)
     return total
 
 
 def _complexity(hypothesis: LikelihoodRatio) -> int:
-    """Parameters that its effects bring."""
+    """Number of parameters of its effects."""
     return sum(len(effect.parameters) for effect in hypothesis.effects)
 
 
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
-    """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
+    """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words.
 
-    Excluded is what is worse by 9 than the best, in −2 ln L both with film as stated and with film that weighs a little
-    other (`film_gain`), as far as the scatter of trials bears it out, plus what its sizes lie beyond the plausible
-    (`prior_penalty`). Set aside are those that hold a simpler one as a limit and are no
-    better by 9 than it, and those that need a size beyond what is plausible where another does not.
+    A hypothesis is excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best, both
+    with the film mass as stated and with the film mass free (`film_gain`). The penalty of its sizes (`prior_penalty`)
+    is added. Among the others, rejected are those that contain a simpler one as a limit and fit no better than it by 9,
+    and those of incredible sizes where another has credible ones.
 
     Parameters
     ----------
@@ -292,39 +294,43 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
     Returns
     -------
-    kept : list of LikelihoodRatio
-    aside : dict
-        Reason by label.
+    members : list of LikelihoodRatio
+    rejected : dict
+        Reason by label; hypotheses excluded by their likelihood alone are not listed.
     """
-    highest = best_of(hypotheses)
+    best = best_of(hypotheses)
 
     film_alone = [-2 * ratio.fit.log_likelihood for ratio in hypotheses if ratio.names == (FILM,)]
-    off = {ratio.label: -2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses}
-    lowest_off = min(off.values())
+    film_free = {ratio.label: -2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses}
+    lowest_film_free = min(film_free.values())
 
-    def behind(hypothesis: LikelihoodRatio) -> float:
-        as_stated = hypothesis.deviance_excess(highest)
-        # Beside film that is off, an effect has to gain something itself.
-        gained = film_alone[0] - off[hypothesis.label] if film_alone else math.inf
-        needed = gained > ANSWER_SET_DELTA_CHI2 * highest.inflation
-        return min(as_stated, off[hypothesis.label] - lowest_off if needed else math.inf) / highest.inflation
+    def excess(hypothesis: LikelihoodRatio) -> float:
+        """Deviance above the best one's over its inflation, with the film mass as stated or free, the smaller."""
+        as_stated = hypothesis.deviance_excess(best)
+        # With the film mass free, the effect must still improve on a wrong film mass alone.
+        gain_over_film = film_alone[0] - film_free[hypothesis.label] if film_alone else math.inf
+        effect_needed = gain_over_film > ANSWER_SET_DELTA_CHI2 * best.inflation
+        with_film_free = film_free[hypothesis.label] - lowest_film_free if effect_needed else math.inf
+        return min(as_stated, with_film_free) / best.inflation
 
-    likely = [hypothesis for hypothesis in hypotheses if behind(hypothesis) <= ANSWER_SET_DELTA_CHI2]
+    likely = [hypothesis for hypothesis in hypotheses if excess(hypothesis) <= ANSWER_SET_DELTA_CHI2]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
 
-    def misfit(hypothesis: LikelihoodRatio) -> float:
-        return behind(hypothesis) + hypothesis.prior_penalty
+    def penalised(hypothesis: LikelihoodRatio) -> float:
+        return excess(hypothesis) + hypothesis.prior_penalty
 
-    lowest = min(misfit(ratio) for ratio in likely)
-    near = [ratio for ratio in likely if misfit(ratio) - lowest <= ANSWER_SET_DELTA_CHI2]
-    aside = {
-        ratio.label: ratio.reason or "its size lies beyond what is plausible" for ratio in likely if ratio not in near
+    lowest = min(penalised(ratio) for ratio in likely)
+    plausible = [ratio for ratio in likely if penalised(ratio) - lowest <= ANSWER_SET_DELTA_CHI2]
+    rejected = {
+        ratio.label: ratio.reason or "its size lies outside the plausible range"
+        for ratio in likely
+        if ratio not in plausible
     }
-    kept = []
-    for ratio in near:
+    members = []
+    for ratio in plausible:
         simpler = [
             other
-            for other in near
+            for other in plausible
             if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET_DELTA_CHI2
             and _complexity(other) < _complexity(ratio)
             and (
@@ -333,29 +339,30 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             )
         ]
         if simpler:
-            aside[ratio.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
+            rejected[ratio.label] = f"it contains {simpler[0].names[-1]} as a limit and fits no better"
         else:
-            kept.append(ratio)
-    credible = [hypothesis for hypothesis in kept if hypothesis.credible]
-    if credible and len(credible) < len(kept):
-        aside |= {hypothesis.label: hypothesis.reason for hypothesis in kept if not hypothesis.credible}
-        kept = credible
-    return kept, aside
+            members.append(ratio)
+    credible = [hypothesis for hypothesis in members if hypothesis.credible]
+    if credible and len(credible) < len(members):
+        rejected |= {hypothesis.label: hypothesis.reason for hypothesis in members if not hypothesis.credible}
+        members = credible
+    return members, rejected
 
 
 def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
-    """Whether curves that agree mean that one is a limit of the other.
+    """Whether equal predictions mean that one hypothesis is a limit of the other.
 
-    With the deviation of B and pressure that every trial has, all hypotheses about levels of trials predict one curve.
+    They do not for differences between trials: as every trial has its deviations of B and pressure, all of these
+    predict the same curves.
     """
     return all(ratio.effects[-1].kind != BETWEEN_TRIALS for ratio in (hypothesis, other))
 
 
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
-    """Posterior weights of hypotheses by label; they add up to 1 over these.
+    """Posterior probabilities of hypotheses by label, equally likely beforehand; they add up to 1.
 
-    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation. The film of
-    the vines is free within `systematics.FILM_ERROR` of what is stated.
+    ln L is divided by the best one's inflation. The film mass of each vine is free within `systematics.FILM_ERROR` of
+    the stated value.
 
     Parameters
     ----------
@@ -378,6 +385,6 @@ def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
 
 
 def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
-    """Whether an effect of one says that it contains that of the other."""
+    """Whether an effect of one declares that it contains an effect of the other (`replaces`)."""
     replaced = {name for effect in hypothesis.effects for name in effect.replaces}
     return bool(replaced & set(other.names))

@@ -11,9 +11,9 @@ exceeds that of every other by
     Z_Y / Z_T ≥ (m − 1)/risk,
 
 so that, whichever of them is true, another is named with at most that risk, by Bonferroni's inequality. Marginal
-likelihoods are those of `weighing`, with plausible ranges as priors, brought down by what trials scatter more than the
-noise model says. Numbers that all hypotheses share are at their best values in each, so the bound holds for campaigns
-that pin them, not to the letter for the first few trials: a campaign never stops before `FEWEST_TRIALS`.
+likelihoods are those of `plausibility_prior`, with plausible ranges as priors, brought down by what trials scatter more
+than the noise model says. Numbers that all hypotheses share are at their best values in each, so the bound holds for
+campaigns that pin them, not to the letter for the first few trials: a campaign never stops before `FEWEST_TRIALS`.
 
 A truth that is in no list breaks the bound's premise. Of that speaks the diagnosis: a name stops a campaign only where
 nothing is left beside it.
@@ -180,7 +180,7 @@ def _rivals(step: Round, best: Candidate) -> list[tuple[float, str]]:
     """
     ratios = []
     for rival in step.ranking:
-        richer = rival.reason.startswith(f"it holds {best.effect} as a limit")
+        richer = rival.reason.startswith(f"it contains {best.effect} as a limit")
         if rival.effect == best.effect or rival.status == NOT_TESTABLE or richer:
             continue
         if rival.status == REFITTED and rival.posterior_weight > 0:

@@ -1,6 +1,6 @@
-"""Whether anything that a smooth force could explain is left beside a fit: score tests of probe forces, all together.
+"""Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
 
-Probes are bumps of force along the growth, over speed and over time; what they find needs no name in a catalogue.
+Probes are bumps of force along the growth, over speed and over time.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.systematics import Systematics
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
-"""Probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
+"""Number of probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
 
 MIN_INFORMATION_SHARE = 1e-4
-"""Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own.
-Chosen: a hundredth of its amplitude."""
+"""Smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of freedom. Chosen:
+a hundredth of the amplitude."""
 
 
 def _probe_shapes(fit: Fit) -> list[CandidateShape]:
@@ -53,7 +53,7 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 
 @dataclass(frozen=True)
 class Structure:
-    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`.
+    """Result of the probes: χ² of their scores for `degrees` of freedom, its p-value `p`, and the same as a `z`.
 
     `smallest_probe_p` is the smallest p-value of single probes, Bonferroni-corrected: a narrow feature shows in one
     probe and is diluted in the sum over all.
@@ -67,16 +67,17 @@ class Structure:
 
 
 def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
-    """Whether anything that a smooth force could explain is left beside a fit.
+    """Test a fit for misfit that a smooth force could explain.
 
-    All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
+    The scores of all probes are tested together, with both kinds of error, in the directions that the fitted parameters
+    leave to them.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    columns : its own, from `fit_columns`.
+    fit : the fit of the model.
+    columns : of the fit, from `fit_columns`.
     systematics : Systematics
-        What trials err by together.
+        Shared systematic errors of the trials.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) 
 
 
 def structure_from_scores(scores: Scores) -> Structure:
-    """What the scores of probes amount to together, and the largest of them alone; see `structure_of`.
+    """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`.
 
     Parameters
     ----------
@@ -103,22 +104,24 @@ def structure_from_scores(scores: Scores) -> Structure:
     from scipy.stats import norm, t
 
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
-    live = np.diag(scores.information) > 0
-    information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
-    score = (scores.score / root)[live]
+    informative = np.diag(scores.information) > 0
+    information = (scores.information / root[:, None] / root)[np.ix_(informative, informative)]
+    score = (scores.score / root)[informative]
     values, vectors = np.linalg.eigh(information)
     keep = values > MIN_INFORMATION_SHARE * values.max(initial=0.0)
-    along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
-    turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
-    single = scores.scores[:, live] @ turn
-    explained = np.einsum("jk,njl,lk->nk", turn, scores.informations[:, live][:, :, live], turn) * along
-    robust = cluster_variance(single - explained, scores.degrees)
-    chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
+    # In the principal directions the scores are uncorrelated and have variance 1 by the noise model.
+    z = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
+    directions = (vectors / root[informative][:, None])[:, keep] / np.sqrt(values[keep])
+    trial_z = scores.scores[:, informative] @ directions
+    trial_informations = scores.informations[:, informative][:, :, informative]
+    explained = np.einsum("jk,njl,lk->nk", directions, trial_informations, directions) * z
+    robust = cluster_variance(trial_z - explained, scores.degrees)
+    chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
-    # A probe that few trials feel has as few degrees of freedom, however many there are in all.
-    each = np.einsum("njj->nj", scores.informations)[:, live]
-    felt = each.sum(axis=0) ** 2 / np.maximum(np.sum(each**2, axis=0), 1e-300)
-    chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
-    smallest_probe_p = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
+    # A probe to which few trials respond has as few degrees of freedom (effective number of trials).
+    by_trial = np.einsum("njj->nj", scores.informations)[:, informative]
+    n_effective = by_trial.sum(axis=0) ** 2 / np.maximum(np.sum(by_trial**2, axis=0), 1e-300)
+    p_values = 2 * t.sf(np.abs(scores.z[informative]), np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0)))
+    smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
     return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), smallest_probe_p)

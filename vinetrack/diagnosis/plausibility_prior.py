@@ -1,13 +1,13 @@
-"""Hypotheses weighed with what an experimenter expects of their sizes: priors from plausible ranges.
+"""Priors from plausible ranges, and the marginal likelihoods and posterior probabilities of hypotheses with them.
 
 A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4:
-the range holds 95 % of it. With a likelihood that is normal about its best value θ̂ with covariance Σ, the marginal
+the range holds 95 % of it. With a likelihood that is normal about its maximum θ̂ with covariance Σ, the marginal
 likelihood of a hypothesis is
 
     ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
 
-which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). A hypothesis
-pays for every number it brings, by ln(σ/τ), and for sizes beyond its range. What all hypotheses share cancels.
+which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). Each parameter
+of a hypothesis costs ln(σ/τ), and sizes outside the range cost more. What all hypotheses share cancels.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Fit, Number
 
 RANGE_EDGE_DISTANCE = 4.0
-"""Squared distance from the middle of a plausible range, in standard deviations of its prior, that is no surprise:
-the edge of the range."""
+"""Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
+penalised. Derived: the edge of the range."""
 
 
 def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
-    """Mean and standard deviation of the prior that a plausible range stands for, in the parameter's unit.
+    """Mean and standard deviation of the prior of a plausible range, in the parameter's unit.
 
-    That of a size which a slip in the sheet leaves lies about that size: the error beside it is an ordinary one.
+    A size that a common slip in the sheet would produce has its prior about that size, as wide as ordinary errors.
     """
     low, high = plausible_range(parameter)
     mean, sd = 0.5 * (low + high), 0.25 * (high - low)
@@ -39,7 +39,7 @@ def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
 
 
 def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """By how much sizes lie beyond what is plausible, on the scale of −2 ln L; 0 inside the plausible ranges.
+    """Penalty of sizes outside their plausible ranges, on the scale of −2 ln L; 0 inside.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     Notes
     -----
     Each size's squared distance from the middle of its range over σ² + τ², less that at the edge of the range. A size
-    that is hardly known (σ ≫ τ) is no surprise wherever it lies.
+    of large standard error (σ ≫ τ) has no penalty wherever it lies.
     """
     total = 0.0
     for number in fit.numbers:
@@ -69,9 +69,9 @@ def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
 
 def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant that all about the same trials share.
+    """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant common to all fits of the same trials.
 
-    Numbers that no trajectory answers to, or whose error is open, keep their prior: they cost nothing.
+    Parameters that no trajectory depends on, or that have no finite standard error, keep their prior and cost nothing.
 
     Parameters
     ----------
@@ -83,24 +83,24 @@ def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     -------
     float
     """
-    places, means, sds = [], [], []
+    indices, means, sds = [], [], []
     for k, number in enumerate(fit.numbers):
         parameter = parameters.get(number.key)
         if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
             mean, sd = _prior_of(parameter, number)
             if sd > 0:
-                places.append(k)
+                indices.append(k)
                 means.append(mean)
                 sds.append(sd)
-    if not places:
+    if not indices:
         return fit.log_likelihood
-    values = np.array([fit.numbers[k].value for k in places])
+    values = np.array([fit.numbers[k].value for k in indices])
     scale = np.array(sds)
-    covariance = fit.covariance[np.ix_(places, places)] / scale[:, None] / scale
-    away = (values - np.array(means)) / scale
-    wide = covariance + np.eye(len(places))
-    occam = 0.5 * (_log_det(covariance) - _log_det(wide))
-    return float(fit.log_likelihood + occam - 0.5 * away @ np.linalg.solve(wide, away))
+    covariance = fit.covariance[np.ix_(indices, indices)] / scale[:, None] / scale
+    deviation = (values - np.array(means)) / scale
+    predictive = covariance + np.eye(len(indices))
+    occam = 0.5 * (_log_det(covariance) - _log_det(predictive))
+    return float(fit.log_likelihood + occam - 0.5 * deviation @ np.linalg.solve(predictive, deviation))
 
 
 def _log_det(matrix: Floats) -> float:
@@ -108,7 +108,7 @@ def _log_det(matrix: Floats) -> float:
 
 
 def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
-    """Posterior probabilities of hypotheses that were equally likely beforehand; they add up to 1.
+    """Posterior probabilities of hypotheses of equal prior probability; they add up to 1.
 
     Parameters
     ----------

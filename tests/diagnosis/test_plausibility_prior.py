@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_penalty
+from vinetrack.diagnosis.plausibility_prior import log_evidence, posterior_weights, prior_penalty
 from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
 
@@ -21,7 +21,7 @@ GAUGE = Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))
 
 @dataclass
 class KnownFit:
-    """What weighing asks of a fit."""
+    """What these functions read of a fit."""
 
     numbers: tuple[Number, ...]
     log_likelihood: float = -10.0
