@@ -161,12 +161,12 @@ def noise_in_motion_p(fit: Fit) -> float:
             or trial_data.noise_m**2 < variance_floor([trial_data])[0]
         ):
             continue
-        rest = _stretch_sums(trial.whitened[: trial_data.n_rest])
-        if rest.size < 2:
+        standstill = _stretch_sums(trial.whitened[: trial_data.n_rest])
+        if standstill.size < 2:
             continue
-        at_rest.append((rest - rest.mean()) * math.sqrt(rest.size / (rest.size - 1)))
+        at_rest.append((standstill - standstill.mean()) * math.sqrt(standstill.size / (standstill.size - 1)))
         in_motion.append(_stretch_sums(trial.whitened[trial_data.n_rest :]))
-        rest_degrees += rest.size - 1
+        rest_degrees += standstill.size - 1
     if rest_degrees < MIN_STRETCHES:
         return 1.0
     still, moving = np.concatenate(at_rest), np.concatenate(in_motion)
