@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 from chrome import Chrome
 from served import Served, Visitor
 
-from vinetrack.explorer.choice import first_choice, sized
+from vinetrack.explorer.choice import choice_in_use, sized_model
 from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import errors_m, follow
+from vinetrack.explorer.curves import errors_m, simulate_curves
 
 SIZE = "size_reservoir_depletion.gamma"
 
@@ -38,11 +38,11 @@ def redraws_ms(visitor: Visitor, moves: int) -> list[float]:
 def computed_ms(results: Path) -> tuple[int, float]:
     """Trials, and the median time in which the curves and errors of all follow."""
     campaign = open_campaign(results)
-    start = first_choice(campaign).with_effect("reservoir_depletion")
+    start = choice_in_use(campaign).with_effect("reservoir_depletion")
     curves, spent = None, []
     for k in range(22):
         begun = time.perf_counter()
-        curves = follow(campaign, sized(campaign, start.with_size(SIZE[5:], 1.1 + 0.01 * k)), curves)
+        curves = simulate_curves(campaign, sized_model(campaign, start.with_size(SIZE[5:], 1.1 + 0.01 * k)), curves)
         errors_m(campaign, curves)
         spent.append(1e3 * (time.perf_counter() - begun))
     return len(campaign.trials), statistics.median(spent[2:])

@@ -71,7 +71,7 @@ def test_what_cannot_be_done_is_one_sentence(copied: tuple[Path, Path], tmp_path
     assert "is no folder" in refused("explore", tmp_path / "nowhere")
     assert "did you mean air_drag?" in refused("explore", results, "--add", "air_drg", "--save")
     assert "is one of the base effects" in refused("explore", results, "--drop", "gravity", "--save")
-    assert "is no form of export" in refused("explore", results, "--export", tmp_path / "a.doc")
+    assert "is no export format" in refused("explore", results, "--export", tmp_path / "a.doc")
     experiment.rename(tmp_path / "moved")
     assert "has moved: say where it is with --experiment" in refused("explore", results, "--save")
     assert "Saved" in run("explore", results, "--experiment", tmp_path / "moved", "--save")

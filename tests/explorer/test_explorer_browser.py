@@ -82,7 +82,7 @@ def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -
     before = errors(visitor)
     visitor.click("tick_reservoir_depletion", "input")
     visitor.until("$status.text.includes('refitting')", "progress", 20)
-    visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 number more')", "the fit", 240)
+    visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 parameter more')", "the fit", 240)
     # Of the mean square error that replicates do not explain, a tenth is left at most.
     beyond = np.mean(before**2) - np.mean(floors(visitor) ** 2)
     assert np.mean(errors(visitor) ** 2) - np.mean(floors(visitor) ** 2) < 0.1 * beyond

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import first_choice
+from vinetrack.explorer.choice import choice_in_use
 from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.fitting import (
     FAULT,
@@ -18,10 +18,10 @@ from vinetrack.explorer.fitting import (
     FitJob,
     FitProgress,
     Fitted,
+    correlated_pairs_text,
     first_fit,
     fit_choice,
-    gained_words,
-    tied_words,
+    likelihood_change_text,
 )
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
@@ -32,7 +32,7 @@ GAMMA = "reservoir_depletion.gamma"
 
 @pytest.fixture(scope="module")
 def first(campaign: Campaign) -> Fitted:
-    return first_fit(campaign, first_choice(campaign))
+    return first_fit(campaign, choice_in_use(campaign))
 
 
 def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted) -> None:
@@ -51,7 +51,7 @@ def test_other_starts_are_tried_where_the_first_leads_not_to_the_known_fit(
         return first.fit
 
     monkeypatch.setattr("vinetrack.explorer.fitting.fit", fitted)
-    first_fit(replace(campaign, log_likelihood=known), first_choice(campaign))
+    first_fit(replace(campaign, log_likelihood=known), choice_in_use(campaign))
     assert seen == asked
 
 
@@ -68,10 +68,10 @@ def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campa
     floor = overall_m(campaign.floors_m, campaign.conditions)
     assert after < 0.5 * before
     assert after < 1.3 * floor
-    assert gained_words(first.fit, found.fit).endswith("for 1 number more.")
-    assert "fell" in gained_words(first.fit, found.fit)
+    assert likelihood_change_text(first.fit, found.fit).endswith("for 1 parameter more.")
+    assert "fell" in likelihood_change_text(first.fit, found.fit)
     back = fit_choice(campaign, found.fit, found.choice.with_effect("reservoir_depletion", False))
-    assert "rose" in gained_words(found.fit, back.fit)
+    assert "rose" in likelihood_change_text(found.fit, back.fit)
     assert overall_m(back.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
 
 
@@ -83,11 +83,11 @@ def test_a_bad_beginning_is_left_behind(campaign: Campaign, first: Fitted) -> No
 
 
 def test_numbers_that_hang_together_are_named(first: Fitted) -> None:
-    lines = tied_words(first.fit)
+    lines = correlated_pairs_text(first.fit)
     assert all("correlation" in line for line in lines)
     tied = replace(first.fit, covariance=first.fit.covariance * 0 + 1.0)
-    assert len(tied_words(tied)) == len(tied.numbers) * (len(tied.numbers) - 1) // 2
-    assert tied_words(tied)[0].endswith("+1.00")
+    assert len(correlated_pairs_text(tied)) == len(tied.numbers) * (len(tied.numbers) - 1) // 2
+    assert correlated_pairs_text(tied)[0].endswith("+1.00")
 
 
 class Heard:
@@ -99,7 +99,7 @@ class Heard:
         self.reasons: list[str] = []
 
     def job(self, work: object) -> FitJob:
-        return FitJob(work, told=self.steps.append, done=self.found.append, failed=self.reasons.append)  # type: ignore[arg-type]
+        return FitJob(work, on_progress=self.steps.append, on_success=self.found.append, on_failure=self.reasons.append)  # type: ignore[arg-type]
 
 
 def test_a_job_tells_and_ends(campaign: Campaign, first: Fitted) -> None:
@@ -122,7 +122,7 @@ def test_a_job_that_is_given_up_is_heard_of_no_more() -> None:
 
     job = heard.job(endless)
     begun.wait(10)
-    job.give_up()
+    job.cancel()
     assert not job.running
     job.wait(10)
     count = len(heard.steps)
@@ -144,23 +144,23 @@ def test_a_job_that_fails_says_why_in_a_sentence(error: Exception, said: str) ->
 
 
 def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
-    ground = BackgroundFit(campaign)
+    background = BackgroundFit(campaign)
     news: list[bool] = []
 
     def hear() -> None:
-        news.append(ground.fitted is not None)
+        news.append(background.fitted is not None)
 
-    ground.listen(hear)
-    ground.begin().wait(120)
-    assert ground.trouble == ""
-    assert not ground.growing
-    assert ground.curves is not None
-    assert ground.fitted is not None
-    assert ground.step is not None
+    background.add_listener(hear)
+    background.begin().wait(120)
+    assert background.failure == ""
+    assert not background.running
+    assert background.curves is not None
+    assert background.fitted is not None
+    assert background.step is not None
     assert len(news) > 2
     assert news[-1]
-    ground.forget(hear)
-    ground.forget(hear)
+    background.remove_listener(hear)
+    background.remove_listener(hear)
 
 
 def test_what_a_person_waits_for_only_ever_comes_nearer() -> None:
@@ -169,12 +169,13 @@ def test_what_a_person_waits_for_only_ever_comes_nearer() -> None:
     assert waiting.state(100.5, "refitting")[1] == "refitting · 0.5 s"
     shares = []
     for k, promised in enumerate((5e4, 300.0, 800.0, 2.0, 1e-3)):
-        waiting.reach(Step(k + 1, {}, promised))
+        waiting.update(Step(k + 1, {}, promised))
         shares.append(waiting.state(101.0, "refitting")[0])
     assert shares == sorted(shares)
     assert 0 < shares[0] < 0.1
     assert shares[-1] == 0.97
-    waiting.reach(Step(9, {}, 123.0))
-    assert waiting.state(101.0, "refitting")[1] == "refitting · step 9 · the next lowers −2 ln L by 1.2e+02 · 1.0 s"
+    waiting.update(Step(9, {}, 123.0))
+    text = waiting.state(101.0, "refitting")[1]
+    assert text == "refitting · step 9 · the next step lowers −2 ln L by 1.2e+02 · 1.0 s"
     waiting.end("The fit was stopped.")
-    assert waiting.words == "The fit was stopped."
+    assert waiting.message == "The fit was stopped."

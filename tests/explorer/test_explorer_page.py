@@ -21,16 +21,16 @@ GAMMA = "size_reservoir_depletion.gamma"
 
 
 @pytest.fixture(scope="module")
-def ground(campaign: Campaign) -> BackgroundFit:
+def background(campaign: Campaign) -> BackgroundFit:
     grown = BackgroundFit(campaign).begin()
     grown.wait(240)
-    assert grown.trouble == ""
+    assert grown.failure == ""
     return grown
 
 
 @pytest.fixture
-def browser(ground: BackgroundFit) -> Iterator[Browser]:
-    opened = Browser(ground)
+def browser(background: BackgroundFit) -> Iterator[Browser]:
+    opened = Browser(background)
     yield opened
     opened.page.close()
 
@@ -57,7 +57,7 @@ def test_a_slider_puts_its_effect_in_and_moves_the_curves(browser: Browser) -> N
     browser.turn()
     assert browser.model("tick_reservoir_depletion").active
     assert [list(part) for part in browser.model("model_curves").data["ys"]] != before
-    # Words follow in a turn of their own: see WORDS_MS.
+    # Words follow in a turn of their own: see TEXT_DELAY_MS.
     browser.turn()
     assert "reservoir depletion" in browser.text("headline")
     assert "--set reservoir_depletion.gamma=1.2" in browser.text("commands")
@@ -102,16 +102,16 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) 
     gamma, *sigma = re.findall(r"[\d.]+", found)[:2]
     # 1.4 is what the trials were grown with, and the largest that a gas can have.
     assert (gamma, "at its bound" in found) == ("1.4", True) or abs(float(gamma) - 1.4) < 2 * float(sigma[0]) < 0.03
-    assert "for 1 number more" in browser.text("numbers")
+    assert "for 1 parameter more" in browser.text("numbers")
     assert "vinetrack add reservoir_depletion" in browser.text("commands")
     assert browser.text("status") == ""
     browser.click("hold")
     browser.model(GAMMA).value = 1.2
     browser.turn()
     browser.turn()
-    assert "Sizes were moved since" in browser.text("numbers")
+    assert "Sizes were changed since" in browser.text("numbers")
     assert "held" in browser.text("numbers")
-    assert browser.model("hold").label == "Let go"
+    assert browser.model("hold").label == "Release"
     browser.click("as_fitted")
     browser.turn()
     assert browser.model("tick_reservoir_depletion").active
@@ -131,7 +131,7 @@ def test_moving_a_size_ends_a_fit_that_is_under_way(browser: Browser) -> None:
     browser.model("tick_supply_refill").active = True
     browser.model("size_air_drag.C_D").value = 2.0
     assert browser.model("refit").label == "Refit"
-    assert "given up" in browser.text("status")
+    assert "cancelled" in browser.text("status")
 
 
 def test_of_a_track_only_the_page_says_so_and_shows_where_the_edge_was(browser: Browser) -> None:
@@ -153,7 +153,7 @@ def test_of_a_track_only_the_page_says_so_and_shows_where_the_edge_was(browser: 
 @pytest.mark.parametrize(("form", "head"), [("csv", b"model,condition"), ("svg", b"<?xml"), ("png", b"\x89PNG")])
 def test_figure_and_data_can_be_taken_along(browser: Browser, form: str, head: bytes) -> None:
     browser.click(f"export_{form}")
-    given = browser.page.keep._download.data
+    given = browser.page.save_panel._download.data
     assert given["name"] == [f"vines_explorer.{form}"]
     assert base64.b64decode(given["body"][0]).startswith(head)
 
@@ -162,7 +162,7 @@ def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_
     experiment = tmp_path / "vines"
     shutil.copytree(campaign.experiment.folder, experiment)
     page = Browser(BackgroundFit(open_campaign(campaign.folder, experiment)).begin())
-    page.page.ground.wait(240)
+    page.page.background.wait(240)
     page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
     page.model("tick_reservoir_depletion").active = True
     page.click("save")
@@ -177,14 +177,14 @@ def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_
     page.page.close()
 
 
-def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: BackgroundFit, tmp_path: Path) -> None:
+def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: BackgroundFit, tmp_path: Path) -> None:
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)
     own = BackgroundFit(open_campaign(folder, campaign.experiment.folder))
-    own.curves, own.errors_m, own.fitted = ground.curves, ground.errors_m, ground.fitted
+    own.curves, own.errors_m, own.fitted = background.curves, background.errors_m, background.fitted
     page = Browser(own)
     write_diagnosis(folder)
-    page.page._look_again()
+    page.page._check_for_diagnosis()
     assert "Cannot be told apart: <b>reservoir depletion, leak</b>" in page.text("tied")
     assert "+0.97" in page.text("tied")
     assert "chamber of 4 L" in page.text("next")
@@ -210,7 +210,7 @@ def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
         raise SimulationError("Trial a: too hard.")
 
     before = error_of(browser)
-    monkeypatch.setattr("vinetrack.explorer.page.follow", refuse)
+    monkeypatch.setattr("vinetrack.explorer.page.simulate_curves", refuse)
     browser.model(GAMMA).value = 1.1
     browser.turn()
     assert "too hard" in browser.text("status")
@@ -218,11 +218,13 @@ def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
 
 
 def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
-    from vinetrack.explorer.choice import chosen, first_choice
+    from vinetrack.explorer.choice import choice_from_options, choice_in_use
 
-    ground = BackgroundFit(campaign, chosen(campaign, first_choice(campaign), ["leak"], [], ["leak.rate=0.2"])).begin()
-    ground.wait(240)
-    page = Browser(ground)
+    background = BackgroundFit(
+        campaign, choice_from_options(campaign, choice_in_use(campaign), ["leak"], [], ["leak.rate=0.2"])
+    ).begin()
+    background.wait(240)
+    page = Browser(background)
     page.turn()
     assert page.model("tick_leak").active
     assert page.model("size_leak.rate").value == pytest.approx(0.2)
@@ -231,9 +233,9 @@ def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
 
 
 def test_a_page_opened_as_the_command_does_shows_the_fit_and_no_size_that_was_moved(campaign: Campaign) -> None:
-    from vinetrack.explorer.choice import first_choice
+    from vinetrack.explorer.choice import choice_in_use
 
-    grown = BackgroundFit(campaign, first_choice(campaign)).begin()
+    grown = BackgroundFit(campaign, choice_in_use(campaign)).begin()
     grown.wait(240)
     page = Browser(grown)
     page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))

@@ -47,9 +47,9 @@ def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
 def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
     """A page of it, and what it has opened instead."""
     reopened: list[BackgroundFit] = []
-    ground = BackgroundFit(unexplained).begin()
-    ground.wait(240)
-    browser = Browser(ground, reopened.append)
+    background = BackgroundFit(unexplained).begin()
+    background.wait(240)
+    browser = Browser(background, reopened.append)
     yield browser, reopened
     browser.page.close()
 
@@ -77,7 +77,7 @@ def test_the_effect_proposed_is_opened_fitted_and_saved_with_its_file(
     assert browser.model("propose_panel").visible
     assert f"vinetrack propose {unexplained.folder.as_posix()}" in browser.text("proposal")
     browser.click("propose")
-    browser.until(lambda: (browser.page._clock(), "learning the missing force" in browser.text("proposal"))[1])
+    browser.until(lambda: (browser.page._update_status(), "learning the missing force" in browser.text("proposal"))[1])
     assert browser.model("propose").label == "Stop"
     going_on.set()
     browser.until(lambda: "Written to" in browser.text("proposal"))
@@ -85,9 +85,9 @@ def test_the_effect_proposed_is_opened_fitted_and_saved_with_its_file(
 
     browser.click("open_proposed")
     assert browser.page.proposal._reload.data == {"times": [1]}
-    (ground,) = reopened
-    ground.wait(240)
-    page = Browser(ground)
+    (background,) = reopened
+    background.wait(240)
+    page = Browser(background)
     page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
     assert page.model("tick_spring_line").active
     assert f"vinetrack add {(folder / 'spring_line.py').as_posix()}" in _fitted_commands(page)
@@ -104,7 +104,7 @@ def _fitted_commands(page: Browser) -> str:
     """Commands of the page once the effect that is ticked was fitted."""
     page.click("refit")
     page.until(lambda: page.model("refit").label == "Refit" and page.page.is_fitted(), 240)
-    page.page._say()
+    page.page._update_text()
     return page.text("commands")
 
 
@@ -156,4 +156,4 @@ def test_a_file_that_is_no_effect_is_said(unexplained: Campaign, monkeypatch: py
     path.write_text("def tail_force(", encoding="utf-8")
     searching(monkeypatch, lambda *_: WrittenProposal((), (path,)))
     with pytest.raises(EffectError, match="cannot be read"):
-        proposal.proposed(unexplained, lambda _: None)
+        proposal.propose_and_read(unexplained, lambda _: None)

@@ -11,7 +11,7 @@ import pytest
 from explorer_campaign import write_bars
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
+from vinetrack.explorer.recording import DecodedRecording, RecordingView, recording_view
 from vinetrack.results.folder_layout import Results
 from vinetrack.video.axis import Axis
 
@@ -25,7 +25,7 @@ def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
     told: list[int] = []
     film = DecodedRecording(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
     assert film.complete
-    assert film.words == ""
+    assert film.error == ""
     assert (film.count, film.expected, film.shape, film.scale) == (30, 30, (96, 320), 1.0)
     assert told[0] == 1
     assert told[-1] == 30
@@ -44,12 +44,12 @@ def test_a_file_that_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
     film = DecodedRecording(tmp_path / "a.mp4").decode()
     assert film.complete
     assert film.count == 0
-    assert "a.mp4" in film.words
+    assert "a.mp4" in film.error
 
 
 def test_a_film_nobody_wants_any_more_stops(tmp_path: Path) -> None:
     film = DecodedRecording(write_clip(tmp_path / "a.mp4"))
-    film.decode(lambda one: one.give_up())
+    film.decode(lambda one: one.cancel())
     assert not film.complete
     assert film.count == 1
 
@@ -93,7 +93,7 @@ def test_an_edge_goes_along_with_a_shaken_picture() -> None:
 
 
 def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaign) -> None:
-    words = view_of(Results(campaign.folder), campaign.trials[0].data.trial)
+    words = recording_view(Results(campaign.folder), campaign.trials[0].data.trial)
     assert isinstance(words, str)
     assert "came as a track (d24_24kPa_1.csv): there is no recording to show" in words
 
@@ -102,25 +102,25 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     seen = campaign.trials[0]
     results = Results(tmp_path)
     trial = replace(seen.data.trial, video=tmp_path / "gone.mp4", track=None)
-    assert "no longer there" in str(view_of(results, trial))
+    assert "no longer exists" in str(recording_view(results, trial))
     trial = replace(trial, video=write_clip(tmp_path / "a.mp4", count=2))
-    assert "does not exist" in str(view_of(results, trial))
+    assert "does not exist" in str(recording_view(results, trial))
     results.track(trial.name).parent.mkdir()
     results.analysed(trial.name).parent.mkdir()
     results.track(trial.name).write_text(
         "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag\n0,0,5,0,0,\n"
     )
     results.analysed(trial.name).write_text("{}")
-    assert "run snakemake again" in str(view_of(results, trial))
+    assert "run snakemake again" in str(recording_view(results, trial))
     axis = {"from_px": [0, 10], "to_px": [300, 10], "width_px": None}
     results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
-    found = view_of(results, trial)
+    found = recording_view(results, trial)
     assert isinstance(found, RecordingView)
     assert found.half_width_px == pytest.approx(15.0)
     assert (found.axis.from_px, found.axis.to_px) == ((0.0, 10.0), (300.0, 10.0))
     bent = {"from_px": [0, 10], "via_px": [[100, 40]], "to_px": [300, 10], "width_px": 20}
     results.analysed(trial.name).write_text(json.dumps({"axis": bent}))
-    found = view_of(results, trial)
+    found = recording_view(results, trial)
     assert isinstance(found, RecordingView)
     (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px)
     middle, direction = found.axis.points(0.5 * found.axis.length_px), np.array([y0 - y1, x1 - x0]) / 30

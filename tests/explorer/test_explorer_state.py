@@ -19,12 +19,28 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import Campaign, ShownTrial, condition_labels
-from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial, condition_labels
+from vinetrack.explorer.choice import (
+    ChoiceError,
+    added_and_dropped,
+    choice_from_options,
+    choice_in_use,
+    sized_model,
+    slider_range,
+)
 from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import errors_m, follow, overall_m
-from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
-from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
+from vinetrack.explorer.curves import errors_m, overall_m, simulate_curves
+from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, export_bytes, model_text
+from vinetrack.explorer.series import (
+    error_bars,
+    measured_lines,
+    model_lines,
+    plotted_rows,
+    replicate_bands,
+    residual_lines,
+    symmetric_range,
+    vine_colours,
+)
 from vinetrack.laboratory.tracks import grow, read_nature
 from vinetrack.results.folder_layout import ResultsError
 
@@ -33,7 +49,7 @@ GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"
 
 def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) -> None:
     table = pd.read_csv(campaign.folder / "comparison.csv").set_index("condition")
-    errors = errors_m(campaign, follow(campaign, sized(campaign, first_choice(campaign))))
+    errors = errors_m(campaign, simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign))))
     for condition, error in errors.items():
         assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)
         assert campaign.floors_m[condition] == pytest.approx(table.loc[condition, "replicate_floor_m"])
@@ -47,7 +63,7 @@ def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> 
         table.assign(sigma_m=np.where(table["time_s"] < 0.015, 2e-3, 1e-4)).to_csv(path, index=False)
     door = open_campaign(make_results(experiment, tmp_path / "results"))
     table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
-    curves = follow(door, sized(door, first_choice(door)))
+    curves = simulate_curves(door, sized_model(door, choice_in_use(door)))
     for seen, motion in zip(door.trials, curves, strict=True):
         assert seen.data.imprecise_rest is not None
         assert motion.origin_m == seen.origin_m
@@ -58,50 +74,59 @@ def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> 
 def test_where_no_rest_was_filmed_release_and_origin_stay_near_the_track(campaign: Campaign) -> None:
     """At constant speed the two are one: neither runs away, of vines of 0.2 m."""
     blind = replace(campaign, trials=tuple(replace(seen, origin_known=False) for seen in campaign.trials))
-    start = first_choice(blind)
+    start = choice_in_use(blind)
     for n in (0.2, 0.37, 0.7):
-        for seen, motion in zip(blind.trials, follow(blind, sized(blind, start.with_size(EXPONENT, n))), strict=True):
+        for seen, motion in zip(
+            blind.trials, simulate_curves(blind, sized_model(blind, start.with_size(EXPONENT, n))), strict=True
+        ):
             assert motion.rms_m < 0.1
             assert abs(motion.origin_m - seen.origin_m) < 0.1
 
 
 def test_the_missing_effect_at_its_size_lowers_every_error_to_the_replicates(campaign: Campaign) -> None:
-    start = first_choice(campaign)
+    start = choice_in_use(campaign)
     true = {"eversion_damping.B[24mm-200um-200mm]": 6.44, "eversion_damping.n": 0.37, GAMMA: 1.4}
     choice = start.with_effect("reservoir_depletion")
     for name, value in true.items():
         choice = choice.with_size(name, value)
-    curves = follow(campaign, sized(campaign, choice), follow(campaign, sized(campaign, start)))
-    before = errors_m(campaign, follow(campaign, sized(campaign, start)))
+    curves = simulate_curves(
+        campaign, sized_model(campaign, choice), simulate_curves(campaign, sized_model(campaign, start))
+    )
+    before = errors_m(campaign, simulate_curves(campaign, sized_model(campaign, start)))
     after = errors_m(campaign, curves)
     assert all(after[name] < before[name] for name in campaign.conditions)
     assert overall_m(after, campaign.conditions) < 1.5 * overall_m(campaign.floors_m, campaign.conditions)
 
 
 def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
-    start = first_choice(campaign)
-    none = follow(campaign, sized(campaign, start.with_effect("air_drag").with_size("air_drag.C_D", 0.0)))
-    for bare, with_it in zip(follow(campaign, sized(campaign, start)), none, strict=True):
+    start = choice_in_use(campaign)
+    none = simulate_curves(
+        campaign, sized_model(campaign, start.with_effect("air_drag").with_size("air_drag.C_D", 0.0))
+    )
+    for bare, with_it in zip(simulate_curves(campaign, sized_model(campaign, start)), none, strict=True):
         np.testing.assert_allclose(with_it.growth_m, bare.growth_m, atol=1e-9)
 
 
 def test_curves_do_not_depend_on_where_releases_are_looked_for_from(campaign: Campaign) -> None:
-    start = first_choice(campaign)
-    far = follow(campaign, sized(campaign, start.with_size("eversion_damping.n", 0.6)))
-    cold, warm = follow(campaign, sized(campaign, start)), follow(campaign, sized(campaign, start), far)
+    start = choice_in_use(campaign)
+    far = simulate_curves(campaign, sized_model(campaign, start.with_size("eversion_damping.n", 0.6)))
+    cold, warm = (
+        simulate_curves(campaign, sized_model(campaign, start)),
+        simulate_curves(campaign, sized_model(campaign, start), far),
+    )
     for one, other in zip(cold, warm, strict=True):
         assert one.release_s == pytest.approx(other.release_s, abs=2e-6)
 
 
 def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
-    curves = follow(campaign, sized(campaign, first_choice(campaign)))
+    curves = simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign)))
     seen, motion = campaign.trials[0], curves[0]
     positions = motion.lead_position_m(seen.data.time_s)
     np.testing.assert_allclose(seen.data.lead_position_m - positions, motion.residual_m, atol=1e-12)
     assert math.isnan(motion.lead_position_m(np.array([99.0]))[0])
 
 
-def traced(seen: ShownTrial) -> ShownTrial:
+def traced(seen: ExplorerTrial) -> ExplorerTrial:
     """With a pressure measured along that is the set one all the time."""
     trace = (np.array([-1.0, 2.0]), np.full(2, seen.data.trial.pressure_Pa))
     return replace(seen, data=replace(seen.data, trace=trace))
@@ -109,13 +134,16 @@ def traced(seen: ShownTrial) -> ShownTrial:
 
 def test_a_motion_that_follows_a_measured_pressure_keeps_its_release(campaign: Campaign) -> None:
     other = replace(campaign, trials=tuple(map(traced, campaign.trials)))
-    start = first_choice(campaign)
-    bare, along = follow(campaign, sized(campaign, start)), follow(other, sized(other, start))
+    start = choice_in_use(campaign)
+    bare, along = (
+        simulate_curves(campaign, sized_model(campaign, start)),
+        simulate_curves(other, sized_model(other, start)),
+    )
     for seen, motion in zip(other.trials, along, strict=True):
         assert motion.release_s == seen.release_s
     assert errors_m(other, along) == pytest.approx(errors_m(campaign, bare), rel=2e-3)
-    far = sized(other, start.with_size("eversion_damping.n", 0.6))
-    assert [motion.release_s for motion in follow(other, far, along)] == [motion.release_s for motion in along]
+    far = sized_model(other, start.with_size("eversion_damping.n", 0.6))
+    assert [motion.release_s for motion in simulate_curves(other, far, along)] == [motion.release_s for motion in along]
 
 
 def test_a_slider_simulates_every_trial_once_a_move(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,9 +155,9 @@ def test_a_slider_simulates_every_trial_once_a_move(campaign: Campaign, monkeypa
         return simulate_many(model, trials, *more, **named)
 
     monkeypatch.setattr("vinetrack.explorer.curves.simulate_many", counted)
-    start = first_choice(campaign)
-    before = follow(campaign, sized(campaign, start))
-    follow(campaign, sized(campaign, start.with_size("eversion_damping.n", 0.42)), before)
+    start = choice_in_use(campaign)
+    before = simulate_curves(campaign, sized_model(campaign, start))
+    simulate_curves(campaign, sized_model(campaign, start.with_size("eversion_damping.n", 0.42)), before)
     assert simulated == [len(campaign.trials)] * 2
 
 
@@ -141,7 +169,7 @@ def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_p
     assert bare.refused == "no reason"
     assert bare.floors_m == {}
     assert len(bare.trials) == 6
-    assert first_choice(bare).numbers["eversion_damping.n"] == 0.37
+    assert choice_in_use(bare).numbers["eversion_damping.n"] == 0.37
     true = {one.stated.name: one for one in grow(bare.experiment.trials, read_nature(DEMO))}
     for seen in bare.trials:
         # The last frame at rest, where 0.1 mm of noise hides the first two milliseconds of the motion.
@@ -168,18 +196,18 @@ def test_own_effects_may_be_chosen(tmp_path: Path) -> None:
         "def tail_force(s, rig, k):\n    return -k * s.tail_position\n"
     )
     own = open_campaign(make_results(experiment, tmp_path / "results"))
-    start = first_choice(own)
-    slow = follow(own, sized(own, start.with_effect("spring_line").with_size("spring_line.k", 2.0)))
-    assert slow[0].path_m.mean() < follow(own, sized(own, start))[0].path_m.mean()
+    start = choice_in_use(own)
+    slow = simulate_curves(own, sized_model(own, start.with_effect("spring_line").with_size("spring_line.k", 2.0)))
+    assert slow[0].path_m.mean() < simulate_curves(own, sized_model(own, start))[0].path_m.mean()
 
 
 # ---- choices ---------------------------------------------------------------------------------------------------------
 
 
 def test_an_effect_goes_in_at_the_end_and_keeps_its_size_when_it_goes_out(campaign: Campaign) -> None:
-    choice = first_choice(campaign).with_effect("air_drag").with_size("air_drag.C_D", 0.7)
+    choice = choice_in_use(campaign).with_effect("air_drag").with_size("air_drag.C_D", 0.7)
     assert choice.effects[-1] == "air_drag"
-    assert changed(campaign, choice) == (["air_drag"], [])
+    assert added_and_dropped(campaign, choice) == (["air_drag"], [])
     out = choice.with_effect("air_drag", False)
     assert out.effects == campaign.in_use
     assert out.numbers["air_drag.C_D"] == 0.7
@@ -187,8 +215,8 @@ def test_an_effect_goes_in_at_the_end_and_keeps_its_size_when_it_goes_out(campai
 
 
 def test_a_choice_is_written_in_words_as_on_the_command_line(campaign: Campaign) -> None:
-    start = first_choice(campaign)
-    choice = chosen(campaign, start, ["leak"], [], [f"{GAMMA}=1.2", "eversion_damping.B=6"])
+    start = choice_in_use(campaign)
+    choice = choice_from_options(campaign, start, ["leak"], [], [f"{GAMMA}=1.2", "eversion_damping.B=6"])
     assert choice.effects[-2:] == ("leak", "reservoir_depletion")
     assert choice.numbers[GAMMA] == 1.2
     assert choice.numbers["eversion_damping.B[24mm-200um-200mm]"] == 6.0
@@ -210,7 +238,7 @@ def test_what_there_is_not_is_refused_in_a_sentence(
     campaign: Campaign, add: list[str], drop: list[str], sizes: list[str], words: str
 ) -> None:
     with pytest.raises(ChoiceError, match=words):
-        chosen(campaign, first_choice(campaign), add, drop, sizes)
+        choice_from_options(campaign, choice_in_use(campaign), add, drop, sizes)
 
 
 def test_sliders_reach_from_nothing_to_what_is_plausible_and_hold_what_was_fitted() -> None:
@@ -244,16 +272,16 @@ def test_a_condition_is_called_by_what_tells_it_from_the_others(campaign: Campai
 
 
 def test_lines_are_in_milliseconds_and_millimetres_and_no_longer_than_can_be_seen(campaign: Campaign) -> None:
-    curves = follow(campaign, sized(campaign, first_choice(campaign)))
+    curves = simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign)))
     shown = [0, 1, 2]
-    lines, left = measured(campaign, shown), residuals(campaign, curves, shown)
+    lines, left = measured_lines(campaign, shown), residual_lines(campaign, curves, shown)
     assert lines["trial"] == [campaign.trials[i].name for i in shown]
     assert max(np.nanmax(part) for part in lines["ys"]) == pytest.approx(200, abs=1)
     assert all(len(part) <= 260 for part in lines["xs"])
     assert [len(part) for part in left["ys"]] == [len(part) for part in lines["ys"]]
-    assert len(modelled(campaign, curves, shown)["xs"]) == 2
-    assert len(bands(campaign, shown)["xs"]) == 2
-    assert len(range(*thinned(10_000, 2000).indices(10_000))) <= 260
+    assert len(model_lines(campaign, curves, shown)["xs"]) == 2
+    assert len(replicate_bands(campaign, shown)["xs"]) == 2
+    assert len(range(*plotted_rows(10_000, 2000).indices(10_000))) <= 260
 
 
 def test_error_bars_have_a_row_a_condition_first_on_top(campaign: Campaign) -> None:
@@ -266,9 +294,9 @@ def test_error_bars_have_a_row_a_condition_first_on_top(campaign: Campaign) -> N
 
 
 def test_the_range_of_residuals_moves_in_steps() -> None:
-    assert symmetric({"ys": [np.array([0.1, -3.3])]}) == (-5.0, 5.0)
-    assert symmetric({"ys": [np.array([math.nan, 4.6])]}) == (-5.0, 5.0)
-    assert symmetric({"ys": []}) == (-0.12, 0.12)
+    assert symmetric_range({"ys": [np.array([0.1, -3.3])]}) == (-5.0, 5.0)
+    assert symmetric_range({"ys": [np.array([math.nan, 4.6])]}) == (-5.0, 5.0)
+    assert symmetric_range({"ys": []}) == (-0.12, 0.12)
 
 
 def test_each_vine_has_its_colour(campaign: Campaign) -> None:
@@ -276,20 +304,20 @@ def test_each_vine_has_its_colour(campaign: Campaign) -> None:
 
 
 def test_the_curves_go_out_as_a_table_and_as_a_figure(campaign: Campaign) -> None:
-    choice = first_choice(campaign)
-    curves = follow(campaign, sized(campaign, choice))
+    choice = choice_in_use(campaign)
+    curves = simulate_curves(campaign, sized_model(campaign, choice))
     table = curve_table(campaign, choice, curves, range(6))
     assert tuple(table.columns) == CURVE_COLUMNS
     np.testing.assert_allclose(table["lead_position_m"] - table["model_position_m"], table["residual_m"], atol=1e-12)
-    assert exported(campaign, choice, curves, [0], "csv").decode().splitlines()[0] == ",".join(CURVE_COLUMNS)
-    assert b"<svg" in exported(campaign, choice, curves, range(6), "svg")
-    assert exported(campaign, choice, curves, [], "png").startswith(b"\x89PNG")
-    with pytest.raises(ChoiceError, match="say one of csv"):
-        exported(campaign, choice, curves, [0], "xls")
+    assert export_bytes(campaign, choice, curves, [0], "csv").decode().splitlines()[0] == ",".join(CURVE_COLUMNS)
+    assert b"<svg" in export_bytes(campaign, choice, curves, range(6), "svg")
+    assert export_bytes(campaign, choice, curves, [], "png").startswith(b"\x89PNG")
+    with pytest.raises(ChoiceError, match="use one of csv"):
+        export_bytes(campaign, choice, curves, [0], "xls")
 
 
 def test_the_page_says_the_command_for_what_it_shows(campaign: Campaign) -> None:
-    start = first_choice(campaign)
+    start = choice_in_use(campaign)
     folder = campaign.folder.as_posix()
     assert commands(campaign, start, start, fitted=True) == [f"vinetrack compare {folder}"]
     more = start.with_effect("reservoir_depletion").with_effect("leak")
@@ -302,8 +330,8 @@ def test_the_page_says_the_command_for_what_it_shows(campaign: Campaign) -> None
         f"vinetrack explore {folder} --add leak --set leak.rate=0.25"
     ]
     own = replace(campaign, experiment=_with_model(campaign, ("leak",)))
-    less = first_choice(own).with_effect("leak", False)
-    assert commands(own, first_choice(own), less, fitted=True) == [f"vinetrack explore {folder} --drop leak --refit"]
+    less = choice_in_use(own).with_effect("leak", False)
+    assert commands(own, choice_in_use(own), less, fitted=True) == [f"vinetrack explore {folder} --drop leak --refit"]
 
 
 def _with_model(campaign: Campaign, more: tuple[str, ...]) -> object:
@@ -313,6 +341,6 @@ def _with_model(campaign: Campaign, more: tuple[str, ...]) -> object:
 
 def test_a_model_has_a_short_name() -> None:
     base = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
-    assert model_words(base) == "base model"
-    assert model_words((*base, "air_drag")) == "base model + air drag"
-    assert model_words(("gravity",)) == "gravity"
+    assert model_text(base) == "base model"
+    assert model_text((*base, "air_drag")) == "base model + air drag"
+    assert model_text(("gravity",)) == "gravity"

@@ -15,9 +15,9 @@ from vinetrack.explorer.page import Page
 class Browser:
     """Stands for the browser: a document whose callbacks are run by hand."""
 
-    def __init__(self, ground: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
+    def __init__(self, background: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
         self.document = Document()
-        self.page = Page(ground, self.document, reopen)
+        self.page = Page(background, self.document, reopen)
         self.turn()
 
     def model(self, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""A results folder as the explorer reads it: trials on one clock, the model in use, and the effects to choose from.
+"""A results folder as read by the explorer: aligned trials, the model in use, and the effects to choose from.
 
 It is read once and never changed; the choice of the user is in `choice`, its curves are in `curves`.
 """
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ShownTrial:
+class ExplorerTrial:
     """One trial with its release and origin, which align it with the common clock and ruler of all trials.
 
-    `origin_known` tells whether the vine was filmed at rest; where it was not, the origin is fitted with a model.
+    `origin_known` tells whether the vine was filmed at rest; if not, the origin is fitted with a model.
     """
 
     data: FitTrial
@@ -58,16 +58,16 @@ class ShownTrial:
 
     @cached_property
     def time_s(self) -> Floats:
-        """Since release, shape (n_points,)."""
+        """Time since release, s, shape (n_points,)."""
         return self.data.time_s - self.release_s
 
     @cached_property
     def growth_m(self) -> Floats:
-        """From the origin, shape (n_points,)."""
+        """Position from the origin, m, shape (n_points,)."""
         return self.data.lead_position_m - self.origin_m
 
-    def counts_from(self, release_s: float) -> int:
-        """Return the first frame where a model with this release or the measurement moves: rest dilutes an error.
+    def first_counted_frame(self, release_s: float) -> int:
+        """Return the first frame that counts for errors: where model or measurement moves, since rest dilutes an error.
 
         Parameters
         ----------
@@ -75,7 +75,7 @@ class ShownTrial:
 
         Returns
         -------
-        int, place among the frames of the trial
+        int, index among the frames of the trial
         """
         released = int(np.searchsorted(self.data.time_s, release_s))
         return min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
@@ -83,7 +83,7 @@ class ShownTrial:
 
 @dataclass(frozen=True)
 class ReplicateBand:
-    """Mean and standard deviation of the replicates of one condition, shape (n_times,); empty where there is one."""
+    """Mean and standard deviation of the replicates of one condition, shape (n_times,)."""
 
     time_s: Floats
     mean_m: Floats
@@ -92,12 +92,11 @@ class ReplicateBand:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Read from a results folder by `read_campaign`.
+    """A results folder with its experiment, read by `read_campaign`.
 
-    `numbers` are those of the fit in `fit.json`, by name, SI; empty where it was refused, for the `refused` reason.
-    `log_likelihood` is that of the same fit, NaN where it was refused.
-    `floors_m` holds the replicate scatter by condition, NaN where there is one trial. `unusable` gives effects that
-    cannot be simulated for these trials, and why.
+    `numbers` are the estimates of the fit in `fit.json`, by name, SI; empty if the fit was refused, with the reason in
+    `refused`. `log_likelihood` is that of the same fit, NaN if it was refused. `floors_m` is the replicate scatter by
+    condition, NaN with one trial. `unusable` maps effects that cannot be simulated for these trials to the reason.
     """
 
     name: str
@@ -105,7 +104,7 @@ class Campaign:
     experiment: Experiment
     pairs: tuple[tuple[Trial, Track], ...]
     kinematics: Mapping[str, Kinematics]
-    trials: tuple[ShownTrial, ...]
+    trials: tuple[ExplorerTrial, ...]
     left_out: Mapping[str, str]
     bands: Mapping[str, ReplicateBand]
     floors_m: Mapping[str, float]
@@ -122,19 +121,19 @@ class Campaign:
 
     @cached_property
     def conditions(self) -> tuple[str, ...]:
-        """In the order of the sheet, vines together, pressure rising."""
-        first = {seen.condition: seen.data.trial for seen in reversed(self.trials)}
-        vines = list(dict.fromkeys(seen.data.trial.vine for seen in self.trials))
+        """Conditions ordered by vine (as in the sheet), payload and pressure."""
+        first = {aligned.condition: aligned.data.trial for aligned in reversed(self.trials)}
+        vines = list(dict.fromkeys(aligned.data.trial.vine for aligned in self.trials))
         rank = {name: (vines.index(t.vine), t.payload_kg, t.pressure_Pa) for name, t in first.items()}
         return tuple(sorted(rank, key=lambda name: rank[name]))
 
     @cached_property
     def vines(self) -> tuple[str, ...]:
-        """In the order of the sheet."""
+        """Vines in the order of the sheet."""
         return self.groups("vine")
 
     def groups(self, shared: str) -> tuple[str, ...]:
-        """Names of the trials that have a number of their own together, in the order of the sheet.
+        """Return the groups of trials with a parameter value of their own, in the order of the sheet.
 
         Parameters
         ----------
@@ -143,14 +142,16 @@ class Campaign:
         Returns
         -------
         tuple of str
-            One blank name where the number is that of all trials.
+            One blank name if the value applies to all trials.
         """
-        return tuple(group_names([seen.data.trial for seen in self.trials], shared))
+        return tuple(group_names([aligned.data.trial for aligned in self.trials], shared))
 
     @cached_property
     def labels(self) -> Mapping[str, str]:
-        """A short name of every condition: of its settings those that vary."""
-        return condition_labels({name: self.trials[self.of_condition(name)[0]].data.trial for name in self.conditions})
+        """A short name of every condition: those of its settings that vary."""
+        return condition_labels(
+            {name: self.trials[self.indices_of_condition(name)[0]].data.trial for name in self.conditions}
+        )
 
     @cached_property
     def host(self) -> Model:
@@ -158,7 +159,7 @@ class Campaign:
         return host_for(Model(()), self.effects.values())
 
     def own_files(self, names: Sequence[str]) -> list[str]:
-        """Files of the user's own effects beside the settings, of those named.
+        """Return the files of user effects in the experiment's folder, of those named.
 
         Parameters
         ----------
@@ -172,8 +173,8 @@ class Campaign:
         paths = [self.effects[name].path for name in names]
         return [path.name for path in paths if path.resolve().parent == folder]
 
-    def of_condition(self, condition: str) -> list[int]:
-        """Places of the trials of a condition among `trials`.
+    def indices_of_condition(self, condition: str) -> list[int]:
+        """Return the indices of the trials of a condition in `trials`.
 
         Parameters
         ----------
@@ -183,10 +184,10 @@ class Campaign:
         -------
         list of int
         """
-        return [i for i, seen in enumerate(self.trials) if seen.condition == condition]
+        return [i for i, aligned in enumerate(self.trials) if aligned.condition == condition]
 
-    def trial(self, name: str) -> ShownTrial:
-        """The trial of that name; KeyError where there is none.
+    def trial(self, name: str) -> ExplorerTrial:
+        """Return the trial of that name; KeyError if there is none.
 
         Parameters
         ----------
@@ -194,9 +195,9 @@ class Campaign:
 
         Returns
         -------
-        AlignedTrial
+        ExplorerTrial
         """
-        return {seen.name: seen for seen in self.trials}[name]
+        return {aligned.name: aligned for aligned in self.trials}[name]
 
 
 def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
@@ -205,7 +206,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     Parameters
     ----------
     folder : of the results.
-    experiment : whose results they are.
+    experiment : from which the results were made.
     user_effects : the user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
 
     Returns
@@ -215,7 +216,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     Raises
     ------
     ResultsError
-        If a stage before the model has not run, or no trial has a track that can be used.
+        If the model stage or one before it has not run, or no trial has a usable track.
     """
     results = Results(folder)
     pairs, kinematics = measured_trials(experiment, results)
@@ -226,7 +227,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     fitted = read_fit(results)
     refused = fitted.refused
     compared = {} if refused else _compared(results)
-    seen = _on_one_clock(data, compared)
+    aligned = _align_trials(data, compared)
     effects = {**catalogue(), **user_effects}
     floors = {} if refused else _floors(results)
     return Campaign(
@@ -235,7 +236,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         experiment=experiment,
         pairs=tuple(pairs),
         kinematics=kinematics,
-        trials=tuple(seen),
+        trials=tuple(aligned),
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=_bands(compared),
         floors_m=floors,
@@ -258,10 +259,10 @@ def _floors(results: Results) -> dict[str, float]:
     return dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
 
 
-def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[ShownTrial]:
-    """Trials with the release and origin that the comparison found, or else what the track alone shows."""
+def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[ExplorerTrial]:
+    """Align trials by the release and origin of the comparison, or else by those estimated from the track alone."""
     starts, at_rest = initial_trial_effects(data), rest_is_seen(data)
-    aligned = []
+    trials = []
     for i, trial_data in enumerate(data):
         release_s, origin_m = float(starts[i, 0]), float(starts[i, 1])
         table = compared.get(trial_data.trial.condition)
@@ -271,12 +272,12 @@ def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
             origin_m = float(trial_data.lead_position_m[0] - rows["lead_position_m"].iloc[0])
         if at_rest[i]:
             origin_m = trial_data.rest_origin_m
-        aligned.append(ShownTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
-    return aligned
+        trials.append(ExplorerTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
+    return trials
 
 
 def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, ReplicateBand]:
-    """The replicates' mean and spread, along the longest trial of each condition."""
+    """Mean and standard deviation of the replicates at the times of the longest trial of each condition."""
     bands = {}
     for condition, table in compared.items():
         if table["trial"].nunique() < 2:
@@ -301,7 +302,7 @@ def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
 
 
 def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
-    """A label for each condition, of those settings in which the trials of the experiment differ.
+    """Return a label for each condition, from the settings in which the trials of the experiment differ.
 
     Parameters
     ----------
@@ -318,18 +319,18 @@ def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
     written = {name: _settings(trial) for name, trial in conditions.items()}
     keys = list(dict.fromkeys(key for settings in written.values() for key in settings))
     varying = [key for key in keys if len({settings.get(key, "") for settings in written.values()}) > 1]
-    kept = _without_what_follows(varying, written) or ["pressure"]
+    kept = _without_redundant(varying, written) or ["pressure"]
     labels = {
         name: ", ".join(settings[key] for key in kept if settings.get(key)) or name
         for name, settings in written.items()
     }
     named = list(labels.values())
-    # What differs in a setting that has no place here is told apart by its own name.
+    # Conditions that differ in another setting get their name appended.
     return {name: label if named.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
 
 
-def _without_what_follows(keys: list[str], written: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Drop thickness and length where the diameter tells them."""
+def _without_redundant(keys: list[str], written: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Drop thickness and length if the other sizes determine them."""
     kept = list(keys)
     for key in ("length", "thickness"):
         others = [other for other in kept if other in ("diameter", "thickness", "length") and other != key]
@@ -340,7 +341,7 @@ def _without_what_follows(keys: list[str], written: Mapping[str, Mapping[str, st
 
 
 def _settings(trial: Trial) -> dict[str, str]:
-    """What may tell a condition from another, in the units of the sheet."""
+    """Settings that may distinguish conditions, in the units of the sheet."""
     numbers = {
         "diameter": (1e3 * trial.diameter_m, "mm"),
         "thickness": (1e6 * trial.thickness_m, "µm"),

@@ -1,4 +1,4 @@
-"""What a person has chosen: the effects in the model and their sizes. Plain data, changed by making another."""
+"""The user's choice: the effects in the model and their sizes. Immutable; a change returns a new choice."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.curves import SizedModel, yields_of
+from vinetrack.explorer.curves import SizedModel, fitted_yield_pressures
 from vinetrack.inference.parameters import DAMPING
 
 
 class ChoiceError(UserError, ValueError):
-    """Something was chosen that there is not; one sentence with a remedy."""
+    """An effect, parameter or value that does not exist or is not allowed; one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
 class SizeControl:
-    """One number of an effect that a slider moves, SI; `vine` is blank where it holds for all."""
+    """One parameter of an effect with a slider, SI; `vine` is blank if one value applies to all trials."""
 
     effect: str
     parameter: Parameter
@@ -36,20 +36,20 @@ class SizeControl:
 
     @property
     def name(self) -> str:
-        """`effect.parameter`, with the vine in brackets where it has one of its own."""
+        """`effect.parameter`, with the vine in brackets if each has its own value."""
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
     @property
     def shown(self) -> tuple[str, float]:
-        """The unit it is shown in, and the factor to it."""
+        """The displayed unit, and the factor from SI."""
         return display_unit(self.parameter.unit, SLIDER_UNITS)
 
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """Effects in the model, in the order they were added, and the size of every number by name, in it or not.
+    """Effects in the model, in the order they were added, and the value of every parameter, in the model or not.
 
-    `numbers` also holds the yield pressures that a fit found, by vine; no slider moves them.
+    `numbers` also holds the fitted yield pressures by vine, which have no slider.
     """
 
     effects: tuple[str, ...]
@@ -59,16 +59,16 @@ class ModelChoice:
         return effect in self.effects
 
     def with_effect(self, effect: str, wanted: bool = True) -> ModelChoice:
-        """With an effect put in (at the end) or taken out; its sizes are kept for when it comes back.
+        """Return the choice with an effect added (at the end) or removed; its sizes are kept for when it returns.
 
         Parameters
         ----------
         effect : its name.
-        wanted : False takes it out.
+        wanted : False removes it.
 
         Returns
         -------
-        Choice
+        ModelChoice
         """
         if wanted == (effect in self.effects):
             return self
@@ -76,7 +76,7 @@ class ModelChoice:
         return replace(self, effects=(*kept, effect) if wanted else kept)
 
     def with_size(self, name: str, value: float) -> ModelChoice:
-        """With one number, SI, at another size.
+        """Return the choice with another value of one parameter.
 
         Parameters
         ----------
@@ -85,13 +85,13 @@ class ModelChoice:
 
         Returns
         -------
-        Choice
+        ModelChoice
         """
         return replace(self, numbers={**self.numbers, name: value})
 
 
-def first_choice(campaign: Campaign) -> ModelChoice:
-    """The model in use at the sizes that were fitted, everything else at its default.
+def choice_in_use(campaign: Campaign) -> ModelChoice:
+    """Return the model in use with its fitted values, and all other parameters at their defaults.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def first_choice(campaign: Campaign) -> ModelChoice:
 
     Returns
     -------
-    Choice
+    ModelChoice
     """
     numbers = {
         size.name: size.parameter.default
@@ -110,9 +110,9 @@ def first_choice(campaign: Campaign) -> ModelChoice:
 
 
 def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
-    """The sliders of an effect: one a number, or one a vine or day where each has its own.
+    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value.
 
-    Ranges hold the present value.
+    Their ranges include the present value.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
 
     Returns
     -------
-    list of Size
+    list of SizeControl
     """
     sizes = []
     for parameter in effect.parameters:
@@ -134,7 +134,7 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
 
 
 def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
-    """From where to where a slider goes: what is plausible, the size at which it vanishes, and the value it has.
+    """Return the range of a slider: the plausible range, extended to the size without effect and the present value.
 
     Parameters
     ----------
@@ -159,8 +159,8 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1]) if value < parameter.bounds[1] else value
 
 
-def sized(campaign: Campaign, choice: ModelChoice) -> SizedModel:
-    """The model that was chosen, ready to be followed.
+def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
+    """Return the chosen model with its sizes, ready to be simulated.
 
     Parameters
     ----------
@@ -177,16 +177,16 @@ def sized(campaign: Campaign, choice: ModelChoice) -> SizedModel:
         for size in sizes_of(campaign, effect, choice.numbers):
             value = choice.numbers.get(size.name, size.parameter.default)
             if size.vine:
-                former = values.get(size.key, {})
-                assert isinstance(former, Mapping)
-                values[size.key] = {**former, size.vine: value}
+                by_vine = values.get(size.key, {})
+                assert isinstance(by_vine, Mapping)
+                values[size.key] = {**by_vine, size.vine: value}
             else:
                 values[size.key] = value
-    return SizedModel(Model(effects, values), yields_of(campaign, choice.numbers))
+    return SizedModel(Model(effects, values), fitted_yield_pressures(campaign, choice.numbers))
 
 
-def can_leave(effect: str) -> bool:
-    """Whether an effect may be taken out: the base effects are what all others are added to.
+def is_removable(effect: str) -> bool:
+    """Return whether an effect may be removed: the base effects may not, since all others are added to them.
 
     Parameters
     ----------
@@ -199,8 +199,8 @@ def can_leave(effect: str) -> bool:
     return effect not in BASE_EFFECTS
 
 
-def changed(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
-    """Effects added to the model in use, and those taken out of it.
+def added_and_dropped(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
+    """Return the effects added to the model in use, and those removed from it.
 
     Parameters
     ----------
@@ -209,47 +209,49 @@ def changed(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[st
 
     Returns
     -------
-    added, dropped : list of str, against the model in use
+    added, dropped : list of str, relative to the model in use
     """
     added = [name for name in choice.effects if name not in campaign.in_use]
     dropped = [name for name in campaign.in_use if name not in choice.effects]
     return added, dropped
 
 
-def chosen(
+def choice_from_options(
     campaign: Campaign, start: ModelChoice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
 ) -> ModelChoice:
-    """A choice put together from words, as a command line has them.
+    """Return the choice described by options of the command line.
 
     Parameters
     ----------
-    campaign : what is explored.
-    start : the choice that is changed.
+    campaign : as `read_campaign` returns it.
+    start : the choice that is modified.
     add, drop : names of effects.
-    sizes : `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is put in.
+    sizes : `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is added.
 
     Returns
     -------
-    Choice
+    ModelChoice
 
     Raises
     ------
     ChoiceError
-        If there is no such effect or number, these trials cannot be asked about it, or a base effect should go.
+        If there is no such effect or parameter, the trials cannot test it, or it is a base effect to be removed.
     """
     choice = start
     for name in add:
-        choice = choice.with_effect(_usable(campaign, name))
+        choice = choice.with_effect(_testable_effect(campaign, name))
     for name in drop:
-        if not can_leave(name):
-            raise ChoiceError(f"{name} is one of the base effects, which all others are added to: it stays.")
+        if not is_removable(name):
+            raise ChoiceError(
+                f"{name} is one of the base effects, to which all others are added: it cannot be dropped."
+            )
         choice = choice.with_effect(name, False)
     for text in sizes:
-        choice = _with_written_size(campaign, choice, text)
+        choice = _with_parsed_size(campaign, choice, text)
     return choice
 
 
-def _usable(campaign: Campaign, name: str) -> str:
+def _testable_effect(campaign: Campaign, name: str) -> str:
     import difflib
 
     if name not in campaign.effects:
@@ -262,23 +264,23 @@ def _usable(campaign: Campaign, name: str) -> str:
     return name
 
 
-def _with_written_size(campaign: Campaign, choice: ModelChoice, text: str) -> ModelChoice:
+def _with_parsed_size(campaign: Campaign, choice: ModelChoice, text: str) -> ModelChoice:
     name, equals, written = text.partition("=")
     name = name.strip()
-    effect = _usable(campaign, name.split(".")[0])
+    effect = _testable_effect(campaign, name.split(".")[0])
     sizes = sizes_of(campaign, campaign.effects[effect], choice.numbers)
-    meant = [size for size in sizes if name in (size.name, size.key)]
-    if not equals or not meant:
+    matching = [size for size in sizes if name in (size.name, size.key)]
+    if not equals or not matching:
         known = ", ".join(size.name for size in sizes) or "none"
         raise ChoiceError(f"{text!r} is no size: write NAME=VALUE, SI, with one of {known}.")
     try:
         value = float(written)
     except ValueError:
         raise ChoiceError(f"{written!r} is no number: write {name}=0.5, say, in SI units.") from None
-    low, high = meant[0].parameter.bounds
+    low, high = matching[0].parameter.bounds
     if not low <= value <= high:
-        raise ChoiceError(f"{name} = {value:g} lies outside its bounds, {low:g} to {high:g}.")
+        raise ChoiceError(f"{name} = {value:g} is outside its bounds, {low:g} to {high:g}.")
     choice = choice.with_effect(effect)
-    for size in meant:
+    for size in matching:
         choice = choice.with_size(size.name, value)
     return choice

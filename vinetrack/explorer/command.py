@@ -1,4 +1,4 @@
-"""The command `vinetrack explore`: the page for a results folder, or what the page does, without it."""
+"""The command `vinetrack explore`: the page for a results folder, or its functions without the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExploreOptions:
-    """What the command line asks for; see `vinetrack explore --help`."""
+    """Options of the command line; see `vinetrack explore --help`."""
 
     add: Sequence[str] = ()
     drop: Sequence[str] = ()
@@ -29,18 +29,18 @@ class ExploreOptions:
     browser: bool = True
 
     @property
-    def is_for_a_page(self) -> bool:
-        """Whether somebody is to look: what is only computed, written or saved needs no page."""
+    def needs_page(self) -> bool:
+        """Whether to open the page: refitting, exporting and saving need none."""
         return not (self.refit or self.export or self.save)
 
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
-    """A results folder with the experiment it was made from.
+    """Open a results folder and its experiment.
 
     Parameters
     ----------
     folder : the results.
-    experiment : its folder where it has moved.
+    experiment : its folder, if it has moved.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     Raises
     ------
     ResultsError
-        If it is no results folder, or its experiment has moved.
+        If it is not a results folder, or its experiment has moved.
     ExperimentError
         If the experiment cannot be read.
     """
@@ -57,18 +57,18 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     from vinetrack.pipeline.effects_stage import effects_of
     from vinetrack.pipeline.source_experiment import read_source_experiment
 
-    read = read_source_experiment(folder, experiment)
-    return read_campaign(folder, read, effects_of(read.folder))
+    source = read_source_experiment(folder, experiment)
+    return read_campaign(folder, source, effects_of(source.folder))
 
 
-def explore(folder: Path, experiment: Path | None, wanted: ExploreOptions, say: Callable[[str], None]) -> None:
-    """Serve the page, or do what was asked for and say what came of it.
+def explore(folder: Path, experiment: Path | None, options: ExploreOptions, say: Callable[[str], None]) -> None:
+    """Serve the page, or carry out the options and print the results.
 
     Parameters
     ----------
     folder : the results.
-    experiment : its folder where it has moved.
-    wanted : the options of the command.
+    experiment : its folder, if it has moved.
+    options : of the command.
     say : prints a line.
 
     Raises
@@ -77,56 +77,56 @@ def explore(folder: Path, experiment: Path | None, wanted: ExploreOptions, say: 
         In one sentence each.
     """
     from vinetrack.core.terminal import waiting
-    from vinetrack.explorer.choice import chosen, first_choice
+    from vinetrack.explorer.choice import choice_from_options, choice_in_use
 
     with waiting(f"opening {folder}"):
         campaign = open_campaign(folder, experiment)
-        start = first_choice(campaign)
-        choice = chosen(campaign, start, wanted.add, wanted.drop, wanted.sizes)
-    if wanted.is_for_a_page:
+        start = choice_in_use(campaign)
+        choice = choice_from_options(campaign, start, options.add, options.drop, options.sizes)
+    if options.needs_page:
         if importlib.util.find_spec("bokeh") is None:
             raise PageError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
         from vinetrack.explorer.fitting import BackgroundFit
         from vinetrack.explorer.server import serve
 
-        serve(BackgroundFit(campaign, start if choice == start else choice), say, wanted.port, browser=wanted.browser)
+        serve(BackgroundFit(campaign, start if choice == start else choice), say, options.port, browser=options.browser)
         return
-    _without_a_page(campaign, start, choice, wanted, say)
+    _run_without_page(campaign, start, choice, options, say)
 
 
-def _without_a_page(
-    campaign: Campaign, start: ModelChoice, choice: ModelChoice, wanted: ExploreOptions, say: Callable[[str], None]
+def _run_without_page(
+    campaign: Campaign, start: ModelChoice, choice: ModelChoice, options: ExploreOptions, say: Callable[[str], None]
 ) -> None:
     from vinetrack.core.terminal import waiting
-    from vinetrack.explorer.choice import sized
-    from vinetrack.explorer.curves import errors_m, follow
-    from vinetrack.explorer.export import model_words, write_export
-    from vinetrack.explorer.fitting import first_fit, fit_choice, gained_words
+    from vinetrack.explorer.choice import sized_model
+    from vinetrack.explorer.curves import errors_m, simulate_curves
+    from vinetrack.explorer.export import model_text, write_export
+    from vinetrack.explorer.fitting import first_fit, fit_choice, likelihood_change_text
     from vinetrack.pipeline.source_experiment import save_model
 
     with waiting("simulating the trials"):
-        before = errors_m(campaign, follow(campaign, sized(campaign, start)))
-    if wanted.refit:
+        before = errors_m(campaign, simulate_curves(campaign, sized_model(campaign, start)))
+    if options.refit:
         with waiting("fitting the model in use"):
             first = first_fit(campaign, start)
-        with waiting(f"fitting {model_words(choice.effects)}"):
+        with waiting(f"fitting {model_text(choice.effects)}"):
             fitted = fit_choice(campaign, first.fit, choice)
         choice = fitted.choice
         say(str(fitted.fit))
-        say(gained_words(first.fit, fitted.fit))
-    curves = follow(campaign, sized(campaign, choice))
+        say(likelihood_change_text(first.fit, fitted.fit))
+    curves = simulate_curves(campaign, sized_model(campaign, choice))
     for line in error_lines(campaign, choice, errors_m(campaign, curves), before):
         say(line)
-    for path in wanted.export:
+    for path in options.export:
         write_export(campaign, choice, curves, path)
         say(f"Written: {path}")
-    if wanted.save:
+    if options.save:
         files = campaign.own_files(choice.effects)
         say(f"Saved: {save_model(campaign.experiment.folder, choice.effects, files)}")
 
 
 def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], before: dict[str, float]) -> list[str]:
-    """The error of every condition before and now beside what replicates differ by, aligned, with units.
+    """Return a table of the error of every condition before and now, with the replicate scatter.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], 
     """
     from vinetrack.core.terminal import table
     from vinetrack.explorer.curves import overall_m
-    from vinetrack.explorer.export import model_words
+    from vinetrack.explorer.export import model_text
 
     def cells(values: dict[str, float]) -> list[str]:
         return [f"{1e3 * values[key]:.3f}" if values[key] == values[key] else "–" for key in ("was", "now", "floor")]
@@ -153,4 +153,4 @@ def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], 
     sums = (overall_m(errors, campaign.conditions) for errors in (before, now, floors))
     rows.append(("all", *cells(dict(zip(("was", "now", "floor"), sums, strict=True)))))
     head = ("condition", "model in use", "now", "replicates")
-    return [model_words(choice.effects), *table(rows, head, ("", "mm", "mm", "mm"), align="<>>>")]
+    return [model_text(choice.effects), *table(rows, head, ("", "mm", "mm", "mm"), align="<>>>")]

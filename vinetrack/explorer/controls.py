@@ -25,17 +25,17 @@ from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.effects import Effect
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import ModelChoice, SizeControl, can_leave, sizes_of, slider_range
-from vinetrack.explorer.export import commands, exported, model_words
+from vinetrack.explorer.choice import ModelChoice, SizeControl, is_removable, sizes_of, slider_range
+from vinetrack.explorer.export import commands, export_bytes, model_text
 from vinetrack.explorer.fitting import Fitted
-from vinetrack.explorer.look import command_block, escaped, sheet, words
+from vinetrack.explorer.look import command_block, escaped, html_div, stylesheet
 from vinetrack.pipeline.source_experiment import save_model
 
 if TYPE_CHECKING:
     from vinetrack.explorer.page import Page
 
 STEPS = 400
-"""Of a slider from end to end; chosen: about one a pixel."""
+"""Steps of a slider; chosen: about one per pixel."""
 HEADING = """
 :host { margin-top: .5rem; }
 .bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
@@ -50,7 +50,7 @@ input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4
 
 
 class EffectRow:
-    """One effect: its tick, its sliders, and words."""
+    """Controls of one effect: tick box, sliders, formula and fitted values."""
 
     def __init__(self, campaign: Campaign, effect: Effect, choice: ModelChoice) -> None:
         self.effect, self.sizes = effect, sizes_of(campaign, effect, choice.numbers)
@@ -58,23 +58,25 @@ class EffectRow:
         self.tick = Checkbox(
             label=effect.name.replace("_", " "),
             active=effect.name in choice,
-            disabled=bool(unusable) or not can_leave(effect.name),
+            disabled=bool(unusable) or not is_removable(effect.name),
             name=f"tick_{effect.name}",
-            stylesheets=[sheet(TICK)],
+            stylesheets=[stylesheet(TICK)],
             margin=(6, 0, 0, 0),
         )
         self.sliders = [_slider(size, choice, bool(unusable)) for size in self.sizes]
-        self.found = [words(visible=False, name=f"found_{size.name}") for size in self.sizes]
+        self.fitted_texts = [html_div(visible=False, name=f"found_{size.name}") for size in self.sizes]
         about = f"<small>{escaped(unusable or effect.formula)}</small>"
-        pairs = [part for pair in zip(self.sliders, self.found, strict=True) for part in pair]
-        self.root = Column(children=[self.tick, words(about), *pairs], sizing_mode="stretch_width", margin=(0, 0, 4, 0))
+        pairs = [part for pair in zip(self.sliders, self.fitted_texts, strict=True) for part in pair]
+        self.root = Column(
+            children=[self.tick, html_div(about), *pairs], sizing_mode="stretch_width", margin=(0, 0, 4, 0)
+        )
 
     def value(self, k: int) -> float:
-        """SI value of a slider.
+        """Return the value of a slider in SI units.
 
         Parameters
         ----------
-        k : place of the slider.
+        k : index of the slider.
 
         Returns
         -------
@@ -96,7 +98,7 @@ def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
         sizing_mode="stretch_width",
         disabled=disabled,
         name=f"size_{size.name}",
-        stylesheets=[sheet(":host { padding: 0 10px 0 4px; }")],
+        stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; }")],
         margin=(2, 0, 6, 0),
     )
     return slider
@@ -112,7 +114,7 @@ def _step(low: float, high: float) -> float:
 
 
 class EffectPanel:
-    """All effects in groups. `ticked(effect, wanted)` and `moved(effect, number, value)` hear what a person does."""
+    """All effects in groups; calls `ticked(effect, wanted)` and `moved(effect, parameter, value)` on user input."""
 
     def __init__(
         self,
@@ -123,7 +125,7 @@ class EffectPanel:
         moved: Callable[[str, str, float], None],
     ) -> None:
         self.campaign, self._ticked, self._moved = campaign, ticked, moved
-        self._quiet = False
+        self._updating = False
         self.rows = {name: EffectRow(campaign, effect, choice) for name, effect in campaign.effects.items()}
         for name, row in self.rows.items():
             row.tick.on_change("active", self._on_tick(name))
@@ -150,35 +152,37 @@ class EffectPanel:
         inside = Column(
             children=[self.rows[name].root for name in names], sizing_mode="stretch_width", visible=shown, margin=0
         )
-        head = Toggle(label=title, active=shown, sizing_mode="stretch_width", stylesheets=[sheet(HEADING)], margin=0)
+        head = Toggle(
+            label=title, active=shown, sizing_mode="stretch_width", stylesheets=[stylesheet(HEADING)], margin=0
+        )
         head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
         return Column(children=[head, inside], sizing_mode="stretch_width", margin=0)
 
     def _on_tick(self, name: str) -> Callable[[str, bool, bool], None]:
-        def heard(_attr: str, _old: bool, new: bool) -> None:
-            if not self._quiet:
+        def on_change(_attr: str, _old: bool, new: bool) -> None:
+            if not self._updating:
                 self._ticked(name, new)
 
-        return heard
+        return on_change
 
     def _on_size(self, name: str, k: int) -> Callable[[str, float, float], None]:
-        def heard(_attr: str, _old: float, _new: float) -> None:
-            if not self._quiet:
+        def on_change(_attr: str, _old: float, _new: float) -> None:
+            if not self._updating:
                 row = self.rows[name]
                 self._moved(name, row.sizes[k].name, row.value(k))
 
-        return heard
+        return on_change
 
     def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
-        """Set ticks and, where wanted, sliders to a choice; beside each number what a fit found of it.
+        """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider.
 
         Parameters
         ----------
         choice : effects and sizes.
-        fitted : the fit whose numbers stand beside the sliders; None for none.
-        sliders : whether they are moved too.
+        fitted : the fit whose estimates are shown; None for none.
+        sliders : whether the sliders are set too.
         """
-        self._quiet = True
+        self._updating = True
         try:
             for name, row in self.rows.items():
                 if row.tick.active != (name in choice):
@@ -186,9 +190,9 @@ class EffectPanel:
                 for k, size in enumerate(row.sizes):
                     if sliders:
                         _set_slider(row.sliders[k], size, choice.numbers.get(size.name, size.parameter.default))
-                    _say_found(row.found[k], size, fitted if name in choice else None)
+                    _show_fitted_value(row.fitted_texts[k], size, fitted if name in choice else None)
         finally:
-            self._quiet = False
+            self._updating = False
 
 
 def _set_slider(slider: Slider, size: SizeControl, value: float) -> None:
@@ -201,7 +205,7 @@ def _set_slider(slider: Slider, size: SizeControl, value: float) -> None:
         slider.value = shown
 
 
-def _say_found(div: Div, size: SizeControl, fitted: Fitted | None) -> None:
+def _show_fitted_value(div: Div, size: SizeControl, fitted: Fitted | None) -> None:
     number = None if fitted is None else fitted.number(size.name)
     if number is None:
         div.visible = False
@@ -228,29 +232,29 @@ CHIPS = """
 """
 
 
-class Chooser:
-    """Buttons; `heard` is called when the selection has changed."""
+class TrialSelector:
+    """Buttons to select conditions and trials; calls `on_change` when the selection changes."""
 
-    def __init__(self, campaign: Campaign, heard: Callable[[], None]) -> None:
-        self.campaign, self._heard = campaign, heard
+    def __init__(self, campaign: Campaign, on_change: Callable[[], None]) -> None:
+        self.campaign, self._on_change = campaign, on_change
         everything = list(range(len(campaign.conditions)))
         self._conditions = CheckboxButtonGroup(
             labels=[campaign.labels[name] for name in campaign.conditions],
             active=everything,
             name="conditions",
-            stylesheets=[sheet(CHIPS)],
+            stylesheets=[stylesheet(CHIPS)],
             margin=(0, 0, 4, 0),
         )
         self._trials = CheckboxButtonGroup(
-            labels=[seen.name for seen in campaign.trials],
+            labels=[aligned.name for aligned in campaign.trials],
             active=list(range(len(campaign.trials))),
             name="trials",
             visible=False,
-            stylesheets=[sheet(CHIPS + SMALL)],
+            stylesheets=[stylesheet(CHIPS + SMALL)],
             margin=(4, 0, 0, 0),
         )
-        self._conditions.on_change("active", lambda _attr, _old, _new: self._heard())
-        self._trials.on_change("active", lambda _attr, _old, _new: self._heard())
+        self._conditions.on_change("active", lambda _attr, _old, _new: self._on_change())
+        self._trials.on_change("active", lambda _attr, _old, _new: self._on_change())
         self.root = Column(
             children=[self._conditions, self._tools(), self._trials],
             sizing_mode="stretch_width",
@@ -260,17 +264,17 @@ class Chooser:
 
     def _tools(self) -> Row:
         single = Toggle(
-            label="single trials …", active=False, stylesheets=[sheet(SMALL)], margin=0, name="single_trials"
+            label="single trials …", active=False, stylesheets=[stylesheet(SMALL)], margin=0, name="single_trials"
         )
         single.js_on_change("active", CustomJS(args={"t": self._trials}, code="t.visible = cb_obj.active"))
         return Row(
             children=[self._button("all", self._all), self._button("none", self._none), single],
             margin=0,
-            stylesheets=[sheet(":host { gap: 4px; }")],
+            stylesheets=[stylesheet(":host { gap: 4px; }")],
         )
 
     def _button(self, label: str, does: Callable[[], None]) -> Any:
-        button = Button(label=label, stylesheets=[sheet(SMALL)], margin=0, name=f"choose_{label}")
+        button = Button(label=label, stylesheets=[stylesheet(SMALL)], margin=0, name=f"choose_{label}")
         button.on_click(does)
         return button
 
@@ -282,26 +286,26 @@ class Chooser:
         self._conditions.active = []
 
     def toggle(self, condition: str) -> None:
-        """Choose this condition alone; where it is alone already, all of them again.
+        """Select this condition alone; if it is alone already, select all.
 
         Parameters
         ----------
         condition : its name.
         """
-        place = self.campaign.conditions.index(condition)
-        alone = self._conditions.active == [place]
-        self._conditions.active = list(range(len(self.campaign.conditions))) if alone else [place]
+        index = self.campaign.conditions.index(condition)
+        is_alone = self._conditions.active == [index]
+        self._conditions.active = list(range(len(self.campaign.conditions))) if is_alone else [index]
 
     @property
     def conditions(self) -> list[str]:
-        """Names of the conditions chosen."""
+        """Names of the selected conditions."""
         return [self.campaign.conditions[k] for k in sorted(self._conditions.active)]
 
     @property
     def shown(self) -> list[int]:
-        """Places of the trials to draw: those ticked, of the conditions chosen."""
-        wanted = set(self.conditions)
-        return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in wanted]
+        """Indices of the trials to draw: those selected, of the selected conditions."""
+        conditions = set(self.conditions)
+        return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in conditions]
 
 
 MIME = {"csv": "text/csv", "svg": "image/svg+xml", "png": "image/png"}
@@ -318,14 +322,14 @@ setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 _GAP = ":host { gap: 6px; flex-wrap: wrap; }"
 
 
-class KeepPanel:
-    """Buttons of one page."""
+class SavePanel:
+    """Buttons of one page to save the model and to export figure and data."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
-        self.save = Button(label="Save the model to experiment.yaml", name="save", stylesheets=[sheet()], margin=0)
+        self.save = Button(label="Save the model to experiment.yaml", name="save", stylesheets=[stylesheet()], margin=0)
         self.save.on_click(self._save)
-        self.said = words(name="saved")
+        self.message = html_div(name="saved")
         self._download = ColumnDataSource({"name": [""], "mime": [""], "body": [""]}, name="download")
         self._download.js_on_change("data", CustomJS(code=DOWNLOAD))
         forms = {"svg": "Figure (SVG)", "png": "Figure (PNG)", "csv": "Data (CSV)"}
@@ -333,9 +337,9 @@ class KeepPanel:
         self.root = Column(
             children=[
                 Row(children=[self.save], margin=0),
-                self.said,
-                Row(children=buttons, margin=0, stylesheets=[sheet(_GAP)]),
-                words("<small>Figure and data hold the trials that are shown, as the model has them now.</small>"),
+                self.message,
+                Row(children=buttons, margin=0, stylesheets=[stylesheet(_GAP)]),
+                html_div("<small>Figure and data contain the trials that are shown, with the current model.</small>"),
             ],
             sizing_mode="stretch_width",
             name="keep",
@@ -344,7 +348,7 @@ class KeepPanel:
         )
 
     def _button(self, form: str, label: str) -> Button:
-        button = Button(label=label, name=f"export_{form}", stylesheets=[sheet()], margin=0)
+        button = Button(label=label, name=f"export_{form}", stylesheets=[stylesheet()], margin=0)
         button.on_click(self._exporter(form))
         return button
 
@@ -353,7 +357,7 @@ class KeepPanel:
             page = self._page
             if page.curves is None:
                 return
-            data = exported(page.campaign, page.choice, page.curves, page.chooser.shown, form)
+            data = export_bytes(page.campaign, page.choice, page.curves, page.selector.shown, form)
             body = base64.b64encode(data).decode("ascii")
             name = f"{page.campaign.name}_explorer.{form}"
             self._download.data = {"name": [name], "mime": [MIME[form]], "body": [body]}
@@ -367,20 +371,20 @@ class KeepPanel:
             path = save_model(folder, page.choice.effects, page.campaign.own_files(page.choice.effects))
         except (ExperimentError, TableError, OSError) as error:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
-            self.said.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
+            self.message.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
             return
         rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
-        self.said.text = (
+        self.message.text = (
             f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
-            f" {escaped(model_words(page.choice.effects))}. The same:</p>"
-            f"{command_block(self._lines(save=True))}<p>New tables and report by</p>{command_block([rerun])}"
+            f" {escaped(model_text(page.choice.effects))}. The same as a command:</p>"
+            f"{command_block(self._lines(save=True))}<p>For new tables and a new report:</p>{command_block([rerun])}"
         )
 
     def _lines(self, *, save: bool = False) -> list[str]:
         page = self._page
-        start = page.ground.start
+        start = page.background.initial
         return commands(page.campaign, start, page.choice, fitted=page.is_fitted(), save=save)
 
     def commands(self) -> str:
-        """What to type for what is on the page."""
+        """The commands that reproduce the state of the page, as HTML."""
         return command_block(self._lines())

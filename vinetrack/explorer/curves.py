@@ -1,9 +1,9 @@
-"""Curves of a model at given sizes for every trial, fast enough to follow a slider.
+"""Curves of a model with given sizes for every trial, fast enough for a slider.
 
-As in a comparison, a prediction is aligned by the trial's own release and origin alone: the origin is where the vine is
-seen at rest; the release, and the origin where no rest was filmed, minimise the mean square. Each trial is simulated
-once on a grid and shifted there. A motion that follows a pressure measured along with it has the clock of that pressure
-and cannot be shifted: its release stays that of the comparison.
+As in a comparison, a prediction is aligned only by the trial's own release and origin. The origin is the rest position
+of the vine; the release, and the origin if no rest was filmed, minimise the mean square residual. Each trial is
+simulated once on a grid, which is then shifted. A motion under a recorded pressure is tied to the clock of that
+pressure and cannot be shifted: its release remains that of the comparison.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
-from vinetrack.explorer.campaign import Campaign, ShownTrial
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial
 from vinetrack.inference.left_out import TOLD_APART, scaled_least_squares
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
 GRID_POINTS = 500
-"""Of the grid a trial is simulated on. Derived: linear interpolation errs by h²·x″/8; with h = T/500 and x″ of order
-8·L/T² that is 4·10⁻⁶ of the length; half the points make it 1.6·10⁻⁵."""
+"""Points of the simulation grid. Derived: the error of linear interpolation is h²·x″/8; with h = T/500 and x″ of order
+8·L/T² that is 4·10⁻⁶ of the length; with half the points 1.6·10⁻⁵."""
 
-ROOM_FRAMES = 25
-"""Frames beyond the recording that the grid reaches; derived: five of the largest steps of the alignment."""
+MARGIN_FRAMES = 25
+"""Frames by which the grid extends beyond the recording; derived: five of the largest steps of the alignment."""
 
-SHIFTS = 12
-"""Newton steps of the alignment; chosen: a release found by the comparison settles in two or three."""
+MAX_NEWTON_STEPS = 12
+"""Newton steps of the alignment at most; chosen: starting from the comparison, two or three suffice."""
 
-LARGEST_SHIFT_FRAMES = 5.0
-"""Of one step; chosen: a steep start cannot throw the release beyond the data."""
+MAX_STEP_FRAMES = 5.0
+"""Largest step, in frames; chosen: keeps the release within the data even from a poor start."""
 
-SETTLED_FRAMES = 1e-3
-"""Chosen: at 1 m/s and 1000 frames a second, a thousandth of a frame is 1 µm."""
+CONVERGED_STEP_FRAMES = 1e-3
+"""Step, in frames, below which the alignment has converged. Chosen: at 1 m/s and 1000 frames per second, 1 µm."""
 
 
 @dataclass(frozen=True)
 class SizedModel:
-    """A model with its sizes: parameters in `model`, yield pressures, Pa, by name of trial."""
+    """A model with its parameter values, and yield pressures, Pa, by name of trial."""
 
     model: Model
     yield_Pa: Mapping[str, float]
@@ -51,9 +51,9 @@ class SizedModel:
 class ModelCurves:
     """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames.
 
-    `release_s` and `origin_m` are on the track's clock and ruler. `growth_m` is the position the camera would report,
-    from the origin that the page uses (`AlignedTrial.origin_m`), `residual_m` measurement minus model. `path_m`, shape
-    (GRID_POINTS,), is the whole motion at `path_s` since that release, from the model's own origin.
+    `release_s` and `origin_m` are in the coordinates of the track. `growth_m` is the position that the camera would
+    report, from the origin of the page (`ExplorerTrial.origin_m`), `residual_m` is measurement minus model. `path_m`,
+    shape (GRID_POINTS,), is the whole motion at `path_s` since that release, from the model's own origin.
     """
 
     release_s: float
@@ -70,62 +70,62 @@ class ModelCurves:
         return math.sqrt(self.mean_square_m2)
 
     def lead_position_m(self, time_s: Floats) -> Floats:
-        """Position on the track's ruler at instants of the track's clock; NaN beyond what was simulated.
+        """Return positions at times, both in the coordinates of the track; NaN beyond the simulation.
 
         Parameters
         ----------
-        time_s : instants, any shape.
+        time_s : times, any shape.
 
         Returns
         -------
         array of the same shape, m
         """
-        since = time_s - self.release_s
-        return self.origin_m + np.interp(since, self.path_s, self.path_m, right=math.nan)
+        since_release = time_s - self.release_s
+        return self.origin_m + np.interp(since_release, self.path_s, self.path_m, right=math.nan)
 
 
 Curves = tuple[ModelCurves, ...]
-"""A motion for every trial of a campaign, in its order."""
+"""The predicted motion of every trial of a campaign, in its order."""
 
 
-def follow(campaign: Campaign, sized: SizedModel, before: Curves | None = None) -> Curves:
+def simulate_curves(campaign: Campaign, sized_model: SizedModel, before: Curves | None = None) -> Curves:
     """Simulate every trial and align it with its measurement.
 
     Parameters
     ----------
     before : curves whose releases the alignment starts from; by default those of the comparison.
     campaign : the trials.
-    sized : model, sizes and yield pressures.
+    sized_model : model, sizes and yield pressures.
 
     Returns
     -------
-    tuple of ModelCurves, one a trial
+    tuple of ModelCurves, one per trial
 
     Raises
     ------
     SimulationError
-        If the model cannot be followed at these sizes.
+        If the model cannot be simulated with these sizes.
     """
-    seen = campaign.trials
-    starts = [trial.release_s for trial in seen]
+    trials = campaign.trials
+    starts = [trial.release_s for trial in trials]
     if before is not None:
         starts = [
             curve.release_s if trial.data.trace is None else start
-            for curve, trial, start in zip(before, seen, starts, strict=True)
+            for curve, trial, start in zip(before, trials, starts, strict=True)
         ]
-    grids = [_grid(trial) for trial in seen]
-    moved = simulate_many(
-        sized.model,
-        [with_yield(trial.data.trial, sized.yield_Pa) for trial in seen],
+    grids = [_grid(trial) for trial in trials]
+    trajectories = simulate_many(
+        sized_model.model,
+        [with_yield_pressure(trial.data.trial, sized_model.yield_Pa) for trial in trials],
         grids,
-        traces=[_since(trial) for trial in seen],
+        traces=[_trace_since_release(trial) for trial in trials],
         host=campaign.host,
     )
-    return tuple(_aligned(*parts) for parts in zip(seen, grids, moved, starts, strict=True))
+    return tuple(_aligned(*parts) for parts in zip(trials, grids, trajectories, starts, strict=True))
 
 
-def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
-    """The trial with the yield pressure that a fit found for its vine, where it found one.
+def with_yield_pressure(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
+    """Return the trial with the fitted yield pressure of its vine, if there is one.
 
     Parameters
     ----------
@@ -139,55 +139,57 @@ def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
-def _grid(seen: ShownTrial) -> Floats:
-    """Instants since release: until the end of the recording and a little on."""
-    data = seen.data
-    last_s = max(data.time_s[-1] - seen.release_s, 0.0) + ROOM_FRAMES * data.frame_s
+def _grid(aligned: ExplorerTrial) -> Floats:
+    """Times since release, up to the end of the recording plus a margin."""
+    data = aligned.data
+    last_s = max(data.time_s[-1] - aligned.release_s, 0.0) + MARGIN_FRAMES * data.frame_s
     return np.linspace(0.0, last_s, GRID_POINTS)
 
 
-def _since(seen: ShownTrial) -> Trace | None:
-    trace = seen.data.trace
-    return None if trace is None else (trace[0] - seen.release_s, trace[1])
+def _trace_since_release(aligned: ExplorerTrial) -> Trace | None:
+    trace = aligned.data.trace
+    return None if trace is None else (trace[0] - aligned.release_s, trace[1])
 
 
-def _aligned(seen: ShownTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
-    """Newton's steps in release, and in the origin where the vine was not seen at rest."""
-    data, position = seen.data, moved.observed_position_m
+def _aligned(aligned: ExplorerTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
+    """Newton steps in release, and in the origin if the vine was not filmed at rest."""
+    data, position = aligned.data, moved.observed_position_m
     speed = np.gradient(position, grid)
-    release_s, origin_m = start_s, seen.origin_m
-    longest_s = LARGEST_SHIFT_FRAMES * data.frame_s
-    for _ in range(SHIFTS):
-        since = data.time_s - release_s
-        left = data.lead_position_m - origin_m - np.interp(since, grid, position)
-        # Before release the vine stands: its speed is zero there.
-        held = data.trace is not None
-        slope = np.zeros(since.size) if held else -np.interp(since, grid, speed, left=0.0, right=0.0)
-        later_s, higher_m = _step(slope, left, free_origin=not seen.origin_known)
-        later_s = min(max(later_s, -longest_s), longest_s)
-        release_s += later_s
-        origin_m += higher_m
-        if abs(later_s) < SETTLED_FRAMES * data.frame_s:
+    release_s, origin_m = start_s, aligned.origin_m
+    longest_s = MAX_STEP_FRAMES * data.frame_s
+    for _ in range(MAX_NEWTON_STEPS):
+        since_release = data.time_s - release_s
+        residual = data.lead_position_m - origin_m - np.interp(since_release, grid, position)
+        # Before release the vine is at rest: its velocity is zero.
+        is_fixed = data.trace is not None
+        slope = (
+            np.zeros(since_release.size) if is_fixed else -np.interp(since_release, grid, speed, left=0.0, right=0.0)
+        )
+        shift_s, rise_m = _step(slope, residual, free_origin=not aligned.origin_known)
+        shift_s = min(max(shift_s, -longest_s), longest_s)
+        release_s += shift_s
+        origin_m += rise_m
+        if abs(shift_s) < CONVERGED_STEP_FRAMES * data.frame_s:
             break
     growth = np.interp(data.time_s - release_s, grid, position)
     residual = data.lead_position_m - origin_m - growth
-    counted = residual[seen.counts_from(release_s) :]
-    above = origin_m - seen.origin_m
-    return ModelCurves(release_s, origin_m, growth + above, residual, float(np.mean(counted**2)), grid, position)
+    counted = residual[aligned.first_counted_frame(release_s) :]
+    offset = origin_m - aligned.origin_m
+    return ModelCurves(release_s, origin_m, growth + offset, residual, float(np.mean(counted**2)), grid, position)
 
 
-def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, float]:
-    """Least squares of what is left on a shift in time, and one in position where that is free."""
+def _step(slope: Floats, residual: Floats, *, free_origin: bool) -> tuple[float, float]:
+    """Least-squares fit of the residuals by a shift in time, and one in position if that is free."""
     if not free_origin:
         square = float(slope @ slope)
-        return (float(slope @ left) / square if square > 0 else 0.0), 0.0
+        return (float(slope @ residual) / square if square > 0 else 0.0), 0.0
     design = np.column_stack([slope, np.ones(slope.size)])
-    later, higher = scaled_least_squares(design, left, math.sqrt(TOLD_APART))
-    return float(later), float(higher)
+    shift, rise = scaled_least_squares(design, residual, math.sqrt(TOLD_APART))
+    return float(shift), float(rise)
 
 
 def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
-    """Root mean square position error by condition, m; its trials count alike, however many frames they have.
+    """Return the root mean square position error by condition, m; all trials have the same weight.
 
     Parameters
     ----------
@@ -199,18 +201,20 @@ def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
     dict, m by condition
     """
     return {
-        condition: math.sqrt(float(np.mean([curves[i].mean_square_m2 for i in campaign.of_condition(condition)])))
+        condition: math.sqrt(
+            float(np.mean([curves[i].mean_square_m2 for i in campaign.indices_of_condition(condition)]))
+        )
         for condition in campaign.conditions
     }
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
-    """Root mean square over conditions, m; NaN over none. Conditions whose error is not known are passed over.
+    """Return the root mean square over conditions with a known error, m; NaN if there are none.
 
     Parameters
     ----------
     errors : m by condition; NaN where unknown.
-    conditions : those that count.
+    conditions : over which to average.
 
     Returns
     -------
@@ -220,8 +224,8 @@ def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
     return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
-def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
-    """Yield pressures, Pa, by trial, from those that a fit gives by vine (and stated value, where it has several).
+def fitted_yield_pressures(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Return fitted yield pressures by trial, from those by vine (and stated value, if a vine has several).
 
     Parameters
     ----------
@@ -233,8 +237,8 @@ def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, flo
     dict, Pa by name of trial
     """
     yields_Pa = {}
-    for seen in campaign.trials:
-        trial = seen.data.trial
+    for aligned in campaign.trials:
+        trial = aligned.data.trial
         for vine in (trial.vine, f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"):
             value = numbers.get(f"{YIELD_PRESSURE}[{vine}]")
             if value is not None:

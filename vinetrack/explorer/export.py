@@ -1,4 +1,4 @@
-"""What is on the page as files: the curves as CSV, the figure as SVG or PNG, the choice as a command."""
+"""Exports of the page: the curves as CSV, the figure as SVG or PNG, the choice as a command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import ChoiceError, ModelChoice, changed, sizes_of
+from vinetrack.explorer.choice import ChoiceError, ModelChoice, added_and_dropped, sizes_of
 from vinetrack.explorer.curves import Curves, errors_m
 
 if TYPE_CHECKING:
@@ -34,14 +34,14 @@ CURVE_COLUMNS = (
 
 
 def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
-    """Measurement and model at every frame used, since release and from the origin; columns `CURVE_COLUMNS`.
+    """Return measurement and model at every frame used, since release and from the origin.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     choice : effects and sizes.
     curves : of that model.
-    shown : places of the trials to write.
+    shown : indices of the trials to write.
 
     Returns
     -------
@@ -51,26 +51,26 @@ def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: 
 
     parts = []
     for i in shown:
-        seen, motion = campaign.trials[i], curves[i]
-        band = campaign.bands.get(seen.condition)
-        nothing = np.full(seen.time_s.size, math.nan)
-        mean_m = nothing if band is None else np.interp(seen.time_s, band.time_s, band.mean_m)
-        sigma_m = nothing if band is None else np.interp(seen.time_s, band.time_s, band.sigma_m)
-        columns = ("+".join(choice.effects), seen.condition, seen.name, seen.time_s, seen.growth_m)
+        aligned, motion = campaign.trials[i], curves[i]
+        band = campaign.bands.get(aligned.condition)
+        unknown = np.full(aligned.time_s.size, math.nan)
+        mean_m = unknown if band is None else np.interp(aligned.time_s, band.time_s, band.mean_m)
+        sigma_m = unknown if band is None else np.interp(aligned.time_s, band.time_s, band.sigma_m)
+        columns = ("+".join(choice.effects), aligned.condition, aligned.name, aligned.time_s, aligned.growth_m)
         model_columns = (motion.growth_m, motion.residual_m, mean_m, sigma_m)
         parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, (*columns, *model_columns), strict=True))))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
 
 
-def exported(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
-    """The curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`.
+def export_bytes(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
+    """Return the curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     choice : effects and sizes.
     curves : of that model.
-    shown : places of the trials to draw.
+    shown : indices of the trials to draw.
     form : one of `FORMATS`.
 
     Returns
@@ -83,7 +83,7 @@ def exported(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Seq
         If it is none of these.
     """
     if form not in FORMATS:
-        raise ChoiceError(f"{form!r} is no form of export: say one of {', '.join(FORMATS)}.")
+        raise ChoiceError(f"{form!r} is no export format: use one of {', '.join(FORMATS)}.")
     table = curve_table(campaign, choice, curves, shown)
     if form == "csv":
         return table.to_csv(index=False, lineterminator="\n").encode("utf-8")
@@ -108,7 +108,7 @@ def _compared(
             "model": "+".join(choice.effects),
             "condition": conditions,
             "condition_label": [campaign.labels[name] for name in conditions],
-            "vine": [campaign.trials[campaign.of_condition(name)[0]].data.trial.vine for name in conditions],
+            "vine": [campaign.trials[campaign.indices_of_condition(name)[0]].data.trial.vine for name in conditions],
             "rms_position_m": rms,
             "ratio": [r / f if f > 0 else math.nan for r, f in zip(rms, floors, strict=True)],
         }
@@ -116,35 +116,35 @@ def _compared(
 
 
 def write_export(campaign: Campaign, choice: ModelChoice, curves: Curves, path: Path) -> None:
-    """Everything in one file whose ending says in which form, whole or not at all.
+    """Write all trials to a file, atomically; its suffix gives the format.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     choice : effects and sizes.
     curves : of that model.
-    path : of the file; its ending gives the format.
+    path : of the file.
 
     Raises
     ------
     ChoiceError
-        If the ending is none of `FORMATS`.
+        If the suffix is none of `FORMATS`.
     """
     from vinetrack.core.tables import write_bytes
 
     form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, exported(campaign, choice, curves, range(len(campaign.trials)), form))
+    write_bytes(path, export_bytes(campaign, choice, curves, range(len(campaign.trials)), form))
 
 
 def commands(
     campaign: Campaign, start: ModelChoice, choice: ModelChoice, *, fitted: bool, save: bool = False
 ) -> list[str]:
-    """What to type for the same without the page, a line a command.
+    """Return the commands that reproduce the choice without the page.
 
     Parameters
     ----------
-    start : the choice the page opened with.
-    fitted : whether the sizes are those of a fit: else they are said one by one.
+    start : the choice with which the page opened.
+    fitted : whether the sizes are those of a fit; otherwise each is given explicitly.
     campaign : as `read_campaign` returns it.
     choice : effects and sizes.
     save : whether the model is to be saved.
@@ -154,37 +154,39 @@ def commands(
     list of str
     """
     folder = shlex.quote(campaign.folder.as_posix())
-    added, dropped = changed(campaign, choice)
-    if not added and not dropped and (fitted or not _moved(campaign, start, choice)):
+    added, dropped = added_and_dropped(campaign, choice)
+    if not added and not dropped and (fitted or not _changed_sizes(campaign, start, choice)):
         return [f"vinetrack compare {folder}"]
     if fitted and not dropped:
         end = " --save" if save else ""
-        return [f"vinetrack add {_typed(campaign, name)} {folder}{end}" for name in added]
-    words = [f"--add {name}" for name in added] + [f"--drop {name}" for name in dropped]
+        return [f"vinetrack add {_command_line_name(campaign, name)} {folder}{end}" for name in added]
+    options = [f"--add {name}" for name in added] + [f"--drop {name}" for name in dropped]
     if fitted or save:
-        words += ["--refit"] if fitted else []
-        return [" ".join(["vinetrack explore", folder, *words, *(["--save"] if save else [])])]
-    words += [f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in _moved(campaign, start, choice).items()]
-    return [" ".join(["vinetrack explore", folder, *words])]
+        options += ["--refit"] if fitted else []
+        return [" ".join(["vinetrack explore", folder, *options, *(["--save"] if save else [])])]
+    options += [
+        f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in _changed_sizes(campaign, start, choice).items()
+    ]
+    return [" ".join(["vinetrack explore", folder, *options])]
 
 
-def _typed(campaign: Campaign, effect: str) -> str:
-    """An effect as it is named on the command line: by its file where the settings do not name that yet."""
+def _command_line_name(campaign: Campaign, effect: str) -> str:
+    """Name of an effect on the command line: its file, if the settings do not list that yet."""
     path = campaign.effects[effect].path
-    unnamed = campaign.own_files([effect]) and path.name not in campaign.experiment.settings.effects
-    return shlex.quote(path.as_posix()) if unnamed else effect
+    is_unlisted = campaign.own_files([effect]) and path.name not in campaign.experiment.settings.effects
+    return shlex.quote(path.as_posix()) if is_unlisted else effect
 
 
-def _moved(campaign: Campaign, start: ModelChoice, choice: ModelChoice) -> dict[str, float]:
-    """Sizes of effects in the model that are not those the page opened with, by name."""
+def _changed_sizes(campaign: Campaign, start: ModelChoice, choice: ModelChoice) -> dict[str, float]:
+    """Sizes of effects in the model that differ from those with which the page opened, by name."""
     names = [
         size.name for effect in choice.effects for size in sizes_of(campaign, campaign.effects[effect], choice.numbers)
     ]
     return {name: choice.numbers[name] for name in names if choice.numbers[name] != start.numbers.get(name)}
 
 
-def model_words(names: Sequence[str]) -> str:
-    """A model in words: the base effects by one name, the others by theirs.
+def model_text(names: Sequence[str]) -> str:
+    """Return a model as text, with one name for the base effects together.
 
     Parameters
     ----------
@@ -195,6 +197,6 @@ def model_words(names: Sequence[str]) -> str:
     str
     """
     others = [name.replace("_", " ") for name in names if name not in BASE_EFFECTS]
-    lacking = [name for name in BASE_EFFECTS if name not in names]
-    base = "base model" if not lacking else " + ".join(name for name in names if name in BASE_EFFECTS)
+    missing_base = [name for name in BASE_EFFECTS if name not in names]
+    base = "base model" if not missing_base else " + ".join(name for name in names if name in BASE_EFFECTS)
     return " + ".join([base, *others])

@@ -1,4 +1,4 @@
-"""The recording, to be scrubbed through, with the tracked edge and the model's drawn over it."""
+"""Panel to step through a recording, with the tracked edge and the model's drawn over it."""
 
 from __future__ import annotations
 
@@ -13,32 +13,46 @@ from bokeh.models import Button, Column, ColumnDataSource, LinearColorMapper, Ra
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
-from vinetrack.explorer.campaign import Campaign, ShownTrial
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial
 from vinetrack.explorer.curves import Curves
-from vinetrack.explorer.look import EARLIER_EDGE, MEASURED_EDGE, MODEL_EDGE, escaped, progress_bar, sheet, words
-from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
+from vinetrack.explorer.look import (
+    MEASURED_EDGE,
+    MODEL_EDGE,
+    REFERENCE_EDGE,
+    escaped,
+    html_div,
+    progress_bar,
+    stylesheet,
+)
+from vinetrack.explorer.recording import DecodedRecording, RecordingView, recording_view
 from vinetrack.results.folder_layout import Results
 
 PLAY_MS = 70
-"""Between two frames while playing; chosen: 14 a second, as fast as pictures of 960 pixels are sent."""
+"""Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent."""
 NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
 
 
 class FilmPanel:
-    """One trial at a time. `instant` hears where in time, s since release, the frame lies (None: nowhere)."""
+    """Shows one trial at a time; calls `instant` with the time of the frame, s since release (None: no frame)."""
 
     def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float | None], None]) -> None:
         self.campaign, self._document, self._instant = campaign, document, instant
         self._curves: Curves | None = None
-        self._earlier: Curves | None = None
+        self._reference: Curves | None = None
         self._film: DecodedRecording | None = None
         self._view: RecordingView | None = None
         self._playing: Any = None
-        names = [seen.name for seen in campaign.trials]
-        self.choose = Select(
-            options=names, value=names[0], width=220, title="trial", name="film_trial", stylesheets=[sheet()], margin=0
+        names = [aligned.name for aligned in campaign.trials]
+        self.trial_select = Select(
+            options=names,
+            value=names[0],
+            width=220,
+            title="trial",
+            name="film_trial",
+            stylesheets=[stylesheet()],
+            margin=0,
         )
-        self.play = Button(label="▶ play", width=84, name="film_play", stylesheets=[sheet()], margin=0)
+        self.play = Button(label="▶ play", width=84, name="film_play", stylesheets=[stylesheet()], margin=0)
         self.frame = Slider(
             start=0,
             end=1,
@@ -47,20 +61,20 @@ class FilmPanel:
             title="frame",
             sizing_mode="stretch_width",
             name="film_frame",
-            stylesheets=[sheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")],
+            stylesheets=[stylesheet(":host { padding: 0 10px 0 4px; min-width: 180px; flex: 1 1 180px; }")],
             margin=0,
         )
-        self.caption = words(name="film_caption")
+        self.caption = html_div(name="film_caption")
         self._picture = ColumnDataSource({"image": []}, name="film_picture")
         self._edges = ColumnDataSource({"xs": [], "ys": [], "colour": [], "dash": []}, name="film_edges")
         self.figure = self._draw()
-        self.choose.on_change("value", lambda _attr, _old, new: self.show_trial(new))
+        self.trial_select.on_change("value", lambda _attr, _old, new: self.show_trial(new))
         self.frame.on_change("value", lambda _attr, _old, new: self._show_frame(int(new)))
         self.play.on_click(self._toggle_play)
         controls = Row(
-            children=[self.choose, self.play, self.frame],
+            children=[self.trial_select, self.play, self.frame],
             sizing_mode="stretch_width",
-            stylesheets=[sheet(NARROW)],
+            stylesheets=[stylesheet(NARROW)],
             margin=0,
         )
         self.root = Column(
@@ -90,18 +104,18 @@ class FilmPanel:
         fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
         return fig
 
-    def set_curves(self, curves: Curves | None, earlier: Curves | None) -> None:
-        """What the model says now, and said when the page opened.
+    def set_curves(self, curves: Curves | None, reference: Curves | None) -> None:
+        """Set the curves of the current model and of the model for comparison.
 
         Parameters
         ----------
-        curves, earlier : of the model now and as the page opened; None where not yet known.
+        curves, reference : of the current model and of the model for comparison; None if not yet known.
         """
-        self._curves, self._earlier = curves, earlier
+        self._curves, self._reference = curves, reference
         self._draw_edges()
 
     def show_trial(self, name: str) -> None:
-        """Begin with another trial: decode its recording, or say that there is none.
+        """Show another trial: decode its recording, or show why there is none.
 
         Parameters
         ----------
@@ -109,26 +123,26 @@ class FilmPanel:
         """
         self._stop()
         if self._film is not None:
-            self._film.give_up()
+            self._film.cancel()
         self._film = self._view = None
-        if self.choose.value != name:
-            self.choose.value = name
+        if self.trial_select.value != name:
+            self.trial_select.value = name
             return
-        seen = self.campaign.trial(name)
-        view = view_of(Results(self.campaign.folder), seen.data.trial)
+        aligned = self.campaign.trial(name)
+        view = recording_view(Results(self.campaign.folder), aligned.data.trial)
         self.figure.visible = False
         if isinstance(view, str):
-            last = max(seen.data.time_s.size - 1, 1)
-            self.frame.update(start=0, end=last, value=(seen.data.n_rest + last) // 2)
-            self._say_frame(int(self.frame.value), view)
+            last = max(aligned.data.time_s.size - 1, 1)
+            self.frame.update(start=0, end=last, value=(aligned.data.n_rest + last) // 2)
+            self._update_caption(int(self.frame.value), view)
             return
         self._view = view
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
         self._film = DecodedRecording(view.path)
-        self._film.in_background(self._heard)
+        self._film.start_decoding(self._on_decoded)
 
-    def _heard(self, film: DecodedRecording) -> None:
-        """From the decoding thread."""
+    def _on_decoded(self, film: DecodedRecording) -> None:
+        """Called from the decoding thread."""
         self._document.add_next_tick_callback(partial(self._decoded, film))
 
     def _decoded(self, film: DecodedRecording) -> None:
@@ -141,7 +155,7 @@ class FilmPanel:
             self.caption.text = progress_bar(share, f"decoding {film.path.name}: {film.count} frames")
             return
         if film.count == 0:
-            self.caption.text = f'<span class="bad">{escaped(film.words or "not one frame can be decoded")}</span>'
+            self.caption.text = f'<span class="bad">{escaped(film.error or "no frame could be decoded")}</span>'
             return
         moving = self._first_moving()
         self.frame.update(start=0, end=max(film.count - 1, 1))
@@ -151,7 +165,7 @@ class FilmPanel:
             self._show_frame(moving)
 
     def _first_moving(self) -> int:
-        """A frame worth seeing first: half-way along the motion."""
+        """The frame shown first: half-way along the motion."""
         if self._view is None or self._film is None:
             return 0
         known = np.flatnonzero(np.isfinite(self._view.edge_px))
@@ -169,29 +183,29 @@ class FilmPanel:
         if self._film is not None and self._film.complete and frame < self._film.count:
             self._picture.data = {"image": [self._film.picture(frame)]}
             self._draw_edges()
-        self._say_frame(frame)
+        self._update_caption(frame)
 
     def _time_s(self, frame: int) -> float:
-        """When a frame was filmed, on the clock of the track."""
-        times = self._seen().data.time_s if self._view is None else self._view.time_s
+        """Time of a frame on the clock of the track."""
+        times = self._shown_trial().data.time_s if self._view is None else self._view.time_s
         return float(times[min(frame, times.size - 1)])
 
-    def _seen(self) -> ShownTrial:
-        return self.campaign.trial(self.choose.value)
+    def _shown_trial(self) -> ExplorerTrial:
+        return self.campaign.trial(self.trial_select.value)
 
     def _positions(self, frame: int) -> tuple[float, float, float]:
-        """Where the edge was measured, and where the model had and has it, m on the track's ruler; NaN: unknown."""
-        time_s, seen = self._time_s(frame), self._seen()
-        place = self.campaign.trials.index(seen)
+        """Positions of the edge, m: measured, of the model for comparison, of the current model; NaN if unknown."""
+        time_s, aligned = self._time_s(frame), self._shown_trial()
+        place = self.campaign.trials.index(aligned)
         at = np.array([time_s])
-        # The fit begins at the first frame that it uses: before that the model says nothing.
-        silent = time_s < float(seen.data.time_s[0])
+        # The model is not defined before the first frame of the fit.
+        is_before_fit = time_s < float(aligned.data.time_s[0])
         model_m = [
-            math.nan if curves is None or silent else float(curves[place].lead_position_m(at)[0])
-            for curves in (self._earlier, self._curves)
+            math.nan if curves is None or is_before_fit else float(curves[place].lead_position_m(at)[0])
+            for curves in (self._reference, self._curves)
         ]
         if self._view is None:
-            return float(seen.data.lead_position_m[min(frame, seen.data.time_s.size - 1)]), model_m[0], model_m[1]
+            return float(aligned.data.lead_position_m[min(frame, aligned.data.time_s.size - 1)]), model_m[0], model_m[1]
         known = frame < self._view.lead_position_m.size
         return (float(self._view.lead_position_m[frame]) if known else math.nan), model_m[0], model_m[1]
 
@@ -200,17 +214,17 @@ class FilmPanel:
         if view is None or film is None or not film.complete or film.count == 0:
             return
         frame = int(self.frame.value)
-        measured_m, earlier_m, now_m = self._positions(frame)
+        measured_m, reference_m, now_m = self._positions(frame)
         edges = [
             (float(view.edge_px[frame]) if frame < view.edge_px.size else math.nan, MEASURED_EDGE, "solid", measured_m),
-            (float(view.along_px(np.array(earlier_m))), EARLIER_EDGE, "dotted", earlier_m),
+            (float(view.along_px(np.array(reference_m))), REFERENCE_EDGE, "dotted", reference_m),
             (float(view.along_px(np.array(now_m))), MODEL_EDGE, "dashed", now_m),
         ]
-        same = self._earlier is self._curves
+        same = self._reference is self._curves
         drawn = [
             (view.across(px, frame), colour, dash)
             for px, colour, dash, at in edges
-            if math.isfinite(px) and math.isfinite(at) and not (same and colour == EARLIER_EDGE)
+            if math.isfinite(px) and math.isfinite(at) and not (same and colour == REFERENCE_EDGE)
         ]
         half = 0.5 * (1 - film.scale)
         self._edges.data = {
@@ -220,29 +234,29 @@ class FilmPanel:
             "dash": [dash for _, _, dash in drawn],
         }
 
-    def _say_frame(self, frame: int, reason: str = "") -> None:
-        seen = self._seen()
-        since_s = self._time_s(frame) - seen.release_s
+    def _update_caption(self, frame: int, reason: str = "") -> None:
+        aligned = self._shown_trial()
+        since_s = self._time_s(frame) - aligned.release_s
         positions = zip(("tracked", "compared with", "model"), self._positions(frame), strict=True)
-        colours = {"tracked": MEASURED_EDGE, "compared with": EARLIER_EDGE, "model": MODEL_EDGE}
+        colours = {"tracked": MEASURED_EDGE, "compared with": REFERENCE_EDGE, "model": MODEL_EDGE}
         positions_text = [
-            f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (at - seen.origin_m):.1f} mm</span>'
-            for name, at in positions
-            if math.isfinite(at)
+            f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
+            for name, m in positions
+            if math.isfinite(m)
         ]
         if not reason and self._view is None:
-            reason = str(view_of(Results(self.campaign.folder), seen.data.trial))
+            reason = str(recording_view(Results(self.campaign.folder), aligned.data.trial))
         if self._view is not None and frame < self._view.by_hand.size and self._view.by_hand[frame]:
             positions_text.append("corrected by hand")
-        words_ = f"<p>{escaped(reason)}</p>" if reason else ""
+        notice = f"<p>{escaped(reason)}</p>" if reason else ""
         when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
-        self.caption.text = f"{words_}<p>{when} · {' · '.join(positions_text)}</p>"
-        self._instant(seen.name, since_s)
+        self.caption.text = f"{notice}<p>{when} · {' · '.join(positions_text)}</p>"
+        self._instant(aligned.name, since_s)
 
     def refresh(self) -> None:
-        """Say the frame again, for curves that have changed."""
+        """Update the caption after a change of the curves."""
         if self._film is None or self._film.complete:
-            self._say_frame(int(self.frame.value))
+            self._update_caption(int(self.frame.value))
 
     def _toggle_play(self) -> None:
         if self._playing is not None:
@@ -263,6 +277,6 @@ class FilmPanel:
         self.play.label = "▶ play"
 
     def close(self) -> None:
-        """Nobody looks any more."""
+        """The page was closed."""
         if self._film is not None:
-            self._film.give_up()
+            self._film.cancel()

@@ -1,4 +1,4 @@
-"""Fits of the explorer, in threads: the model in use, fitted once for all open pages, and the chosen models."""
+"""Fits of the explorer in background threads: the model in use, once for all open pages, and the chosen models."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import ModelChoice, first_choice, sized
-from vinetrack.explorer.curves import Curves, errors_m, follow
+from vinetrack.explorer.choice import ModelChoice, choice_in_use, sized_model
+from vinetrack.explorer.curves import Curves, errors_m, simulate_curves
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
@@ -27,21 +27,22 @@ from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 
 log = logging.getLogger(__name__)
 
-FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE to have the traceback."
+FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
 STRONG_CORRELATION = 0.9
-"""Chosen: two numbers of this correlation have errors 1/√(1 − 0.9²) = 2.3 times those with the other one known."""
+"""Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other
+parameter known."""
 
 CLEARLY_WORSE = 0.5
-"""Chosen: a fall of ln L by 0.5 is the limit of one standard error; two fits within it agree."""
+"""Decrease in ln L. Chosen: 0.5 corresponds to one standard error; two fits within it agree."""
 
 
-class GivenUp(Exception):  # noqa: N818 - nothing went wrong
-    """The fit is no longer wanted."""
+class FitCancelled(Exception):  # noqa: N818 - nothing went wrong
+    """The fit was cancelled."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit, the choice at its numbers, and what follows from them. `floors_m` are those of its own comparison."""
+    """A fit, the choice with its estimates, its curves and errors; `floors_m` is the replicate scatter."""
 
     choice: ModelChoice
     fit: Fit
@@ -51,7 +52,7 @@ class Fitted:
     seconds: float
 
     def number(self, name: str) -> Number | None:
-        """The fitted number of that name, None where it was not fitted.
+        """Return the estimate of a parameter, None if it was not fitted.
 
         Parameters
         ----------
@@ -65,9 +66,9 @@ class Fitted:
 
 
 def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
-    """Fit the model in use, as the stage of the workflow does.
+    """Fit the model in use, as the model stage of the workflow does.
 
-    Its likelihood is known from `fit.json`; where the first start reaches it, no others are tried.
+    The likelihood to be reached is in `fit.json`: if the first start reaches it, no others are tried.
 
     Parameters
     ----------
@@ -84,8 +85,8 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     FitError, EffectError, SimulationError
         If it cannot be fitted.
     """
-    begun = time.perf_counter()
-    model = sized(campaign, choice).model
+    started = time.perf_counter()
+    model = sized_model(campaign, choice).model
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
@@ -93,13 +94,13 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     result = begin(thorough=False)
     if not result.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
         result = begin()
-    return _weighed(campaign, choice, result, time.perf_counter() - begun)
+    return _evaluated(campaign, choice, result, time.perf_counter() - started)
 
 
 def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
-    """Fit what was chosen, from where a fit ended and the sizes that were chosen for what is new.
+    """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects.
 
-    Where that ends worse than without the new effects, or does not settle, it is tried once more from their defaults.
+    If the result is worse than without the new effects, or has not converged, it is refitted from their defaults.
 
     Parameters
     ----------
@@ -117,32 +118,32 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
     FitError, EffectError, SimulationError
         If it cannot be fitted.
     """
-    begun = time.perf_counter()
-    model = replace(sized(campaign, choice).model, values={})
+    started = time.perf_counter()
+    model = replace(sized_model(campaign, choice).model, values={})
     new = [effect for effect in model if effect.name not in before.model]
-    values = sized(campaign, choice).model.values
+    values = sized_model(campaign, choice).model.values
     begin = {key: value for effect in new for key, value in values.items() if key.startswith(f"{effect.name}.")}
     result = refit(before, model, start=begin, watch=watch)
     grew = set(before.model.names) <= set(model.names)
     worse = grew and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
     if new and (worse or not result.converged):
-        again: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
-        other = refit(before, model, start=again, watch=watch)
+        defaults: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
+        other = refit(before, model, start=defaults, watch=watch)
         result = max((result, other), key=lambda result: result.log_likelihood)
-    return _weighed(campaign, choice, result, time.perf_counter() - begun)
+    return _evaluated(campaign, choice, result, time.perf_counter() - started)
 
 
-def _weighed(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
-    """The fit compared with the measurement, as `vinetrack compare` does."""
-    settled = at_numbers(choice, {number.name: number.value for number in result.numbers})
-    curves = follow(campaign, sized(campaign, settled))
+def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
+    """Compare a fit with the measurement, as `vinetrack compare` does."""
+    fitted_choice = with_numbers(choice, {number.name: number.value for number in result.numbers})
+    curves = simulate_curves(campaign, sized_model(campaign, fitted_choice))
     table = compare(result, campaign.pairs, kinematics=campaign.kinematics).table
     floors = dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
-    return Fitted(settled, result, curves, errors_m(campaign, curves), floors, seconds)
+    return Fitted(fitted_choice, result, curves, errors_m(campaign, curves), floors, seconds)
 
 
-def at_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
-    """The same effects at these sizes.
+def with_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
+    """Return the same effects with these sizes.
 
     Parameters
     ----------
@@ -151,12 +152,12 @@ def at_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice
 
     Returns
     -------
-    Choice
+    ModelChoice
     """
     return replace(choice, numbers={**choice.numbers, **numbers})
 
 
-def gained_words(before: Fit, after: Fit) -> str:
+def likelihood_change_text(before: Fit, after: Fit) -> str:
     """Return how −2 ln L changed with a larger or smaller model, as a sentence.
 
     Parameters
@@ -169,14 +170,14 @@ def gained_words(before: Fit, after: Fit) -> str:
     """
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     more = len(after.numbers) - len(before.numbers)
-    numbers = f"{abs(more)} number{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
+    numbers = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
     if more == 0:
-        return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} with as many numbers."
+        return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} with the same number of parameters."
     return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} for {numbers}."
 
 
-def tied_words(result: Fit) -> list[str]:
-    """Return the pairs of fitted numbers with strongly correlated errors, largest correlation first, as text.
+def correlated_pairs_text(result: Fit) -> list[str]:
+    """Return the pairs of strongly correlated estimates, largest correlation first, as text.
 
     Parameters
     ----------
@@ -196,38 +197,38 @@ def tied_words(result: Fit) -> list[str]:
     return [words for _, words in sorted(pairs, reverse=True)]
 
 
-Told = TypeVar("Told")
+Progress = TypeVar("Progress")
 Outcome = TypeVar("Outcome")
 
 
-class FitJob(Generic[Told, Outcome]):
-    """One fit, or a search made of fits, in a thread; `told`, `done` and `failed` are called from that thread."""
+class FitJob(Generic[Progress, Outcome]):
+    """One fit, or a search made of fits, in a thread; the callbacks are called from that thread."""
 
     def __init__(
         self,
-        work: Callable[[Callable[[Told], None]], Outcome],
+        work: Callable[[Callable[[Progress], None]], Outcome],
         *,
-        told: Callable[[Told], None],
-        done: Callable[[Outcome], None],
-        failed: Callable[[str], None],
+        on_progress: Callable[[Progress], None],
+        on_success: Callable[[Outcome], None],
+        on_failure: Callable[[str], None],
     ) -> None:
-        self._work, self._told, self._done, self._failed = work, told, done, failed
-        self._unwanted = threading.Event()
-        self.begun = time.monotonic()
+        self._work, self._on_progress, self._on_success, self._on_failure = work, on_progress, on_success, on_failure
+        self._cancelled = threading.Event()
+        self.started = time.monotonic()
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}fit")
         self._thread.start()
 
     @property
     def running(self) -> bool:
-        """Whether it goes on, wanted."""
-        return self._thread.is_alive() and not self._unwanted.is_set()
+        """Whether it is running and was not cancelled."""
+        return self._thread.is_alive() and not self._cancelled.is_set()
 
-    def give_up(self) -> None:
-        """Let it end at its next step; nothing more is heard of it."""
-        self._unwanted.set()
+    def cancel(self) -> None:
+        """End it at its next step; no callback is called any more."""
+        self._cancelled.set()
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Until it has ended.
+        """Wait until it has ended.
 
         Parameters
         ----------
@@ -238,55 +239,55 @@ class FitJob(Generic[Told, Outcome]):
     def _run(self) -> None:
         try:
             result = self._work(self._watch)
-        except GivenUp:
+        except FitCancelled:
             return
         except UserError as error:
-            self._say(self._failed, str(error))
+            self._report(self._on_failure, str(error))
         except Exception:
             log.exception("a fit of the explorer")
-            self._say(self._failed, FAULT)
+            self._report(self._on_failure, FAULT)
         else:
-            if not self._unwanted.is_set():
-                self._done(result)
+            if not self._cancelled.is_set():
+                self._on_success(result)
 
-    def _say(self, whom: Callable[[str], None], words: str) -> None:
-        if not self._unwanted.is_set():
-            whom(words)
+    def _report(self, callback: Callable[[str], None], message: str) -> None:
+        if not self._cancelled.is_set():
+            callback(message)
 
-    def _watch(self, step: Told) -> None:
-        if self._unwanted.is_set():
-            raise GivenUp
-        self._told(step)
+    def _watch(self, step: Progress) -> None:
+        if self._cancelled.is_set():
+            raise FitCancelled
+        self._on_progress(step)
 
 
 log = logging.getLogger(__name__)
 
 
 class BackgroundFit:
-    """Grows in the background, in this order: `curves` and `errors_m` of the model in use, then its fit.
+    """Computes in a thread `curves` and `errors_m` of the model in use, then its fit.
 
-    `trouble` says why it got no further, blank where it did. Listeners are called from the background's thread.
+    `failure` is the reason if it failed, else blank. Listeners are called from that thread.
     """
 
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
         self.campaign = campaign
-        self.start = first_choice(campaign)
-        self.opening = self.start if choice in (None, self.start) else choice
+        self.initial = choice_in_use(campaign)
+        self.opening_choice = self.initial if choice in (None, self.initial) else choice
         self.curves: Curves | None = None
         self.errors_m: dict[str, float] = {}
         self.fitted: Fitted | None = None
         self.step: Step | None = None
-        self.trouble = ""
+        self.failure = ""
         self._listeners: list[Callable[[], None]] = []
-        self._thread = threading.Thread(target=self._grow, daemon=True, name=f"{THREAD_PREFIX}ground")
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}background")
 
     def begin(self) -> BackgroundFit:
-        """Start growing."""
+        """Start the thread."""
         self._thread.start()
         return self
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Until all is there, or something went wrong.
+        """Wait until it has finished or failed.
 
         Parameters
         ----------
@@ -294,81 +295,81 @@ class BackgroundFit:
         """
         self._thread.join(timeout_s)
 
-    def listen(self, heard: Callable[[], None]) -> None:
-        """Have `heard` called whenever something new is there.
+    def add_listener(self, listener: Callable[[], None]) -> None:
+        """Call `listener` whenever there is a new result or step.
 
         Parameters
         ----------
-        heard : takes no argument.
+        listener : takes no argument.
         """
-        self._listeners.append(heard)
+        self._listeners.append(listener)
 
-    def forget(self, heard: Callable[[], None]) -> None:
-        """Call it no more.
+    def remove_listener(self, listener: Callable[[], None]) -> None:
+        """Remove a listener.
 
         Parameters
         ----------
-        heard : as given to `listen`.
+        listener : as given to `add_listener`.
         """
-        if heard in self._listeners:
-            self._listeners.remove(heard)
+        if listener in self._listeners:
+            self._listeners.remove(listener)
 
     @property
-    def growing(self) -> bool:
-        """Whether more is to come."""
+    def running(self) -> bool:
+        """Whether the thread is running."""
         return self._thread.is_alive()
 
-    def _grow(self) -> None:
+    def _run(self) -> None:
         try:
-            self.curves = follow(self.campaign, sized(self.campaign, self.start))
+            self.curves = simulate_curves(self.campaign, sized_model(self.campaign, self.initial))
             self.errors_m = errors_m(self.campaign, self.curves)
-            self._tell()
-            self.fitted = first_fit(self.campaign, self.start, self._stepped)
+            self._notify()
+            self.fitted = first_fit(self.campaign, self.initial, self._on_step)
         except (FitError, EffectError, SimulationError) as error:
-            self.trouble = str(error)
+            self.failure = str(error)
         except Exception:
             log.exception("the model in use")
-            self.trouble = FAULT
-        self._tell()
+            self.failure = FAULT
+        self._notify()
 
-    def _stepped(self, step: Step) -> None:
+    def _on_step(self, step: Step) -> None:
         self.step = step
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
-        for heard in list(self._listeners):
-            heard()
+    def _notify(self) -> None:
+        for listener in list(self._listeners):
+            listener()
 
 
-_LEAST_SHARE = 0.04
-"""Of the bar at the begin; chosen: visible at a width of 200 pixels."""
+_INITIAL_FRACTION = 0.04
+"""Of the progress bar at the start; chosen: visible at a width of 200 pixels."""
 
 
 class FitProgress:
-    """How far a fit is, as a fraction and in words; `words` is the message where no fit runs.
+    """Progress of a fit, as a fraction and as text; `message` is shown when no fit runs.
 
-    The number of steps is unknown: progress is measured by the logarithm of the decrease that the next step promises,
-    from its largest value down to `CONVERGED_DECREASE`, where a fit stops.
+    The number of steps is unknown. Progress is measured on the logarithm of the predicted decrease of −2 ln L by the
+    next step, from its largest value down to `CONVERGED_DECREASE`, where a fit stops.
     """
 
     def __init__(self) -> None:
-        self.words = ""
-        self._begun = 0.0
+        self.message = ""
+        self._started = 0.0
         self._largest = 0.0
-        self._share = _LEAST_SHARE
+        self._fraction = _INITIAL_FRACTION
         self._step: Step | None = None
 
     def begin(self, now: float) -> None:
-        """A fit is wanted.
+        """Start the clock of a new fit.
 
         Parameters
         ----------
         now : monotonic clock, s.
         """
-        self._begun, self._largest, self._share, self._step, self.words = now, 0.0, _LEAST_SHARE, None, ""
+        self._started, self._largest, self._fraction, self._step, self.message = now, 0.0, _INITIAL_FRACTION, None, ""
 
-    def reach(self, step: Step) -> None:
-        """It has come so far.
+    def update(self, step: Step) -> None:
+        """Take the latest step of the fit into account.
 
         Parameters
         ----------
@@ -381,20 +382,20 @@ class FitProgress:
             done = math.log10(
                 max(self._largest, step.predicted_decrease) / max(step.predicted_decrease, CONVERGED_DECREASE)
             )
-            self._share = max(self._share, min(done / whole, 0.97))
+            self._fraction = max(self._fraction, min(done / whole, 0.97))
 
-    def state(self, now: float, about: str, other: Step | None = None) -> tuple[float, str]:
-        """Share done and words; `other` is the step of what has to be done first.
+    def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
+        """Return the fraction done and the text of the status line.
 
         Parameters
         ----------
         now : monotonic clock, s.
-        about : what is fitted.
-        other : the step of what has to be done first; None where nothing has.
+        task : what is done.
+        other : the latest step of a fit that has to finish first; None for none.
 
         Returns
         -------
-        share : float, 0 to 1
+        fraction : float, 0 to 1
         text : str
         """
         step = other or self._step
@@ -402,26 +403,26 @@ class FitProgress:
         promise = ""
         if step is not None and math.isfinite(step.predicted_decrease):
             promise = (
-                f" · the next lowers −2 ln L by {step.predicted_decrease:,.2g}"
+                f" · the next step lowers −2 ln L by {step.predicted_decrease:,.2g}"
                 if step.predicted_decrease < 1e4
                 else " · still far off"
             )
-        return self._share, f"{about}{where}{promise} · {now - self._begun:.1f} s"
+        return self._fraction, f"{task}{where}{promise} · {now - self._started:.1f} s"
 
-    def end(self, words: str) -> None:
-        """The fit has ended; `words` state why, blank where it succeeded.
-
-        Parameters
-        ----------
-        words : blank where the fit succeeded.
-        """
-        self.words = words
-
-    def say(self, words: str) -> None:
-        """State something that is no end.
+    def end(self, message: str) -> None:
+        """Show why a fit ended.
 
         Parameters
         ----------
-        words : the message.
+        message : blank if the fit succeeded.
         """
-        self.words = words
+        self.message = message
+
+    def set_message(self, message: str) -> None:
+        """Show a message without ending the fit.
+
+        Parameters
+        ----------
+        message : the text.
+        """
+        self.message = message

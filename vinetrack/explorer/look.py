@@ -1,4 +1,4 @@
-"""One look with the report: colours, fonts and the pieces of HTML that the page is made of."""
+"""Style shared with the report: colours, fonts, and the pieces of HTML of the page."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS
 
 TEMPLATES = Path(__file__).with_name("templates")
 SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
-MEASURED_EDGE, EARLIER_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
-"""The tracked edge, and the model's before and now, over a grey picture."""
+MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
+"""Colours over a grey picture: the tracked edge, the edge of the model for comparison, and of the current model."""
 
 _AXIS = {
     "axis_label_text_font": SANS,
@@ -42,26 +42,26 @@ THEME: dict[str, Any] = {
 
 
 def theme() -> Theme:
-    """The look of plots and widgets."""
+    """Return the style of plots and widgets."""
     return Theme(json=THEME)
 
 
 def page_template() -> str:
-    """The page, for jinja2."""
+    """Return the template of the page, for jinja2."""
     return (TEMPLATES / "page.html").read_text(encoding="utf-8")
 
 
 def page_style() -> str:
-    """CSS of the page around the widgets."""
+    """Return the CSS of the page around the widgets."""
     return page_frame() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
 
 
 def screen_script(figures: Sequence[figure]) -> CustomJS:
-    """Has these figures follow a light or dark screen.
+    """Return a script that adapts figures to a light or dark colour scheme.
 
     Parameters
     ----------
-    figures : that change their colours.
+    figures : whose colours are adapted.
 
     Returns
     -------
@@ -72,13 +72,13 @@ def screen_script(figures: Sequence[figure]) -> CustomJS:
 
 
 def vine_colour() -> dict[str, Any]:
-    """Colour of glyphs whose column `colour` holds that of their vine: a palette, so that a page can change it."""
+    """Return the colour of glyphs with a column `colour`: a palette, so that a page can change it."""
     colours = list(VINE_COLOURS)
     return {"field": "colour", "transform": CategoricalColorMapper(factors=colours, palette=colours)}
 
 
-def sheet(more: str = "") -> InlineStyleSheet:
-    """CSS inside a widget, which the page's does not reach.
+def stylesheet(more: str = "") -> InlineStyleSheet:
+    """Return CSS inside a widget, which the CSS of the page does not reach.
 
     Parameters
     ----------
@@ -91,24 +91,24 @@ def sheet(more: str = "") -> InlineStyleSheet:
     return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
 
 
-def words(text: str = "", name: str | None = None, **keywords: Any) -> Div:
-    """A piece of HTML.
+def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
+    """Return a piece of HTML as a widget.
 
     Parameters
     ----------
     text : HTML.
-    name : by which the document finds it.
+    name : name of the widget in the document.
     keywords : of `bokeh.models.Div`.
 
     Returns
     -------
     Div
     """
-    return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[sheet()], margin=0, **keywords)
+    return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
-    """An empty figure as wide as its card.
+    """Return an empty figure as wide as its card.
 
     Parameters
     ----------
@@ -140,11 +140,11 @@ def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
 
 
 def escaped(text: object) -> str:
-    """Text that may hold anything, for HTML.
+    """Return text escaped for HTML.
 
     Parameters
     ----------
-    text : shown by `str`.
+    text : converted by `str`.
 
     Returns
     -------
@@ -154,13 +154,13 @@ def escaped(text: object) -> str:
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
-    """A table in HTML; cells are escaped, columns `numeric` stand to the right.
+    """Return a table in HTML; cells are escaped, columns `numeric` are right-aligned.
 
     Parameters
     ----------
     rows : cells of each row.
     header : names of the columns.
-    numeric : places of the columns set to the right.
+    numeric : indices of right-aligned columns.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequ
 
 
 def progress_bar(share: float, text: str) -> str:
-    """A bar filled to a share between 0 and 1, with words below it.
+    """Return a bar filled to a fraction, with text below it.
 
     Parameters
     ----------
@@ -192,11 +192,11 @@ def progress_bar(share: float, text: str) -> str:
 
 
 def command_block(lines: Sequence[str]) -> str:
-    """Commands to copy.
+    """Return commands to copy, as HTML.
 
     Parameters
     ----------
-    lines : one a command.
+    lines : one per command.
 
     Returns
     -------
@@ -206,21 +206,21 @@ def command_block(lines: Sequence[str]) -> str:
 
 
 __all__ = [
-    "EARLIER_EDGE",
     "INK",
     "MEASURED_EDGE",
     "MODEL_EDGE",
     "MUTED",
+    "REFERENCE_EDGE",
     "command_block",
     "escaped",
+    "html_div",
     "page_style",
     "page_template",
     "plot",
     "progress_bar",
     "screen_script",
-    "sheet",
+    "stylesheet",
     "table",
     "theme",
     "vine_colour",
-    "words",
 ]

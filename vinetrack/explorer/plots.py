@@ -1,4 +1,4 @@
-"""The figures that follow the choice: positions, what is left of them, and the error of each condition."""
+"""Figures that follow the choice of model: positions, residuals, and the error of each condition."""
 
 from __future__ import annotations
 
@@ -11,28 +11,38 @@ from bokeh.models import ColumnDataSource, CustomJSTickFormatter, HoverTool, Ran
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.curves import Curves
 from vinetrack.explorer.look import GRID, INK, MUTED, plot, vine_colour
-from vinetrack.explorer.series import bands, error_bars, extent, measured, modelled, residuals, symmetric
+from vinetrack.explorer.series import (
+    axis_ranges,
+    error_bars,
+    measured_lines,
+    model_lines,
+    replicate_bands,
+    residual_lines,
+    symmetric_range,
+)
 
 ROW_PX = 25
-"""Height of a bar of the errors; chosen: a label of 12 pixels and a gap as high."""
+"""Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height."""
 
-MOST_BANDS = 4
+MAX_BANDS = 4
 """Chosen: bands of more conditions overlap and hide the curves."""
 
 
 class Plots:
-    """Figures and their data. `set_…` methods put new data in; nothing here decides what they are."""
+    """Figures and their data sources; the `set_…` methods update the data."""
 
-    def __init__(self, campaign: Campaign, chosen: Callable[[str], None]) -> None:
-        self.campaign, self._chosen = campaign, chosen
-        self._earlier_drawn: object = None
+    def __init__(self, campaign: Campaign, on_condition_click: Callable[[str], None]) -> None:
+        self.campaign, self._on_condition_click = campaign, on_condition_click
+        self._reference_drawn: object = None
         self._curves_drawn: tuple[int, ...] | None = None
         empty: dict[str, Any] = {"xs": [], "ys": []}
         self._band = ColumnDataSource({**empty, "colour": []})
         self._measured = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []})
-        self._earlier = ColumnDataSource(empty)
+        self._reference = ColumnDataSource(empty)
         self._model = ColumnDataSource(empty, name="model_curves")
-        self._left = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []}, name="residual_curves")
+        self._residuals = ColumnDataSource(
+            {**empty, "colour": [], "trial": [], "condition": []}, name="residual_curves"
+        )
         self._bars = ColumnDataSource(error_bars(campaign, {}, {}, {}, ()), name="error_bars")
         self.motion, self.residual = self._draw_motion(), self._draw_residual()
         self.errors = self._draw_errors()
@@ -44,7 +54,7 @@ class Plots:
             "xs", "ys", source=self._measured, line_color=vine_colour(), line_width=1.6, line_alpha=0.9
         )
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
-        fig.multi_line("xs", "ys", source=self._earlier, **ghost)
+        fig.multi_line("xs", "ys", source=self._reference, **ghost)
         model = fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
         values = [("since release", "$x{0.0} ms"), ("growth", "$y{0.0} mm")]
         tips = [("trial", "@trial"), ("", "@condition"), *values]
@@ -61,7 +71,7 @@ class Plots:
             230, "growth (mm)", "measured − model (mm)", name="residual", x_range=Range1d(), y_range=Range1d(-1, 1)
         )
         fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
-        lines = fig.multi_line("xs", "ys", source=self._left, line_color=vine_colour(), line_width=1.4)
+        lines = fig.multi_line("xs", "ys", source=self._residuals, line_color=vine_colour(), line_width=1.4)
         values = [("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
         tips = [("trial", "@trial"), ("", "@condition"), *values]
         fig.add_tools(HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"))
@@ -96,7 +106,7 @@ class Plots:
             args={"names": names, "labels": labels}, code="return labels[names.indexOf(tick)] ?? tick"
         )
         fig.ygrid.visible = False
-        # Its buttons would lie over the first bar; a tap needs none.
+        # Toolbar buttons would cover the first bar; tapping needs none.
         fig.toolbar_location = None
         fig.yaxis.major_tick_line_color = None
         return fig
@@ -106,43 +116,43 @@ class Plots:
             return
         names = list(reversed(self.campaign.conditions))
         self._bars.selected.indices = []
-        self._chosen(names[new[0]])
+        self._on_condition_click(names[new[0]])
 
-    def set_shown(self, shown: Sequence[int], earlier: Curves | None) -> None:
-        """Trials to draw; of the earlier curves those of their conditions.
+    def set_shown(self, shown: Sequence[int], reference: Curves | None) -> None:
+        """Select the trials to draw, and the reference curves of their conditions.
 
         Parameters
         ----------
-        shown : places of the trials to draw.
-        earlier : curves as the page opened; None where they are the present ones.
+        shown : indices of the trials to draw.
+        reference : curves of the model for comparison; None if they are the current ones.
         """
-        lines = measured(self.campaign, shown)
-        (left, right), (bottom, top) = extent(lines)
+        lines = measured_lines(self.campaign, shown)
+        (left, right), (bottom, top) = axis_ranges(lines)
         self.motion.x_range.update(start=left, end=right)
         self.motion.y_range.update(start=bottom, end=top)
         self.residual.x_range.update(start=bottom, end=top)
         self._measured.data = lines
-        self.set_earlier(earlier, shown)
-        few = len({self.campaign.trials[i].condition for i in shown}) <= MOST_BANDS
-        self._band.data = bands(self.campaign, shown if few else [])
+        self.set_reference(reference, shown)
+        few = len({self.campaign.trials[i].condition for i in shown}) <= MAX_BANDS
+        self._band.data = replicate_bands(self.campaign, shown if few else [])
 
-    def set_earlier(self, earlier: Curves | None, shown: Sequence[int]) -> None:
-        """The curves to compare with, where they are others.
+    def set_reference(self, reference: Curves | None, shown: Sequence[int]) -> None:
+        """Set the curves for comparison.
 
         Parameters
         ----------
-        earlier : curves as the page opened; None where they are the present ones.
-        shown : places of the trials to draw.
+        reference : curves of the model for comparison; None if they are the current ones.
+        shown : indices of the trials to draw.
         """
-        key = (id(earlier), tuple(shown))
-        if key != self._earlier_drawn:
-            self._earlier_drawn = key
-            self._earlier.data = (
-                modelled(self.campaign, earlier, shown) if earlier is not None else {"xs": [], "ys": []}
+        key = (id(reference), tuple(shown))
+        if key != self._reference_drawn:
+            self._reference_drawn = key
+            self._reference.data = (
+                model_lines(self.campaign, reference, shown) if reference is not None else {"xs": [], "ys": []}
             )
 
     def set_instant(self, since_s: float | None) -> None:
-        """Mark an instant, s since release, or none.
+        """Mark a time since release, or none.
 
         Parameters
         ----------
@@ -151,23 +161,23 @@ class Plots:
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
     def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
-        """What the model says now; of lines that are drawn already only what has moved is sent.
+        """Set the curves of the current model; for lines already drawn only their ordinates are sent.
 
         Parameters
         ----------
-        curves : of the model now.
-        shown : places of the trials to draw.
+        curves : of the current model.
+        shown : indices of the trials to draw.
         """
-        lines, left = modelled(self.campaign, curves, shown), residuals(self.campaign, curves, shown)
-        low, high = symmetric(left)
+        lines, residual = model_lines(self.campaign, curves, shown), residual_lines(self.campaign, curves, shown)
+        low, high = symmetric_range(residual)
         if high != self.residual.y_range.end:
             self.residual.y_range.update(start=low, end=high)
         if tuple(shown) == self._curves_drawn:
             self._model.data["ys"] = lines["ys"]
-            self._left.data["ys"] = left["ys"]
+            self._residuals.data["ys"] = residual["ys"]
         else:
             self._curves_drawn = tuple(shown)
-            self._model.data, self._left.data = lines, left
+            self._model.data, self._residuals.data = lines, residual
 
     def set_errors(
         self,
@@ -176,7 +186,7 @@ class Plots:
         floors_m: Mapping[str, float],
         conditions: Sequence[str],
     ) -> None:
-        """The error of every condition; those not among `conditions` are drawn faint.
+        """Set the error of every condition; those not in `conditions` are drawn faint.
 
         Parameters
         ----------
@@ -194,7 +204,7 @@ class Plots:
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis does not twitch.
+    """Return the next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis rarely changes.
 
     Parameters
     ----------

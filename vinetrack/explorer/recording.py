@@ -1,7 +1,7 @@
-"""Frames of one recording for scrubbing, with where the tracked edge and the model's edge lie in the picture.
+"""Frames of one recording, and the positions of the tracked edge and the model's edge in the picture.
 
-A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: a
-second of a high-speed camera fits in a few tens of megabytes.
+A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: one
+second of a high-speed camera takes a few tens of megabytes.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
     from vinetrack.video.axis import Axis
 
-WIDEST_PX = 960
+MAX_WIDTH_PX = 960
 """Chosen: as wide as the page shows a recording."""
 
-QUALITY = 88
-"""Of JPEG, 0 to 100; chosen: at 88 an edge shows no blocks; a second of 1000 frames takes some tens of megabytes."""
+JPEG_QUALITY = 88
+"""JPEG quality, 0 to 100; chosen: at 88 an edge shows no blocks, and 1000 frames take some tens of megabytes."""
 
-TOLD_EVERY = 10
+PROGRESS_EVERY_FRAMES = 10
 """Frames between two reports of progress; chosen: several reports a second."""
 
 
 @dataclass(frozen=True)
 class RecordingView:
-    """How positions along the growth axis lie in the picture of one recording, px of the recording.
+    """Mapping of positions along the growth axis to the picture of one recording, px of the recording.
 
     `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
-    `lead_position_m` are those of the track. `shake_px`, shape (n_frames,), is how far along the axis a shaken camera
-    moved each picture; `by_hand`, likewise, whether a person has corrected the point.
+    `lead_position_m` are those of the track. `shake_px`, shape (n_frames,), is the shift of each picture along the axis
+    by camera shake; `by_hand`, shape (n_frames,), marks points corrected by hand.
     """
 
     trial: str
@@ -55,9 +55,9 @@ class RecordingView:
     by_hand: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def along_px(self, lead_position_m: Floats) -> Floats:
-        """Where positions on the track's ruler lie along the axis; beyond the track, in a straight line.
+        """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track.
 
-        NaN where the track has fewer than two points.
+        NaN if the track has fewer than two points.
 
         Parameters
         ----------
@@ -79,12 +79,12 @@ class RecordingView:
         return np.where(outside, offset + scale * lead_position_m, inside)
 
     def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ends, x and y, of a line across the vine at a place along the axis; with `frame` in the picture as it is.
+        """Return the ends of a line across the vine at a position along the axis; with `frame`, in that picture.
 
         Parameters
         ----------
-        along_px : place along the axis.
-        frame : number of the picture; None for the axis itself.
+        along_px : position along the axis.
+        frame : number of the picture; None for the steady picture.
 
         Returns
         -------
@@ -97,8 +97,8 @@ class RecordingView:
         return (float(x0), float(x1)), (float(y0), float(y1))
 
 
-def view_of(results: Results, trial: Trial) -> RecordingView | str:
-    """The view of a trial, or in words why there is none: it is a track only, or its axis was not kept.
+def recording_view(results: Results, trial: Trial) -> RecordingView | str:
+    """Return the view of a trial, or the reason why there is none.
 
     Parameters
     ----------
@@ -111,16 +111,16 @@ def view_of(results: Results, trial: Trial) -> RecordingView | str:
     """
     if trial.video is None:
         name = trial.track.name if trial.track is not None else "a table"
-        return f"{trial.name} came as a track ({name}): there is no recording to show, only where its edge was."
+        return f"{trial.name} came as a track ({name}): there is no recording to show, only the positions of its edge."
     if not trial.video.exists():
-        return f"The recording of {trial.name}, {trial.video.name}, is no longer there; its track is shown instead."
+        return f"The recording of {trial.name}, {trial.video.name}, no longer exists; its track is shown instead."
     try:
         axis = read_json(results.analysed(trial.name)).get("axis")
         table = read_result(results.track(trial.name))
     except ResultsError as error:
         return str(error)
     if not axis:
-        return f"Where the axis of {trial.name} lies in its picture was not kept: run snakemake again."
+        return f"The position of the axis of {trial.name} in its picture was not stored: run snakemake again."
     return _view(trial, axis, table)
 
 
@@ -145,9 +145,9 @@ def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingV
 
 @dataclass
 class DecodedRecording:
-    """Frames of one recording, decoded in the background. `shape` is that of the pictures, height and width, px.
+    """Frames of one recording, decoded in the background. `shape` is the height and width of the pictures, px.
 
-    `scale` is pixels of these pictures in one of the recording. `words` say what went wrong, blank where nothing.
+    `scale` is the number of their pixels per pixel of the recording; `error` is blank unless decoding failed.
     """
 
     path: Path
@@ -156,12 +156,12 @@ class DecodedRecording:
     shape: tuple[int, int] = (0, 0)
     scale: float = 1.0
     complete: bool = False
-    words: str = ""
+    error: str = ""
     _frames: list[bytes] = field(default_factory=list)
-    _unwanted: bool = False
+    _cancelled: bool = False
 
     def picture(self, frame: int) -> NDArray[np.uint8]:
-        """Grey levels of one frame, shape `shape`.
+        """Return the grey levels of one frame.
 
         Parameters
         ----------
@@ -176,12 +176,12 @@ class DecodedRecording:
         data = np.frombuffer(self._frames[frame], dtype=np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
-    def decode(self, told: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
-        """Decode every frame; `told` hears every so often.
+    def decode(self, on_progress: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
+        """Decode every frame.
 
         Parameters
         ----------
-        told : called every `TOLD_EVERY` frames and at the end.
+        on_progress : called every `PROGRESS_EVERY_FRAMES` frames and at the end.
 
         Returns
         -------
@@ -193,30 +193,30 @@ class DecodedRecording:
             recording = inspect_recording(self.path)
             self.expected = recording.declared_frames or 0
             for luma in iterate_frames(recording):
-                if self._unwanted:
+                if self._cancelled:
                     return self
                 self._add(luma, recording.bit_depth)
-                if told is not None and self.count % TOLD_EVERY == 1:
-                    told(self)
+                if on_progress is not None and self.count % PROGRESS_EVERY_FRAMES == 1:
+                    on_progress(self)
         except (RecordingError, OSError) as error:
-            self.words = str(error)
+            self.error = str(error)
         self.complete = True
-        if told is not None:
-            told(self)
+        if on_progress is not None:
+            on_progress(self)
         return self
 
-    def in_background(self, told: Callable[[DecodedRecording], None]) -> None:
-        """`decode` in a thread, from which `told` is called.
+    def start_decoding(self, on_progress: Callable[[DecodedRecording], None]) -> None:
+        """Run `decode` in a thread, from which `on_progress` is called.
 
         Parameters
         ----------
-        told : as of `decode`.
+        on_progress : as of `decode`.
         """
-        threading.Thread(target=self.decode, args=(told,), daemon=True, name=f"{THREAD_PREFIX}film").start()
+        threading.Thread(target=self.decode, args=(on_progress,), daemon=True, name=f"{THREAD_PREFIX}film").start()
 
-    def give_up(self) -> None:
-        """Stop decoding: another recording is wanted."""
-        self._unwanted = True
+    def cancel(self) -> None:
+        """Stop decoding."""
+        self._cancelled = True
 
     def _add(self, luma: NDArray[Any], bit_depth: int) -> None:
         import cv2
@@ -224,10 +224,10 @@ class DecodedRecording:
         height, width = luma.shape
         if luma.dtype != np.uint8:
             luma = (luma >> max(bit_depth - 8, 0)).astype(np.uint8)
-        if width > WIDEST_PX:
-            size = (WIDEST_PX, round(height * WIDEST_PX / width))
+        if width > MAX_WIDTH_PX:
+            size = (MAX_WIDTH_PX, round(height * MAX_WIDTH_PX / width))
             luma = cv2.resize(luma, size, interpolation=cv2.INTER_AREA)
-        _, data = cv2.imencode(".jpg", luma, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        _, data = cv2.imencode(".jpg", luma, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         self._frames.append(data.tobytes())
         self.shape, self.scale = (luma.shape[0], luma.shape[1]), luma.shape[1] / width
         self.count += 1

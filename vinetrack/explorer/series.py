@@ -1,4 +1,4 @@
-"""What the page draws, as plain columns in the units it shows: milliseconds and millimetres."""
+"""Data of the page's figures, as plain columns in milliseconds and millimetres."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.explorer.campaign import Campaign, ShownTrial, condition_labels
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial, condition_labels
 from vinetrack.explorer.curves import Curves
 from vinetrack.figures.style import vine_styles
 
-MOST_POINTS = 250
-"""Points of a line on the page; chosen: one every three or four pixels; more take longer to send than to compute."""
+MAX_POINTS = 250
+"""Points of a line on the page; chosen: one per three or four pixels; more take longer to send than to compute."""
 
 Columns = dict[str, list[Any]]
 
 
 def colours(campaign: Campaign) -> dict[str, str]:
-    """Colour of each condition: that of its vine, as in every figure.
+    """Return the colour of each condition: that of its vine, as in every figure.
 
     Parameters
     ----------
@@ -32,11 +32,11 @@ def colours(campaign: Campaign) -> dict[str, str]:
     dict, hexadecimal code by condition
     """
     styles = vine_styles(campaign.vines)
-    return {seen.condition: styles[seen.data.trial.vine].colour for seen in campaign.trials}
+    return {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
 
 
 def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Each vine, by what tells it from the others, with its colour.
+    """Return a distinguishing label and the colour of each vine.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
     list of (label, hexadecimal code)
     """
     styles = vine_styles(campaign.vines)
-    first = {seen.data.trial.vine: seen.data.trial for seen in reversed(campaign.trials)}
+    first = {aligned.data.trial.vine: aligned.data.trial for aligned in reversed(campaign.trials)}
     bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
     labels = condition_labels(bare) if len(bare) > 1 else dict.fromkeys(bare, "measured")
     return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
 
 
-def thinned(count: int, first: int) -> slice:
-    """Rows to draw of a track: from a little before the motion, no more than can be seen.
+def plotted_rows(count: int, first: int) -> slice:
+    """Return the rows of a track to draw: from a little before the motion, at most `MAX_POINTS`.
 
     Parameters
     ----------
@@ -66,54 +66,54 @@ def thinned(count: int, first: int) -> slice:
     slice
     """
     begin = max(first - max((count - first) // 20, 2), 0)
-    return slice(begin, None, max(math.ceil((count - begin) / MOST_POINTS), 1))
+    return slice(begin, None, max(math.ceil((count - begin) / MAX_POINTS), 1))
 
 
-def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`.
+def measured_lines(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Return lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    shown : places of the trials to draw.
+    shown : indices of the trials to draw.
 
     Returns
     -------
     dict, lists by column
     """
     trials = [campaign.trials[i] for i in shown]
-    return _a_line_each(campaign, [(seen, seen.time_s, seen.growth_m) for seen in trials])
+    return _lines_by_trial(campaign, [(aligned, aligned.time_s, aligned.growth_m) for aligned in trials])
 
 
-def _a_line_each(campaign: Campaign, lines: Iterable[tuple[ShownTrial, Floats, Floats]]) -> Columns:
-    """A line a trial, of what stands along and what stands up, in thousandths of their units."""
+def _lines_by_trial(campaign: Campaign, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
+    """One line per trial, from its abscissae and ordinates in SI, scaled by 1000."""
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for seen, along, up in lines:
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * along[rows])
-        columns["ys"].append(1e3 * _broken(seen, rows, up[rows]))
-        columns["colour"].append(colour[seen.condition])
-        columns["trial"].append(seen.name)
-        columns["condition"].append(campaign.labels[seen.condition])
+    for aligned, x, y in lines:
+        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        columns["xs"].append(1e3 * x[rows])
+        columns["ys"].append(1e3 * _with_gaps(aligned, rows, y[rows]))
+        columns["colour"].append(colour[aligned.condition])
+        columns["trial"].append(aligned.name)
+        columns["condition"].append(campaign.labels[aligned.condition])
     return columns
 
 
-def _broken(seen: ShownTrial, rows: slice, values: Floats) -> Floats:
-    """Values with NaN where frames are left out, so that no line is drawn over frames that were not compared."""
-    stretch = np.cumsum(seen.data.first)[rows]
+def _with_gaps(aligned: ExplorerTrial, rows: slice, values: Floats) -> Floats:
+    """Insert NaN after each gap, so that no line is drawn across frames that were left out."""
+    stretch = np.cumsum(aligned.data.first)[rows]
     out = values.copy()
     out[np.flatnonzero(np.diff(stretch) > 0) + 1] = math.nan
     return out
 
 
-def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Outlines of one standard deviation of the replicates about their mean, ms and mm.
+def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Return outlines of one standard deviation of the replicates around their mean, ms and mm.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    shown : places of the trials to draw.
+    shown : indices of the trials to draw.
 
     Returns
     -------
@@ -125,7 +125,7 @@ def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
         band = campaign.bands.get(condition)
         if band is None or band.time_s.size < 2:
             continue
-        rows = thinned(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
+        rows = plotted_rows(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
         time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
         columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
         columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
@@ -133,14 +133,14 @@ def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
     return columns
 
 
-def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """A line a condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth.
+def model_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     curves : of the model.
-    shown : places of the trials to draw.
+    shown : indices of the trials to draw.
 
     Returns
     -------
@@ -150,28 +150,28 @@ def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Column
     for condition in _conditions(campaign, shown):
         members = [i for i in shown if campaign.trials[i].condition == condition]
         longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
-        seen = campaign.trials[longest]
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.time_s[rows])
+        aligned = campaign.trials[longest]
+        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        columns["xs"].append(1e3 * aligned.time_s[rows])
         columns["ys"].append(1e3 * curves[longest].growth_m[rows])
     return columns
 
 
-def residuals(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """Lines of measurement minus model, `ys` mm, along the growth, `xs` mm.
+def residual_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     curves : of the model.
-    shown : places of the trials to draw.
+    shown : indices of the trials to draw.
 
     Returns
     -------
     dict, lists by column
     """
     trials = [(campaign.trials[i], curves[i]) for i in shown]
-    return _a_line_each(campaign, [(seen, seen.growth_m, motion.residual_m) for seen, motion in trials])
+    return _lines_by_trial(campaign, [(aligned, aligned.growth_m, motion.residual_m) for aligned, motion in trials])
 
 
 def error_bars(
@@ -181,12 +181,12 @@ def error_bars(
     floors_m: Mapping[str, float],
     shown: Sequence[str],
 ) -> Columns:
-    """A row a condition, the first at the bottom: `label`, `now`, `before`, `floor`, mm, `colour` and how opaque.
+    """Return one row per condition, the first at the bottom: `label`, `now`, `before`, `floor` (mm), `colour`, `alpha`.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    now_m, before_m, floors_m : errors of the model now and as the page opened, and replicate scatter, m by condition.
+    now_m, before_m, floors_m : errors of the current model and the one for comparison, and replicate scatter, m.
     shown : conditions that are not drawn faint.
 
     Returns
@@ -206,8 +206,8 @@ def error_bars(
     }
 
 
-def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Ranges that hold all lines with a little room: (left, right), (bottom, top).
+def axis_ranges(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return ranges that contain all lines with a margin.
 
     Parameters
     ----------
@@ -229,8 +229,8 @@ def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], 
     return ranges[0], ranges[1]
 
 
-def symmetric(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
-    """A range about zero for residuals, in round steps so that it does not twitch while a slider moves.
+def symmetric_range(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
+    """Return a symmetric range for residuals, rounded so that it rarely changes while a slider moves.
 
     Parameters
     ----------

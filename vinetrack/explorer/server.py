@@ -1,4 +1,4 @@
-"""The page served: on this machine's own address alone, everything it needs included, until Ctrl-C."""
+"""Server of the page, on the loopback address only and without external resources."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from tornado.web import ErrorHandler
 from vinetrack.core.local_page import LOOPBACK, allowed_hosts, secret_path, serve_on_free_port, stop_on_signals
 from vinetrack.explorer.fitting import BackgroundFit
 
-QUIET = ("bokeh", "tornado")
-SWITCH_S = 1e-3
-"""Between threads; chosen: with Python's 5 ms each move of a slider waits as long while a fit runs."""
+SILENCED_LOGGERS = ("bokeh", "tornado")
+THREAD_SWITCH_S = 1e-3
+"""Thread switch interval; chosen: with Python's default of 5 ms each slider move waits that long while a fit runs."""
 
 KEEP_ALIVE_MS = 20_000
-"""Between two pings of an open page; chosen: a page that was closed is noticed within half a minute."""
+"""Interval of pings to an open page; chosen: a closed page is noticed within half a minute."""
 
 
-def application(ground: BackgroundFit) -> Application:
-    """A page for whoever opens one.
+def application(background: BackgroundFit) -> Application:
+    """Return the application, which creates a page for each visitor.
 
     Parameters
     ----------
-    ground : the background that all pages share.
+    background : the background fit, shared by all pages.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def application(ground: BackgroundFit) -> Application:
     """
     from vinetrack.explorer.page import Page
 
-    shown = [ground]
+    shown = [background]
 
     def open_page(document: Document) -> None:
         Page(shown[-1], document, shown.append)
@@ -48,14 +48,14 @@ def application(ground: BackgroundFit) -> Application:
     return Application(FunctionHandler(open_page, trap_exceptions=False))
 
 
-def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
-    """A server that is bound to the loopback address and answers no page from elsewhere.
+def start_server(background: BackgroundFit, port: int | None = None) -> Server:
+    """Return a server that is bound to the loopback address and refuses requests from other pages.
 
     Parameters
     ----------
     port
-        The port to take, 0 for any that is free; None looks for the first free one from `FIRST_PORT`.
-    ground : the background that all pages share.
+        Port, 0 for any free one; None for the first free one from `FIRST_PORT`.
+    background : the background fit, shared by all pages.
 
     Returns
     -------
@@ -64,20 +64,20 @@ def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
     Raises
     ------
     PageError
-        If it is taken.
+        If the port is taken.
     """
-    return serve_on_free_port(lambda number: _serve(ground, number), port)
+    return serve_on_free_port(lambda number: _bind(background, number), port)
 
 
-def _serve(ground: BackgroundFit, port: int) -> Server:
-    # Found first, so that the port is known before it is said who may connect to it.
+def _bind(background: BackgroundFit, port: int) -> Server:
+    # Find a free port first, because the allowed hosts include the port.
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((LOOPBACK, port))
         free_port = int(probe.getsockname()[1])
     hosts = allowed_hosts(free_port)
     server = Server(
-        {"/": application(ground)},
+        {"/": application(background)},
         prefix=secret_path(),
         address=LOOPBACK,
         port=free_port,
@@ -93,9 +93,9 @@ def _serve(ground: BackgroundFit, port: int) -> Server:
 
 
 def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
-    """Answer 403, on every route and to the socket, to whoever asks under another name than this machine's own.
+    """Answer 403, on every route and on the web socket, to requests with another host name (DNS rebinding).
 
-    Bokeh looks at the origin of a socket alone: a name elsewhere that is made to lead here has a fitting origin.
+    Bokeh checks only the origin of a web socket, which matches if a foreign name resolves to this machine.
     """
     tornado = server._tornado
     routed = tornado.find_handler
@@ -109,11 +109,11 @@ def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
 
 
 def address(server: Server) -> str:
-    """Where the page is.
+    """Return the address of the page.
 
     Parameters
     ----------
-    server : that runs.
+    server : the running server.
 
     Returns
     -------
@@ -122,12 +122,14 @@ def address(server: Server) -> str:
     return f"http://{LOOPBACK}:{server.port}{server.prefix}/"
 
 
-def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
-    """Serve until Ctrl-C (or SIGTERM), then leave without a word more than needed.
+def serve(
+    background: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True
+) -> None:
+    """Serve until Ctrl-C (or SIGTERM).
 
     Parameters
     ----------
-    ground : the background that all pages share.
+    background : the background fit, shared by all pages.
     say : prints a line.
     port : as of `start_server`.
     browser : whether a browser is opened.
@@ -137,15 +139,15 @@ def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = 
     PageError
         If the port is taken.
     """
-    for name in QUIET:
+    for name in SILENCED_LOGGERS:
         logging.getLogger(name).setLevel(logging.ERROR)
-    # A fit in the background then hands over between two strokes of a pen, not after.
-    sys.setswitchinterval(SWITCH_S)
-    server = start_server(ground, port)
+    # A background fit would otherwise delay the page.
+    sys.setswitchinterval(THREAD_SWITCH_S)
+    server = start_server(background, port)
     where = address(server)
-    ground.begin()
+    background.begin()
     say(f"Explorer: {where}")
-    say("For this machine alone. Ctrl-C ends it.")
+    say("For this machine only. Ctrl-C ends it.")
     if browser:
         threading.Thread(target=webbrowser.open, args=(where,), daemon=True).start()
     with stop_on_signals(lambda: server.io_loop.add_callback_from_signal(server.io_loop.stop)):

@@ -1,4 +1,4 @@
-"""Text beside the figures as HTML: headline, fitted numbers, and of a diagnosis tied candidates and the next trial."""
+"""Text panels as HTML: headline, fitted parameters, tied candidates and next trial of a diagnosis."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import ModelChoice
 from vinetrack.explorer.curves import Curves, overall_m
-from vinetrack.explorer.export import model_words
-from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
+from vinetrack.explorer.export import model_text
+from vinetrack.explorer.fitting import Fitted, correlated_pairs_text, likelihood_change_text
 from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.figures.candidate_figures import TIED_COSINE
@@ -25,20 +25,20 @@ from vinetrack.narrative.verdict_summary import size
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
-AT_THE_FLOOR = 1.15
-"""Chosen: an error within 15 % of the replicate scatter counts as equal to it; with six replicates that scatter is
+FLOOR_MARGIN = 1.15
+"""Chosen: an error up to 1.15 times the replicate scatter counts as equal to it; with six replicates that scatter is
 itself known to 1/√(2·5) = 32 %."""
 
-MOST_PAIRS = 6
-"""Of correlated numbers; chosen: the card holds six lines."""
+MAX_PAIRS = 6
+"""Pairs of correlated parameters shown; chosen: the card has room for six lines."""
 
-MOST_COMPARED = 8
+MAX_COMPARED_EFFECTS = 8
 """Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels."""
 
 
 @dataclass(frozen=True)
-class FittedRung:
-    """One model fitted on this page: its effects, error over all conditions, and what the fit said."""
+class LadderEntry:
+    """One model fitted on this page: its effects, its error over all conditions, and the change of −2 ln L as text."""
 
     effects: tuple[str, ...]
     rms_m: float
@@ -47,7 +47,7 @@ class FittedRung:
 
 @dataclass(frozen=True)
 class HeldModel:
-    """A model to compare with: its effects, curves, errors by condition (m), and its fit where it is one."""
+    """A model for comparison: its effects, curves, errors by condition (m), and its fit, if it was fitted."""
 
     effects: tuple[str, ...]
     curves: Curves | None
@@ -55,24 +55,24 @@ class HeldModel:
     fitted: Fitted | None
 
 
-def side_by_side(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
-    """Return the held model and the present one as a table: error, and every fitted number of either.
+def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
+    """Return the held model and the current one as a table: error, and every fitted parameter of either.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    held : None where nothing is held.
-    now : the model as it is drawn.
+    held : None if none is held.
+    now : the current model.
 
     Returns
     -------
-    str, HTML; blank where nothing is held
+    str, HTML; blank if none is held
     """
     if held is None:
         return ""
     models = (held, now)
     rows = [
-        ("effects", *(model_words(model.effects) for model in models)),
+        ("effects", *(model_text(model.effects) for model in models)),
         ("rms of position", *(_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
     ]
     fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
@@ -96,12 +96,12 @@ def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float]
     str, HTML
     """
     now, before, floor = (overall_m(errors, campaign.conditions) for errors in (now_m, before_m, campaign.floors_m))
-    words = model_words(choice.effects)
+    words = model_text(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
     if not math.isfinite(now):
         reason = f"The model in use was not fitted: {escaped(campaign.refused)}" if campaign.refused else "Preparing …"
         return f"<h1>{reason}</h1>"
-    at_floor = math.isfinite(floor) and now <= AT_THE_FLOOR * floor
+    at_floor = math.isfinite(floor) and now <= FLOOR_MARGIN * floor
     grade = "good" if at_floor else "bad"
     was = f", {_mm(before)} when the page opened" if math.isfinite(before) and _mm(before) != _mm(now) else ""
     if math.isfinite(floor):
@@ -115,38 +115,40 @@ def _mm(value_m: float) -> str:
     return f"{1e3 * value_m:.3g} mm"
 
 
-def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[FittedRung], touched: bool) -> str:
-    """The table of fitted numbers and the models fitted so far.
+def fitted_numbers_html(
+    campaign: Campaign, fitted: Fitted | None, fitted_models: Sequence[LadderEntry], sizes_changed: bool
+) -> str:
+    """Return the table of fitted parameters and the models fitted so far, as HTML.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
     fitted : the last fit; None before the first.
-    rungs : models fitted on this page.
-    touched : whether sizes were moved since.
+    fitted_models : models fitted on this page.
+    sizes_changed : whether sizes were changed since.
 
     Returns
     -------
     str, HTML
     """
     if fitted is None:
-        return "<p class='muted'>The model in use is being fitted; its numbers come here.</p>"
+        return "<p class='muted'>The model in use is being fitted; its parameters will appear here.</p>"
     vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
     known = vines if len(vines) > 1 else {}
     rows = [_number_row(number, known.get(number.vine, number.vine) or "all") for number in fitted.fit.numbers]
     parts = [table(rows, ("", "vine", "value", "error", "95 %"), (2, 3, 4))]
-    if touched:
-        parts.append('<p class="muted">Sizes were moved since: these are the numbers of the last fit.</p>')
+    if sizes_changed:
+        parts.append('<p class="muted">Sizes were changed since: these are the parameters of the last fit.</p>')
     spreads = "; ".join(
-        f"{escaped(name)} {100 * s.value:.2g} %{'' if s.estimated else ' (held)'}"
+        f"{escaped(name)} {100 * s.value:.2g} %{'' if s.estimated else ' (fixed)'}"
         for name, s in fitted.fit.spreads.items()
     )
     chi2 = f"χ² per degree of freedom {fitted.fit.chi2_per_dof:.3g}" if math.isfinite(fitted.fit.chi2_per_dof) else ""
     noise = f"noise {1e3 * fitted.fit.noise_m:.2g} mm"
-    facts = [noise, chi2, f"spread from trial to trial: {spreads}" if spreads else "", f"{fitted.seconds:.2g} s"]
+    facts = [noise, chi2, f"between-trial standard deviations: {spreads}" if spreads else "", f"{fitted.seconds:.2g} s"]
     parts.append(f"<p><small>{' · '.join(fact for fact in facts if fact)}</small></p>")
     parts += [f"<p><small>{escaped(message)}</small></p>" for message in fitted.fit.messages]
-    parts.append(_ladder(campaign, rungs))
+    parts.append(_ladder(campaign, fitted_models))
     return "".join(parts)
 
 
@@ -156,27 +158,29 @@ def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     if math.isfinite(number.bound):
         return name, vine, f"{number.bound * factor:.4g}", "at its bound", ""
     if not (math.isfinite(number.sigma) and number.sigma > 0):
-        return name, vine, f"{number.value * factor:.4g}", "open", ""
+        return name, vine, f"{number.value * factor:.4g}", "undetermined", ""
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
     return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
 
 
-def _ladder(campaign: Campaign, rungs: Sequence[FittedRung]) -> str:
-    """The models fitted on this page, one below the other, with what is left beyond the replicates."""
-    if not rungs:
+def _ladder(campaign: Campaign, fitted_models: Sequence[LadderEntry]) -> str:
+    """The models fitted on this page, with the error in excess of replicate scatter."""
+    if not fitted_models:
         return ""
     floor = overall_m(campaign.floors_m, campaign.conditions)
     rows = []
-    for rung in rungs:
+    for rung in fitted_models:
         beyond = math.sqrt(max(rung.rms_m**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
-        rows.append((model_words(rung.effects), _mm(rung.rms_m), _mm(beyond) if math.isfinite(beyond) else "–"))
-    gained = f"<p><small>{escaped(rungs[-1].gained)}</small></p>" if rungs[-1].gained else ""
-    return "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "beyond replicates"), (1, 2)) + gained
+        rows.append((model_text(rung.effects), _mm(rung.rms_m), _mm(beyond) if math.isfinite(beyond) else "–"))
+    gained = f"<p><small>{escaped(fitted_models[-1].gained)}</small></p>" if fitted_models[-1].gained else ""
+    return (
+        "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "excess over replicates"), (1, 2)) + gained
+    )
 
 
-def rung_of(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> FittedRung:
-    """A line of the ladder for a fit, and what it gained over the one before.
+def ladder_entry(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> LadderEntry:
+    """Return the entry of a fit in the table of fitted models.
 
     Parameters
     ----------
@@ -186,19 +190,19 @@ def rung_of(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> Fitted
 
     Returns
     -------
-    FittedRung
+    LadderEntry
     """
-    gained = "" if before is None else gained_words(before.fit, fitted.fit)
-    return FittedRung(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
+    gained = "" if before is None else likelihood_change_text(before.fit, fitted.fit)
+    return LadderEntry(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
 
 
-def tied_panel(campaign: Campaign, story: DiagnosisSummary | None, fitted: Fitted | None) -> str:
-    """Return what the data cannot tell apart: effects, by the diagnosis; fitted numbers, by their correlations.
+def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fitted | None) -> str:
+    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    story : the diagnosis; None where there is none.
+    summary : the diagnosis; None where there is none.
     fitted : the last fit; None before the first.
 
     Returns
@@ -206,55 +210,57 @@ def tied_panel(campaign: Campaign, story: DiagnosisSummary | None, fitted: Fitte
     str, HTML
     """
     parts = []
-    if story is None:
+    if summary is None:
         parts.append(
             "<p>No diagnosis yet: it tests every effect and states which of them these trials cannot tell apart. It"
             " appears here after</p>"
         )
         parts.append(command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"]))
     else:
-        parts.append(f"<p><b>{escaped(story.verdict)}</b>: {escaped(story.explanation)}</p>")
-        if len(story.answer_set) > 1:
-            names = ", ".join(name.replace("_", " ") for name in story.answer_set)
+        parts.append(f"<p><b>{escaped(summary.verdict)}</b>: {escaped(summary.explanation)}</p>")
+        if len(summary.answer_set) > 1:
+            names = ", ".join(name.replace("_", " ") for name in summary.answer_set)
             parts.append(f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>")
-        parts.append(cosine_grid(story))
+        parts.append(cosine_grid(summary))
     if fitted is not None:
-        pairs_words = tied_words(fitted.fit)
+        pairs_words = correlated_pairs_text(fitted.fit)
         parts.append("<h3>In the last fit</h3>")
-        parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:MOST_PAIRS]] or [
-            "<p class='muted'>No two numbers are correlated by more than 0.9.</p>"
+        parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:MAX_PAIRS]] or [
+            "<p class='muted'>No two parameters have a correlation above 0.9.</p>"
         ]
     return "".join(parts)
 
 
-def cosine_grid(story: DiagnosisSummary) -> str:
+def cosine_grid(summary: DiagnosisSummary) -> str:
     """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two.
 
     Parameters
     ----------
-    story : the diagnosis.
+    summary : the diagnosis.
 
     Returns
     -------
     str, HTML
     """
-    names = [name for name in story.best if name in story.cosine_names]
-    names += [name for *pair, _ in story.most_tied() for name in pair]
-    names = list(dict.fromkeys(names))[:MOST_COMPARED]
+    names = [name for name in summary.best if name in summary.cosine_names]
+    names += [name for *pair, _ in summary.most_tied() for name in pair]
+    names = list(dict.fromkeys(names))[:MAX_COMPARED_EFFECTS]
     if len(names) < 2:
         return ""
-    place = [story.cosine_names.index(name) for name in names]
+    place = [summary.cosine_names.index(name) for name in names]
     head = "".join(f"<th class='up'><span>{escaped(_spaced(name))}</span></th>" for name in names)
     body = "".join(
-        f"<tr><th>{escaped(_spaced(name))}</th>" + "".join(_cosine_cell(story.cosines[i][k]) for k in place) + "</tr>"
+        f"<tr><th>{escaped(_spaced(name))}</th>" + "".join(_cosine_cell(summary.cosines[i][k]) for k in place) + "</tr>"
         for name, i in zip(names, place, strict=True)
     )
-    caption = "<small>Cosines of what effects do to the trajectories: near ±1 they cannot be told apart.</small>"
+    caption = (
+        "<small>Cosines between the effects on the trajectories: near ±1 two effects cannot be told apart.</small>"
+    )
     return f"<div class='scroll'><table class='cosines'><tr><th></th>{head}</tr>{body}</table></div>{caption}"
 
 
 def _cosine_cell(cosine: float) -> str:
-    """Blue for alike, vermillion for opposite, the deeper the more."""
+    """Blue for positive, vermillion for negative cosines, the deeper the larger."""
     if not math.isfinite(cosine):
         return "<td>–</td>"
     strength = min(abs(cosine), 1.0) ** 2
@@ -267,22 +273,22 @@ def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
-def next_panel(campaign: Campaign, story: DiagnosisSummary | None) -> str:
-    """What to film next, as the diagnosis says.
+def next_panel(campaign: Campaign, summary: DiagnosisSummary | None) -> str:
+    """Return the next experiment of the diagnosis, as HTML.
 
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    story : the diagnosis; None where there is none.
+    summary : the diagnosis; None where there is none.
 
     Returns
     -------
     str, HTML
     """
-    if story is None:
+    if summary is None:
         command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
         return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
-    advice = story.next_experiment
+    advice = summary.next_experiment
     if not advice:
         return "<p>The diagnosis proposes no further trial.</p>"
     parts = [f"<p>{escaped(advice.get('text', ''))}</p>"]
@@ -302,7 +308,7 @@ def next_panel(campaign: Campaign, story: DiagnosisSummary | None) -> str:
 
 
 def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
-    """One condition to make, in the units of the sheet; what differs from the rig so far is said."""
+    """One condition in the units of the sheet, with what differs from the present rig."""
     size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
     changed = trial.get("changed") or ()
     other = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in changed and trial.get(key)]
@@ -324,7 +330,7 @@ DIAGNOSIS = "diagnosis.json"
 
 @dataclass(frozen=True)
 class RankedCandidate:
-    """A candidate of the ranking: the fall of −2 ln L with it, and whether it is in the answer set."""
+    """A candidate of the ranking: the decrease of −2 ln L with it, and whether it is in the answer set."""
 
     effect: str
     delta_chi2: float
@@ -334,7 +340,7 @@ class RankedCandidate:
 
 @dataclass(frozen=True)
 class DiagnosisSummary:
-    """The first round of a diagnosis, and what to do next. `cosines` is a matrix in the order of `cosine_names`."""
+    """The first round of a diagnosis, and the next experiment. `cosines` is a matrix in the order of `cosine_names`."""
 
     verdict: str
     unexplained: bool
@@ -352,7 +358,7 @@ class DiagnosisSummary:
         return tuple(dict.fromkeys([*self.answer_set, *ranked]))
 
     def most_tied(self, least: float = TIED_COSINE) -> list[tuple[str, str, float]]:
-        """Pairs of candidates with |cosine| of `least` or more, largest first.
+        """Return the pairs of candidates with |cosine| of at least `least`, largest first.
 
         Parameters
         ----------
@@ -372,7 +378,7 @@ class DiagnosisSummary:
 
 
 def read_summary(folder: Path) -> DiagnosisSummary | None:
-    """The diagnosis of a results folder, None where there is none or it cannot be understood.
+    """Return the diagnosis of a results folder, None if there is none or it cannot be read.
 
     Parameters
     ----------
