@@ -127,7 +127,7 @@ def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial
     assert {number.key for number in numbers} == {"day.gain"}
     size = {number.vine: number.value for number in numbers}
     assert size["day 2"] - size["day 3"] == pytest.approx(np.log(1.05 / 0.96), abs=0.025)
-    assert "how a regulator was set" in result.explanation
+    assert "setting of a regulator" in result.explanation
 
 
 def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> None:

@@ -42,7 +42,7 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     assert (said.verdict, said.answer_set) == ("artefact", ("film_mass",))
     (named,) = [candidate for candidate in said.rounds[0].ranking if candidate.effect == "film_mass"]
     assert len({number.vine for number in named.numbers}) == 2
-    assert "filmed at a frame rate that is off by half of its ε" in said.explanation
+    assert "an error of ε/2 in frame rate" in said.explanation
     (n,) = [number for number in named.along if number.key == "eversion_damping.n"]
     assert abs(n.value - truths["eversion_damping.n"]) < 2 * n.sigma
     assert f"Fitted together with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation

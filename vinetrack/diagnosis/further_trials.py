@@ -32,7 +32,7 @@ from vinetrack.dynamics.model import Value
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.planning.campaign_information import FEWEST_MOVING
+from vinetrack.planning.campaign_information import FEWEST_GROWTH_FRAMES
 from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
 from vinetrack.planning.scaling_priors import damping_prior
 
@@ -136,7 +136,7 @@ class _Search:
         moving = [trial_data.time_s.size - trial_data.n_rest for trial_data in asked.fit.predictor.data]
         blocks = _wide(asked, effect)
         before = {trial.name for trial in design.trials}
-        filmed = {name: k for k, name in enumerate(names) if name not in before and moving[k] >= FEWEST_MOVING}
+        filmed = {name: k for k, name in enumerate(names) if name not in before and moving[k] >= FEWEST_GROWTH_FRAMES}
         self.conditions = tuple(condition for condition in every if condition.trial.name in filmed)
         self.each = REPLICATES * blocks[[filmed[condition.trial.name] for condition in self.conditions]]
         self.so_far = _prior(asked) + blocks[[k for k, name in enumerate(names) if name in before]].sum(axis=0)

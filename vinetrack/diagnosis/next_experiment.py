@@ -27,7 +27,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.plan_text import calibration_for, entries, in_words, only_measurement, outlook
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.planning.design_simulation import Bench, expected, observed, separation
-from vinetrack.planning.discriminating_design import Side, all_sides, best_design, likeliest_vines, worth
+from vinetrack.planning.discriminating_design import RefitTerms, best_design, best_new_vines, refit_terms, worth
 from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, conditions
 from vinetrack.planning.hypothesis_predictions import carry
 from vinetrack.planning.simulated_tracks import camera_of, courses
@@ -183,7 +183,7 @@ def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
 
 
-def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Side]]:
+def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[RefitTerms]]:
     """Hypotheses, every condition worth filming, and what a trial of each would answer."""
     data = tied[0].predictor.data
     every = conditions([trial_data.trial for trial_data in data], limits)
@@ -199,12 +199,12 @@ def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[B
     chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
     hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
     try:
-        return Bench(hypotheses, chosen, lenses), all_sides(hypotheses, chosen, lenses, ways)
+        return Bench(hypotheses, chosen, lenses), refit_terms(hypotheses, chosen, lenses, ways)
     except SimulationError as error:
         raise FitError(f"Further trials cannot be followed by every hypothesis: {error}") from error
 
 
-def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list[_Option]:
+def _options(bench: Bench, sides: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
     """The best set of trials by every effort that gains over the lesser ones, with what to expect of it.
 
     One effort beyond what is enough is looked at, to have something to compare with.
@@ -221,7 +221,7 @@ def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list
     return options
 
 
-def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray[np.int_]]:
+def _by_effort(bench: Bench, sides: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
     """Conditions to choose from: on the rig so far, on others too, and with one or another new vine besides."""
     efforts = np.array([condition.effort for condition in bench.conditions])
     for effort in (SAME_RIG, OTHER_RIG):
@@ -231,7 +231,7 @@ def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray
     if new.size:
         vines = np.array([condition.trial.vine for condition in bench.conditions])
         most = MOST_VINES_TRIED if len(sides) == 2 else 1
-        for vine in likeliest_vines(sides, bench.conditions, new, trials, most):
+        for vine in best_new_vines(sides, bench.conditions, new, trials, most):
             yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 

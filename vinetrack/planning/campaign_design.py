@@ -1,8 +1,8 @@
-"""The campaign that pins n and B to a wanted error, with as few trials as possible.
+"""The smallest campaign that determines n and B with the standard errors wanted.
 
-A campaign grows every vine at K pressures, in equal ratios of the drive P − P_y (n is a slope in logarithms), with one
-payload or each of several, r times. K of two would be the cheapest for n, and blind to a model that fails in between:
-so there are a fewest and a most. What the cheapest allocation without that rule would cost stands beside it.
+A campaign grows every vine at K pressures, spaced in equal ratios of the drive P − P_y (n is a slope in logarithms),
+with one payload or each of several, r times. K = 2 would be cheapest for n, but could not reveal a model that fails in
+between, so K has a lower and an upper limit. The cheapest allocation without these limits is given for comparison.
 """
 
 from __future__ import annotations
@@ -21,31 +21,34 @@ from vinetrack.planning.campaign_information import FilmingPlan, Information, fi
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.scaling_priors import burst_pressure_Pa
 
-LEVELS = 13
-"""Pressures looked at for each vine. Chosen: neighbours differ by a factor 1.4 of the drive where the drive spans 50.
-Reasoned: at half no campaign of eight pressures is evenly spaced, at twice the search takes twice as long."""
+CANDIDATE_PRESSURES = 13
+"""Candidate pressures of each vine. Chosen: neighbours differ by a factor of 1.4 in drive where the drive spans a
+factor of 50. Reasoned: at half no campaign of eight pressures is evenly spaced, at twice the search takes twice as
+long."""
 
-SLOWEST_DRIVE = 0.02
-"""Of the largest drive, where no lowest pressure is given; the slowest that can be filmed decides then. Chosen: with it
-the speed of an n of 0.4 spans four decades, more than can be filmed. At half or twice the same trials are left by the
-camera's limits."""
+LOWEST_DRIVE_FRACTION = 0.02
+"""Lowest drive considered, as a fraction of the highest, where no lowest pressure is given. Chosen: at n = 0.4 the
+speeds then span four decades, more than a camera can film, so the camera decides. At half or twice the camera's limits
+leave the same trials."""
 
 MEASURED_YIELD_SIGMA_PA = 200.0
-"""Error of a yield pressure that will be measured with the campaign, as a sheet takes it where it says nothing. Chosen
-with that default."""
+"""Standard error of a yield pressure that will be measured with the campaign, Pa. Chosen: the sheet's default."""
 
-ENDLESS = 1e7
-"""Trials a condition in a campaign without end. Chosen: errors are then 3000 times smaller than those of one trial, so
-that only what trials cannot tell remains."""
+UNLIMITED_REPLICATES = 1e7
+"""Trials of each condition in a campaign of unlimited size. Chosen: standard errors are then 3000 times smaller than
+those of one trial, so that only what no number of trials determines remains."""
 
 
 class CampaignError(ValueError):
-    """A campaign that cannot be: one sentence with a remedy."""
+    """An impossible campaign: one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What a campaign may consist of; pressures in Pa (NaN: as low, or high, as can be), payloads in kg."""
+    """Limits of a campaign: pressures in Pa (NaN: as low, or as high, as possible), payloads in kg.
+
+    `pressures`, `replicates` : fewest and most. `burst_share` : largest fraction of the burst pressure.
+    """
 
     pressure_Pa: tuple[float, float] = (math.nan, math.nan)
     payloads_kg: tuple[float, ...] = (0.0,)
@@ -57,9 +60,9 @@ class Scope:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Conditions that can be filmed, what one trial of each says, and the model they stand on.
+    """Conditions that can be filmed, the information of one trial of each, and the model at its assumed values.
 
-    `vine`, `payload` and `level` index each condition; `rejected` counts those that cannot be filmed.
+    `vine` and `payload_kg` are those of each condition; `rejected` counts conditions that cannot be filmed.
     """
 
     model: Model
@@ -72,7 +75,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign: how many trials of each candidate condition, and the standard errors it is expected to leave.
+    """A campaign: number of trials of each candidate condition, and the expected standard errors of n and B.
 
     `n_error` is absolute, `B_errors` by vine are relative.
     """
@@ -86,21 +89,21 @@ class Plan:
 
     @property
     def n_trials(self) -> int:
-        """All trials."""
+        """Number of trials of all conditions."""
         return int(np.sum(self.counts))
 
     @property
     def B_error(self) -> float:
-        """That of the vine known least."""
+        """Largest relative standard error of B among the vines."""
         return max(self.B_errors.values(), default=0.0)
 
     def meets(self, n_error: float, B_error: float) -> bool:
-        """Whether both errors are as small as wanted.
+        """Whether the expected standard errors are as small as wanted.
 
         Parameters
         ----------
         n_error, B_error : float
-            Largest standard errors wanted: of n, absolute; of every B, relative.
+            Largest standard errors allowed: of n, absolute; of every B, relative.
 
         Returns
         -------
@@ -111,10 +114,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Planned:
-    """What was found: `best`, or None where no campaign within the scope will do; `others` in order of cost.
+    """Result of the search: `best`, or None where no campaign within the scope suffices; `others` in order of cost.
 
-    `cheapest` is the allocation without a rule on pressures and replicates, `endless` what trials without end of the
-    largest campaign would leave.
+    `cheapest` is the allocation without limits on pressures and replicates, `nearest` the campaign that misses the
+    wanted errors least, `endless` the largest campaign with unlimited replicates.
     """
 
     candidates: Candidates
@@ -126,13 +129,13 @@ class Planned:
 
 
 def candidates(vine_inputs: Sequence[PredictiveInputs], scope: Scope, filming: FilmingPlan) -> Candidates:
-    """Every condition that can be filmed, with what a trial of it would say.
+    """Return every condition that can be filmed, with the information of a trial of it.
 
     Parameters
     ----------
     vine_inputs : predictive inputs, one for each vine, all of one model.
     scope : pressures, payloads and limits to stay within.
-    filming : camera of the campaign; decides which conditions can be filmed.
+    filming : how trials are filmed; decides which conditions can be filmed.
 
     Returns
     -------
@@ -147,35 +150,35 @@ def candidates(vine_inputs: Sequence[PredictiveInputs], scope: Scope, filming: F
     trials = with_names([trial for inputs in vine_inputs for trial in _conditions(inputs, scope)])
     model = joint_model(vine_inputs)
     data = filmed(model, trials, filming)
-    kept = [trial_data for trial_data in data if trial_data is not None]
-    if not kept:
+    can_be_filmed = [trial_data for trial_data in data if trial_data is not None]
+    if not can_be_filmed:
         raise CampaignError(
-            f"No trial of the campaign could be filmed: none grows within {filming.longest_s:g} s and in a dozen "
-            "frames or more; widen the range of pressures, or change --capture-fps or --longest-s."
+            f"No trial of the campaign could be filmed: none finishes growing within {filming.longest_s:g} s and shows "
+            "a dozen frames of growth or more; widen the range of pressures, or change --capture-fps or --longest-s."
         )
-    shown = tuple(trial_data.trial for trial_data in kept)
+    feasible = tuple(trial_data.trial for trial_data in can_be_filmed)
     return Candidates(
         model=model,
-        trials=shown,
-        information=information(model, kept, filming, vine_inputs[0].spreads),
-        vine=tuple(trial.vine for trial in shown),
-        payload_kg=np.array([trial.payload_kg for trial in shown]),
-        rejected=len(data) - len(kept),
+        trials=feasible,
+        information=information(model, can_be_filmed, filming, vine_inputs[0].spreads),
+        vine=tuple(trial.vine for trial in feasible),
+        payload_kg=np.array([trial.payload_kg for trial in feasible]),
+        rejected=len(data) - len(can_be_filmed),
     )
 
 
 def _conditions(inputs: PredictiveInputs, scope: Scope) -> Iterator[Trial]:
-    """Pressures in equal ratios of the drive, with every payload."""
+    """The candidate trials of a vine: pressures in equal ratios of the drive, with every payload."""
     trial = inputs.trial
     onset = trial.yield_pressure_Pa
     burst = scope.burst_share * burst_pressure_Pa(trial.diameter_m, trial.thickness_m)
     high = burst if math.isnan(scope.pressure_Pa[1]) else min(scope.pressure_Pa[1], burst)
-    low = onset + SLOWEST_DRIVE * (high - onset) if math.isnan(scope.pressure_Pa[0]) else scope.pressure_Pa[0]
+    low = onset + LOWEST_DRIVE_FRACTION * (high - onset) if math.isnan(scope.pressure_Pa[0]) else scope.pressure_Pa[0]
     if not onset < low < high:
         return
     sigma = trial.yield_pressure_sigma_Pa
     for pressure_Pa, payload_kg in itertools.product(
-        onset + np.geomspace(low - onset, high - onset, LEVELS), scope.payloads_kg
+        onset + np.geomspace(low - onset, high - onset, CANDIDATE_PRESSURES), scope.payloads_kg
     ):
         rounded = float(f"{pressure_Pa:.3g}")
         yield replace(
@@ -189,31 +192,31 @@ def _conditions(inputs: PredictiveInputs, scope: Scope) -> Iterator[Trial]:
 
 
 def plan(candidate_set: Candidates, scope: Scope, n_error: float, B_error: float) -> Planned:
-    """The campaign with the fewest trials that leaves no more than these standard errors.
+    """Find the campaign with the fewest trials whose expected standard errors are as small as wanted.
 
     Parameters
     ----------
     candidate_set : from `candidates`.
-    scope : fewest and most pressures and replicates, and most trials.
+    scope : limits on pressures, replicates and trials.
     n_error : float
-        Standard error wanted of n, absolute.
+        Largest standard error of n, absolute.
     B_error : float
-        Standard error wanted of every B, relative.
+        Largest standard error of every B, relative.
 
     Returns
     -------
     Planned
     """
-    tried = [_smallest(candidate_set, scope, design, n_error, B_error) for design in _shapes(candidate_set, scope)]
-    good = [design for design in tried if design.meets(n_error, B_error) and design.n_trials <= scope.most_trials]
-    good.sort(key=lambda design: (design.n_trials, -design.pressures))
-    largest = max(tried, key=lambda design: np.count_nonzero(design.counts))
-    endless = _judged(candidate_set, np.where(largest.counts > 0, ENDLESS, 0.0))
-    affordable = [design for design in tried if design.n_trials <= scope.most_trials] or tried
+    designs = [_fewest_replicates(candidate_set, scope, s, n_error, B_error) for s in _shapes(candidate_set, scope)]
+    sufficient = [d for d in designs if d.meets(n_error, B_error) and d.n_trials <= scope.most_trials]
+    sufficient.sort(key=lambda design: (design.n_trials, -design.pressures))
+    largest = max(designs, key=lambda design: np.count_nonzero(design.counts))
+    endless = _with_errors(candidate_set, np.where(largest.counts > 0, UNLIMITED_REPLICATES, 0.0))
+    affordable = [design for design in designs if design.n_trials <= scope.most_trials] or designs
     return Planned(
         candidates=candidate_set,
-        best=good[0] if good else None,
-        others=tuple(good[1:]),
+        best=sufficient[0] if sufficient else None,
+        others=tuple(sufficient[1:]),
         cheapest=_cheapest(candidate_set, scope.most_trials, n_error, B_error),
         endless=endless,
         nearest=min(affordable, key=lambda design: max(design.n_error / n_error, design.B_error / B_error)),
@@ -222,7 +225,7 @@ def plan(candidate_set: Candidates, scope: Scope, n_error: float, B_error: float
 
 @dataclass(frozen=True)
 class _Shape:
-    """Which conditions: how many pressures, which payloads, and a mark for each candidate."""
+    """A set of conditions: number of pressures, payloads, and a mask of the candidates."""
 
     pressures: int
     payloads_kg: tuple[float, ...]
@@ -230,7 +233,7 @@ class _Shape:
 
 
 def _shapes(candidate_set: Candidates, scope: Scope) -> Iterator[_Shape]:
-    """Every number of pressures with one payload alone, or all of them."""
+    """Every number of pressures, with each single payload and with all payloads together."""
     payloads: list[tuple[float, ...]] = [(payload,) for payload in scope.payloads_kg]
     if len(scope.payloads_kg) > 1:
         payloads.append(scope.payloads_kg)
@@ -242,25 +245,25 @@ def _shapes(candidate_set: Candidates, scope: Scope) -> Iterator[_Shape]:
                 k for k, name in enumerate(candidate_set.vine) if name == vine and candidate_set.payload_kg[k] == load
             ]
             if places:
-                chosen[[places[i] for i in _spread(len(places), pressures)]] = True
+                chosen[[places[i] for i in _evenly_spaced(len(places), pressures)]] = True
         if chosen.tobytes() not in seen and chosen.any():
             seen.add(chosen.tobytes())
             yield _Shape(pressures, loads, chosen)
 
 
-def _spread(count: int, wanted: int) -> list[int]:
-    """Evenly spread places among `count`, the ends included."""
+def _evenly_spaced(count: int, wanted: int) -> list[int]:
+    """Indices below `count`, evenly spaced, the ends included."""
     return sorted(set(np.rint(np.linspace(0, count - 1, min(wanted, count))).astype(int).tolist()))
 
 
-def _smallest(candidate_set: Candidates, scope: Scope, shape: _Shape, n_error: float, B_error: float) -> Plan:
-    """The fewest replicates of a shape that will do, or as many as there may be."""
+def _fewest_replicates(candidate_set: Candidates, scope: Scope, shape: _Shape, n_error: float, B_error: float) -> Plan:
+    """The fewest replicates of a shape that suffice; the most allowed where none do."""
     design = None
     affordable = scope.most_trials // int(np.count_nonzero(shape.chosen))
     for replicates in range(scope.replicates[0], max(min(scope.replicates[1], affordable), scope.replicates[0]) + 1):
         counts = replicates * shape.chosen.astype(float)
         design = replace(
-            _judged(candidate_set, counts),
+            _with_errors(candidate_set, counts),
             pressures=shape.pressures,
             replicates=replicates,
             payloads_kg=shape.payloads_kg,
@@ -271,41 +274,42 @@ def _smallest(candidate_set: Candidates, scope: Scope, shape: _Shape, n_error: f
     return design
 
 
-def _judged(candidate_set: Candidates, counts: Floats) -> Plan:
+def _with_errors(candidate_set: Candidates, counts: Floats) -> Plan:
+    """The campaign of these counts with its expected standard errors."""
     n, B = candidate_set.information.errors(counts)
     return Plan(counts, n, B)
 
 
 def _cheapest(candidate_set: Candidates, most_trials: int, n_error: float, B_error: float) -> Plan | None:
-    """Trials added one by one where they help most, from one at each end of every vine's range."""
+    """Greedy design: one trial at each end of every vine's range, then one at a time where it helps most."""
     counts = np.zeros(len(candidate_set.trials))
     for vine in dict.fromkeys(candidate_set.vine):
         places = [k for k, name in enumerate(candidate_set.vine) if name == vine]
         drives = [candidate_set.trials[k].pressure_Pa for k in places]
         counts[[places[int(np.argmin(drives))], places[int(np.argmax(drives))]]] = 1
     while np.sum(counts) <= most_trials:
-        now = _judged(candidate_set, counts)
-        if now.meets(n_error, B_error):
-            return now
-        step = np.eye(len(counts))
-        tried = [_short_by(_judged(candidate_set, counts + extra), n_error, B_error) for extra in step]
-        counts = counts + step[int(np.argmin(tried))]
+        design = _with_errors(candidate_set, counts)
+        if design.meets(n_error, B_error):
+            return design
+        one_more = np.eye(len(counts))
+        losses = [_loss(_with_errors(candidate_set, counts + extra), n_error, B_error) for extra in one_more]
+        counts = counts + one_more[int(np.argmin(losses))]
     return None
 
 
-def _short_by(design: Plan, n_error: float, B_error: float) -> float:
-    """By how much a campaign misses what is wanted; all misses count, so that none is traded for nothing."""
+def _loss(design: Plan, n_error: float, B_error: float) -> float:
+    """Squared ratios of the errors to those wanted, summed where above 1, and a little of all to break ties."""
     ratios = np.array([design.n_error / n_error, *(error / B_error for error in design.B_errors.values())])
     return float(np.sum(np.maximum(ratios, 1.0) ** 2) + 1e-3 * np.sum(ratios**2))
 
 
 def trials_of(candidate_set: Candidates, design: Plan) -> list[Trial]:
-    """Every trial of a campaign, named, replicates one after the other.
+    """Return every trial of a campaign with a name, replicates next to each other.
 
     Parameters
     ----------
-    candidate_set : what the campaign was chosen from.
-    design : the campaign: trials of each condition.
+    candidate_set : conditions that the campaign was chosen from.
+    design : the campaign: number of trials of each condition.
 
     Returns
     -------

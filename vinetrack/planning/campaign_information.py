@@ -1,17 +1,17 @@
-"""How well trials that are not yet made would pin n and B: the information of the linear mixed model about them.
+"""Expected precision of n and B from planned trials: Fisher information of the linear mixed model.
 
-Each condition is simulated once at the medians of the predictive inputs, with a camera's frames and noise; what it
-would say of n, B and the yield pressure follows from the sensitivities of its positions, with release, origin and the
-deviations of pressure and B that every trial has of its own integrated out. Information adds up over trials, so any
-campaign is judged without simulating it again.
+Each condition is simulated once at the medians of the predictive inputs, with the camera's frames and noise. Its
+information about n, B and the yield pressure follows from the sensitivities of its positions, with the trial effects
+(release, origin, deviations of pressure and B) integrated out. Information adds up over trials, so any campaign is
+evaluated without further simulation.
 
-Beside it, what steady speeds alone would say of n, by the damping law
+For comparison, the precision of n from steady speeds alone follows from the damping law
 
     ln (P − P_y)A = ln B + n ln ẋ_ss
 
-which scatters by what B and P do from trial to trial, and which a yield pressure that is off tilts. A fit to
-trajectories uses more (how a vine gets to its speed), as long as its model lacks nothing; the law uses less and needs
-less.
+whose scatter comes from the between-trial deviations of B and P, and whose slope is biased by an error of the yield
+pressure. A fit to trajectories also uses the approach to the steady speed, as long as its model lacks nothing; the law
+uses less and assumes less.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 REST_FRAMES = 20
-"""Frames at rest before release. Chosen: their mean fixes the origin to 0.22 of one frame's noise; at half 0.32, at
-twice 0.16, small beside what growth says."""
+"""Frames at rest before release. Chosen: their mean determines the origin to 0.22 of one frame's noise; at half 0.32,
+at twice 0.16, small beside the information of the growth."""
 
-RELEASE_PART = 0.4
-"""Where between two frames the release falls, in frames: nowhere special. Chosen: n and B answer alike wherever it
-falls, only the first frames differ."""
+RELEASE_FRACTION = 0.4
+"""Time of release within a frame interval, in frames. Chosen arbitrarily: the information about n and B hardly depends
+on it, since only the first frames change."""
 
-FEWEST_MOVING = 12
+FEWEST_GROWTH_FRAMES = 12
 """Frames of growth below which a trial is not worth filming. Chosen: release, origin, the deviations of pressure and B,
-and a curve take six numbers, here with as many frames to spare. At half trials are planned that a fit can barely use;
-at twice fast vines drop out."""
+and a curve take six parameters, which leaves as many degrees of freedom. At half trials are planned that a fit can
+barely use; at twice fast vines drop out."""
 
 
 @dataclass(frozen=True)
 class FilmingPlan:
-    """What a campaign is filmed with: frames a second, noise of a position, m, and its lag-one correlation.
+    """How a campaign is filmed: frames per second, noise of a position, m, and its lag-one correlation.
 
-    Recordings end with the growth, at twice `longest_s` where that does not end, and `stops_s` after release at the
-    latest.
+    A recording ends with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s`
+    after release.
     """
 
     capture_fps: float
@@ -66,10 +66,10 @@ class FilmingPlan:
 
 @dataclass(frozen=True)
 class Information:
-    """What one trial of each condition says; `free` names the numbers; as the fit holds them: ln B, n over its scale.
+    """Fisher information of one trial of each condition about the `free` parameters.
 
-    `each`, shape (n_conditions, n_free, n_free); `prior`, shape (n_free,), is what is known beforehand: the yield
-    pressures, as precisely as they are stated.
+    Parameters are scaled as in the fit (ln B, n over its scale). `each`, shape (n_conditions, n_free, n_free); `prior`,
+    shape (n_free,), is the prior precision: that of the yield pressures as stated.
     """
 
     free: tuple[FreeParameter, ...]
@@ -77,19 +77,17 @@ class Information:
     prior: Floats
 
     def covariance(self, counts: Floats) -> Floats:
-        """Covariance of the free numbers after so many trials of every condition, shape (n_free, n_free).
-
-        Infinite on the diagonal where they say nothing of a number.
+        """Covariance of the free parameters after these numbers of trials.
 
         Parameters
         ----------
         counts : array, shape (n_conditions,)
-            Trials of each condition.
+            Number of trials of each condition.
 
         Returns
         -------
         array, shape (n_free, n_free)
-            Scaled as the fit holds the numbers.
+            Scaled as in the fit; infinite on the whole diagonal where the information is singular.
         """
         total = np.tensordot(counts, self.each, axes=1) + np.diag(self.prior)
         scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
@@ -105,7 +103,7 @@ class Information:
         Parameters
         ----------
         counts : array, shape (n_conditions,)
-            Trials of each condition.
+            Number of trials of each condition.
 
         Returns
         -------
@@ -123,11 +121,11 @@ class Information:
 
 
 def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
-    """One model with the medians of all vines: B of each, the rest shared.
+    """Return one model with the median B of each vine and everything else shared.
 
     Parameters
     ----------
-    vine_inputs : predictive inputs of each vine; the model of the first is taken.
+    vine_inputs : predictive inputs of each vine; the model is that of the first.
 
     Returns
     -------
@@ -139,7 +137,7 @@ def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
 
 
 def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[FitTrial | None]:
-    """Each trial as a fit would see it, without noise; None for those too slow or too quick to be filmed.
+    """Return the data of each trial as a fit would get them, without noise; None where it is too slow or too fast.
 
     Parameters
     ----------
@@ -150,7 +148,7 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
     Returns
     -------
     list of FitTrial or None
-        One a trial, in order.
+        One for each trial, in order.
     """
     frame_s = float(1 / camera.capture_fps)
     ends = simulate_many(model, trials, [np.array([0.0, camera.longest_s])] * len(trials))
@@ -159,11 +157,11 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
     until = [end.end_time_s if end.status == "ended" else 0.0 for end in ends]
     for end in until:
         frames = np.arange(-REST_FRAMES, max(int(end * camera.capture_fps), 1), dtype=float)
-        times.append((frames + 1 - RELEASE_PART) * frame_s)
+        times.append((frames + 1 - RELEASE_FRACTION) * frame_s)
     moved = simulate_many(model, trials, times)
     for trial, trajectory, end in zip(trials, moved, until, strict=True):
         keep = trajectory.lead_position_m < END_FRACTION * trial.length_m
-        if end == 0.0 or np.count_nonzero(keep & (trajectory.lead_position_m > 0)) < FEWEST_MOVING:
+        if end == 0.0 or np.count_nonzero(keep & (trajectory.lead_position_m > 0)) < FEWEST_GROWTH_FRAMES:
             data.append(None)
             continue
         count = int(np.count_nonzero(keep))
@@ -182,14 +180,14 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
 
 
 def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -> Floats:
-    """Speed of the leading edge at 0.95 of the length, m/s, shape (n_trials,); 0 where it does not get there.
+    """Return the speed of the leading edge at 0.95 of the length, m/s; 0 where it does not get there.
 
     Parameters
     ----------
     model : with B by vine.
     trials : conditions.
     longest_s : float
-        Growth is followed for so long, s.
+        Duration of the simulation, s.
 
     Returns
     -------
@@ -212,12 +210,12 @@ def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -
 def information(
     model: Model, data: Sequence[FitTrial], camera: FilmingPlan, spreads: tuple[float, float]
 ) -> Information:
-    """What one trial of each condition would say: the information of the linear mixed model, trial effects eliminated.
+    """Return the information of one trial of each condition, trial effects integrated out.
 
     Parameters
     ----------
     model : at its assumed values, with B by vine.
-    data : see `filmed`; None left out.
+    data : from `filmed`, without None.
     camera : noise of a position and its correlation.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
@@ -230,7 +228,7 @@ def information(
     predictor = Predictor(layout, data)
     trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
     theta = layout.start
-    predictor.linearise(theta, trial_effects)  # its steps are right the second time
+    predictor.linearise(theta, trial_effects)  # the first call adapts the steps of the finite differences
     columns = predictor.linearise(theta, trial_effects)
     cross_products = all_products(columns, [trial_data.first for trial_data in data])
     problem = make_problem(predictor, trial_effects)
@@ -248,21 +246,21 @@ def _information(layout: ParameterMap, problem: MixedProblem, state: FitState, c
     return Information(layout.free, each[:, :count, :count], layout.prior_precision)
 
 
-STEADY = 0.97
-"""Of the speed of Eq. (3), that a vine must have come to at 0.95 of its length to count as steady. Chosen: as in a
+STEADY_FRACTION = 0.97
+"""Fraction of the speed of Eq. (3) that a vine must reach before 0.95 of its length to count as steady. Chosen: as in a
 steady window, 3 % of speed are 1 % of force at n = 0.37. At half (1.5 %) fewer vines count as steady, at twice more do,
 with a bias of 2 %."""
 
 
 def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> np.ndarray:
-    """Which bare vines come to within 3 % of their steady speed before the end, shape (n_trials,).
+    """Return which vines without payload come to within 3 % of their steady speed before the end.
 
     Parameters
     ----------
     model : with B by vine.
     trials : conditions.
     longest_s : float
-        Growth is followed for so long, s.
+        Duration of the simulation, s.
 
     Returns
     -------
@@ -273,12 +271,12 @@ def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> n
     for trial, moved in zip(trials, simulate_many(model, trials, times), strict=True):
         inside = moved.lead_position_m < 0.95 * trial.length_m
         highest = trial.travel_ratio * float(np.max(moved.lead_velocity_m_s[inside]))
-        reached.append(trial.payload_kg == 0 and highest > STEADY * steady_speed(model, trial))
+        reached.append(trial.payload_kg == 0 and highest > STEADY_FRACTION * steady_speed(model, trial))
     return np.array(reached)
 
 
 def steady_speed(model: Model, trial: Trial) -> float:
-    """Tail speed of Eq. (3) of Alvarez et al. (2025), ((P − P_y)A/B)^(1/n), m/s.
+    """Return the tail speed of Eq. (3) of Alvarez et al. (2025), ((P − P_y)A/B)^(1/n), m/s.
 
     Parameters
     ----------
@@ -297,16 +295,16 @@ def steady_speed(model: Model, trial: Trial) -> float:
 def steady_error(
     model: Model, trials: Sequence[Trial], counts: Floats, spreads: tuple[float, float], steady: np.ndarray
 ) -> float:
-    """Standard error of n from the steady trials among so many of each condition; infinite where they cannot tell.
+    """Return the standard error of n from the steady trials alone; infinite where they do not determine it.
 
-    Weighted least squares of ln F = ln B_v + n ln ẋ_ss with a shared shift of the yield pressure for each vine.
+    Weighted least squares of ln F = ln B_v + n ln ẋ_ss with one error of the yield pressure for each vine.
 
     Parameters
     ----------
     model : with damping; B by vine.
     trials : conditions.
     counts : array, shape (n_trials,)
-        Trials of each condition.
+        Number of trials of each condition.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
     steady : array of bool, shape (n_trials,)
@@ -319,8 +317,8 @@ def steady_error(
     vines = list(dict.fromkeys(trial.vine for trial in trials))
     size = 1 + 2 * len(vines)
     total = np.zeros((size, size))
-    for trial, count, settles in zip(trials, counts.tolist(), steady.tolist(), strict=True):
-        if not settles or count == 0:
+    for trial, count, is_steady in zip(trials, counts.tolist(), steady.tolist(), strict=True):
+        if not is_steady or count == 0:
             continue
         drive = trial.pressure_Pa - trial.yield_pressure_Pa
         scatter = math.hypot(spreads[1], spreads[0] * trial.pressure_Pa / drive)
@@ -329,13 +327,13 @@ def steady_error(
         row[1 + vines.index(trial.vine)] = 1.0
         row[1 + len(vines) + vines.index(trial.vine)] = trial.yield_pressure_sigma_Pa / drive
         total += count * np.outer(row, row) / max(scatter, 1e-6) ** 2
-    known = np.diag(total) > 0
-    if not known[0]:
+    has_information = np.diag(total) > 0
+    if not has_information[0]:
         return math.inf
-    # Yield pressures in units of their stated error: known to 1 beforehand.
+    # Errors of yield pressures are in units of their stated standard error, so their prior precision is 1.
     total[np.arange(1 + len(vines), size), np.arange(1 + len(vines), size)] += 1.0
-    kept = np.flatnonzero(known)
-    inside = total[np.ix_(kept, kept)]
-    if np.linalg.cond(inside) > 1e12:
+    determined = np.flatnonzero(has_information)
+    information_matrix = total[np.ix_(determined, determined)]
+    if np.linalg.cond(information_matrix) > 1e12:
         return math.inf
-    return math.sqrt(float(np.linalg.inv(inside)[0, 0]))
+    return math.sqrt(float(np.linalg.inv(information_matrix)[0, 0]))
