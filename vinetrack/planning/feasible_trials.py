@@ -1,8 +1,8 @@
-"""Trials that could be made next: pressures, payloads, vines and rigs within what the user allows.
+"""Candidate trials for the next experiment: pressures, payloads, vines and rigs within the user's limits.
 
-Where the user says nothing the experiment is the guide: pressures from the lowest used to a quarter above the highest
-and never above what the film holds; no payload or the heaviest used; half and twice the chamber; connectors of half and
-twice the area; and film of other thickness rolled to other diameters. Rigs change one thing at a time.
+Where a limit is not given it follows from the experiment: pressures from the lowest used to a quarter above the highest
+and never above the strength of the film; no payload or the heaviest used; half and twice the chamber; connectors of
+half and twice the area; and vines of other diameters and film thicknesses. Only one part of a rig changes at a time.
 """
 
 from __future__ import annotations
@@ -22,44 +22,45 @@ from vinetrack.experiment.settings import Limits
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2
-"""What a trial asks for: nothing new; another chamber, connector or angle; a vine that has to be made. Defined in order
-of effort; nothing but their order counts."""
+"""Effort of a trial: nothing new; another chamber, connector or angle; a vine that has to be made. Defined in order of
+effort; only their order matters."""
 
 HEADROOM = 1.25
-"""Pressures are looked at up to this many times the highest that was used. Chosen: a modest step beyond experience. At
-1.12 less of the model is tested, at 1.5 pressures may exceed what a rig can hold."""
+"""Highest candidate pressure, as a multiple of the highest used. Chosen: a modest step beyond experience. At 1.12 less
+of the model is tested, at 1.5 pressures may exceed what a rig can hold."""
 
-ABOVE_YIELD = 1.15
-"""Nearer to the yield pressure its own error decides how a vine moves. Chosen: an error of 3 % of P_y is then 20 % of
-the drive P − P_y. At 1.07 it is 40 %, at 1.3 slow trials are not offered."""
+LOWEST_PRESSURE_RATIO = 1.15
+"""Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure, since nearer to it the
+error of P_y dominates the motion. Chosen: an error of 3 % of P_y is then 20 % of the drive P − P_y. At 1.07 it is 40 %,
+at 1.3 slow trials are not offered."""
 
 PRESSURE_STEP_PA = 100.0
-"""As finely as pressures are set. Chosen: regulators are read to about 0.1 kPa; at half or twice a plan's pressures
-differ by less than their errors."""
+"""Resolution of set pressures, Pa. Chosen: regulators are read to about 0.1 kPa; at half or twice, the pressures of a
+plan change by less than their errors."""
 
 PAYLOAD_KG = 0.05
 """Payload offered where none was used yet, kg. Chosen: several times the mass of a usual tail; the user's limits
 replace it."""
 
-PRESSURES_LOOKED_AT = 6
-"""Chosen: over a range of ten, steps of 1.6. At half an optimum between pressures is missed by little (designs are flat
-there), at twice the search takes longer."""
+CANDIDATE_PRESSURES = 6
+"""Candidate pressures of a vine. Chosen: over a factor of ten, steps of 1.6. At half an optimum between pressures is
+missed by little (designs are flat there), at twice the search takes longer."""
 
 MOST_NEW_VINES = 10
-"""Chosen for time; the most different sizes are kept. At half a useful size may be missed, at twice the search takes
-twice as long."""
+"""New vines considered, at most; those of the most different sizes are taken. Chosen for time: at half a useful size
+may be missed, at twice the search takes twice as long."""
 
-SAME = 1e-4
-"""Relative difference below which two values are the same. Chosen: below any tolerance of a workshop, above
-rounding."""
+EQUAL_TOLERANCE = 1e-4
+"""Relative difference below which two values are equal. Chosen: below any tolerance of a workshop, above rounding."""
 
 
 @dataclass(frozen=True)
 class Condition:
     """A trial that could be made.
 
-    `like` is the place among the trials of the experiment of the one it is modelled on: for a vine that exists, a trial
-    with it; else one with the vine nearest in size. `changed` names what differs from the rig of that trial.
+    `like` is the index, among the trials of the experiment, of the trial it is modelled on: for an existing vine a
+    trial with it, else one with the vine nearest in size. `changed` names the columns that differ from the rig of that
+    trial.
     """
 
     trial: Trial
@@ -69,23 +70,23 @@ class Condition:
 
 
 def conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
-    """Every trial to look at; empty where the limits leave none.
+    """Return every candidate trial; empty where the limits exclude all.
 
     Parameters
     ----------
     trials : of the experiment, at least one.
-    limits : what the user allows.
+    limits : of the user.
 
     Returns
     -------
     list of Condition
         Named `next_1`, `next_2`, …
     """
-    models = _models(trials)
-    if not models:
+    typical = _typical_trials(trials)
+    if not typical:
         return []
     used = [trial for trial in trials if trial.travel_ratio != 1]
-    vines = [(trials[k], k) for k in models]
+    vines = [(trials[k], k) for k in typical]
     feasible = []
     for vine, k in vines:
         if _allowed(vine, limits):
@@ -108,40 +109,41 @@ def conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
     ]
 
 
-RIG = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
+RIG_FIELDS = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
+"""Columns of the sheet that describe a rig, with their fields of a trial."""
 
 
 def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
-    return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
+    return tuple(column for column, name in RIG_FIELDS.items() if not _alike(rig, before, [name]))
 
 
-def _models(trials: Sequence[Trial]) -> list[int]:
-    """The trial of each everting vine that stands for it: the first of its commonest rig and yield pressure."""
+def _typical_trials(trials: Sequence[Trial]) -> list[int]:
+    """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
     rigs = [(trial.vine, trial.yield_pressure_Pa, trial.chamber_m3, trial.inlet_m, trial.bends) for trial in trials]
     texts = [repr(rig) for rig in rigs]
     places = []
     for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
-        mine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
-        places.append(texts.index(Counter(mine).most_common(1)[0][0]))
+        of_vine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
+        places.append(texts.index(Counter(of_vine).most_common(1)[0][0]))
     return places
 
 
 def _allowed(vine: Trial, limits: Limits) -> bool:
-    """Whether the user's lists, where there are any, hold this vine."""
+    """Whether the user's lists of sizes, where given, contain this vine."""
     sizes = (
         (vine.diameter_m * 1e3, limits.diameter_mm),
         (vine.thickness_m * 1e6, limits.thickness_um),
         (vine.length_m * 1e3, limits.length_mm),
     )
-    return all(values is None or not math.isfinite(size) or _among(size, values) for size, values in sizes)
+    return all(values is None or not math.isfinite(size) or _is_among(size, values) for size, values in sizes)
 
 
-def _among(value: float, values: Iterable[float]) -> bool:
-    return any(math.isclose(value, listed, rel_tol=SAME, abs_tol=1e-12) for listed in values)
+def _is_among(value: float, values: Iterable[float]) -> bool:
+    return any(math.isclose(value, listed, rel_tol=EQUAL_TOLERANCE, abs_tol=1e-12) for listed in values)
 
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
-    """The vine on every rig: of chamber, connector and angle no more is changed at a time than the limits ask for."""
+    """The vine on every rig; chamber, connector and angle change one at a time unless the limits require more."""
     half, twice = math.sqrt(0.5), math.sqrt(2.0)
     chambers = _choices(vine.chamber_m3, [t.chamber_m3 for t in used], limits.chamber_l, 1e-3, (0.5, 2.0))
     inlets = _choices(vine.inlet_m, [t.inlet_m for t in used], limits.inlet_mm, 1e-3, (half, twice))
@@ -151,7 +153,7 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
         rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
         changes = len(_changed(rig, vine))
         if changes == 0 or not inlet > vine.diameter_m:
-            at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
+            at_hand = any(_alike(rig, trial, tuple(RIG_FIELDS.values())) for trial in used)
             rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
     fewest = min((changed for changed, _, _ in rigs), default=0)
     return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
@@ -160,14 +162,14 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
 def _choices(
     now: float, used: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float] = ()
 ) -> list[float]:
-    """Values of one thing of the rig: those the user lists, else those used and some about what is; NaN stays."""
+    """Values of one part of the rig: the user's, else those used and multiples of the present one; NaN stays."""
     if not math.isfinite(now):
         return [now]
     if given is not None:
         return [value * unit for value in given]
-    known = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
-    known += [_rounded(now * factor) for factor in factors]
-    return [value for i, value in enumerate(known) if not _among(value, known[:i])]
+    values = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
+    values += [_rounded(now * factor) for factor in factors]
+    return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
 
 
 def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Limits) -> list[Condition]:
@@ -180,33 +182,33 @@ def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Li
 
 
 def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
-    """None (or the least allowed), the heaviest, and those that were used between."""
-    before = {trial.payload_kg for trial in used}
-    heaviest = max(before) if max(before) > 0 else PAYLOAD_KG
+    """No payload (or the lightest allowed), the heaviest, and those used in between."""
+    payloads = {trial.payload_kg for trial in used}
+    heaviest = max(payloads) if max(payloads) > 0 else PAYLOAD_KG
     low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
-    return sorted({low, high, *(payload for payload in before if low <= payload <= high)})
+    return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
 
 
 def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
-    """Set pressures in equal ratios, Pa, with the error of setting them."""
-    before = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
-    if not before:
+    """Set pressures in equal ratios, Pa, each with its standard error."""
+    pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
+    if not pressures:
         return []
-    low, high = min(before), HEADROOM * max(before)
+    low, high = min(pressures), HEADROOM * max(pressures)
     if limits.pressure_kPa is not None:
         low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
     stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
     if math.isfinite(stress_Pa):
-        # A guess of what film holds must not forbid what it has held; what the user says of it may.
-        told = "hoop_stress_MPa" in limits.model_fields_set
-        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not told]
+        # The default strength of film must not exclude pressures that this vine has held; a stated strength may.
+        is_stated = "hoop_stress_MPa" in limits.model_fields_set
+        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not is_stated]
         bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
         high = min(high, max([PRESSURE_STEP_PA * math.floor(bursts_Pa / PRESSURE_STEP_PA), *held]))
     if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
-        low = max(low, ABOVE_YIELD * rig.yield_pressure_Pa)
+        low = max(low, LOWEST_PRESSURE_RATIO * rig.yield_pressure_Pa)
     if not low <= high:
         return []
-    steps = np.geomspace(low, high, PRESSURES_LOOKED_AT) if high > 1.02 * low else np.array([high])
+    steps = np.geomspace(low, high, CANDIDATE_PRESSURES) if high > 1.02 * low else np.array([high])
     relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
     share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
     steps = np.clip(PRESSURE_STEP_PA * np.round(steps / PRESSURE_STEP_PA), low, high)
@@ -214,11 +216,11 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
 
 
 def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:
-    """Vines that could be made, each with the place of the trial whose vine is nearest in size."""
+    """Vines that could be made, each with the index of the trial whose vine is nearest in size."""
     vines = [trial for trial, _ in models]
     diameters = _sizes([v.diameter_m for v in vines], limits.diameter_mm, 1e-3, (0.5, 0.75, 1.5))
     walls = _sizes([v.thickness_m for v in vines], limits.thickness_um, 1e-6, (0.5, 2.0))
-    vines_found: list[tuple[Trial, int]] = []
+    new_vines: list[tuple[Trial, int]] = []
     for diameter, wall in itertools.product(diameters, walls):
         if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
             continue
@@ -235,24 +237,24 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
                 pressure_trace=None,
             )
             if not any(_alike(sized, vine) for vine in vines):
-                vines_found.append((with_names([sized])[0], like))
-    return _spread_out(vines_found, MOST_NEW_VINES)
+                new_vines.append((with_names([sized])[0], like))
+    return _most_different(new_vines, MOST_NEW_VINES)
 
 
 def _sizes(
     before: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float]
 ) -> list[float]:
-    """Sizes to look at: those the user lists, else those used and some beyond."""
+    """Candidate sizes: the user's, else those used and multiples of the smallest and largest."""
     if given is not None:
         return [size * unit for size in given]
-    known = {size for size in before if math.isfinite(size)}
-    if not known:
+    used = {size for size in before if math.isfinite(size)}
+    if not used:
         return []
-    return sorted(known | {_rounded(f * (min(known) if f < 1 else max(known))) for f in factors})
+    return sorted(used | {_rounded(f * (min(used) if f < 1 else max(used))) for f in factors})
 
 
 def _rounded(value: float) -> float:
-    """Two significant digits: sizes that a person would ask for."""
+    """The value to two significant digits, as a person would order it."""
     return float(f"{value:.2g}")
 
 
@@ -262,16 +264,16 @@ def _distance(vine: Trial, diameter_m: float, thickness_m: float) -> float:
 
 def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
     pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
-    return all(_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+    return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
-def _spread_out(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
-    """At most so many vines, those furthest from one another in diameter, thickness and length."""
+def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
+    """At most so many vines, by farthest-point sampling in ln diameter, ln thickness and ln length."""
     if len(vines) <= most:
         return vines
-    places = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
-    chosen = [int(np.argmax(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
+    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
+    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
     while len(chosen) < most:
-        away = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(away)))
+        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
     return [vines[k] for k in sorted(chosen)]

@@ -1,8 +1,8 @@
-"""A campaign made before it is made: grown with scatter, filmed with noise, fitted, and held against the truth.
+"""Monte Carlo check of a planned campaign: simulated with scatter and noise, fitted, compared with the truth.
 
-What the information of a campaign promises is a linear estimate. Here it is tried: every trial has its own pressure and
-B, every vine a yield pressure that was misread, release falls between frames, positions are noisy; then the fit of
-`vinetrack.fit` does what it would do with a real campaign.
+The standard errors expected from the information of a campaign are a linear estimate. Here every trial has its own
+pressure and B, every vine a misread yield pressure, release falls between frames and positions are noisy; then
+`vinetrack.fit` fits the campaign as it would a real one.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 @dataclass(frozen=True)
 class SimulatedCampaigns:
-    """Errors found in `campaigns` that were made: root mean squares, and the mean of what the fits stated.
+    """Errors of fits to `campaigns` simulated campaigns: root mean square of the true and of the stated errors.
 
-    `n_rms` and `n_stated` are absolute; `B_rms`, `B_stated` relative, by vine. `covered` is how often a 95 % interval
-    held the truth, of all numbers. `failed` counts campaigns that could not be fitted.
+    `n_rms` and `n_stated` are absolute; `B_rms`, `B_stated` relative, by vine. `covered` is the fraction of all 95 %
+    intervals that contain the truth. `failed` counts campaigns that could not be fitted.
     """
 
     campaigns: int
@@ -41,7 +41,7 @@ class SimulatedCampaigns:
 
     @property
     def uncertainty(self) -> float:
-        """Relative standard error of a root mean square of so few campaigns."""
+        """Relative standard error of a root mean square over this number of campaigns."""
         return 1 / math.sqrt(2 * max(self.campaigns, 1))
 
 
@@ -60,12 +60,12 @@ def simulate_campaign(
     Parameters
     ----------
     model : the truth, with B by vine.
-    trials : trials of the campaign, replicates one by one.
+    trials : all trials of the campaign, replicates included.
     camera : frame rate, noise and longest recording.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
     campaigns : int
-        How many are simulated.
+        Number of simulated campaigns.
     seed : int
         Of the random numbers.
     watch : callable, optional
@@ -97,10 +97,10 @@ def make(
     draw: np.random.Generator,
     host: Model | None = None,
 ) -> list[tuple[Trial, Track]]:
-    """Sheet and tracks of one campaign: what the sheet states, and what a camera would have seen.
+    """Simulate one campaign: its trials as the sheet states them, and their tracks.
 
-    The camera is taken for calibrated: no smooth error of position is allowed for unless the sheet states one, as in
-    `vinetrack.planning.campaign_information`, whose promise this holds to account.
+    The camera counts as calibrated: positions have no systematic error unless the sheet states one, as in
+    `vinetrack.planning.campaign_information`, whose expected errors this checks.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def make(
         Relative between-trial standard deviations of pressure and B.
     draw : numpy.random.Generator
     host : Model, optional
-        A larger model whose compiled form serves this one.
+        A larger model whose compiled form is used.
 
     Returns
     -------
@@ -125,32 +125,33 @@ def make(
     count = len(trials)
     cameras = [camera] * count if isinstance(camera, FilmingPlan) else list(camera)
     frames_s = np.array([1 / of_trial.capture_fps for of_trial in cameras])
-    pressures = 1 + spreads[0] * draw.standard_normal(count)
+    pressure_factors = 1 + spreads[0] * draw.standard_normal(count)
     misread = {vine: draw.standard_normal() for vine in dict.fromkeys(trial.vine for trial in trials)}
-    true = [
+    true_trials = [
         replace(
             trial,
             pressure_Pa=trial.pressure_Pa * float(factor),
-            yield_pressure_Pa=max(trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * misread[trial.vine], 0.0),
+            yield_pressure_Pa=max(
+                trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * yield_errors[trial.vine], 0.0
+            ),
         )
-        for trial, factor in zip(trials, pressures, strict=True)
+        for trial, factor in zip(trials, pressure_factors, strict=True)
     ]
     theta = np.array([model.parameters_of(trial) for trial in trials])
     theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
     longest_s = [2 * of_trial.longest_s for of_trial in cameras]
-    last = [np.array([0.0, end_s]) for end_s in longest_s]
-    ends = simulate_many(model, true, last, parameters=theta, host=host)
-    until = [
+    ends = simulate_many(model, true_trials, [np.array([0.0, s]) for s in longest_s], parameters=theta, host=host)
+    stop_s = [
         min(end.end_time_s if end.status == "ended" else longest, of_trial.stops_s)
         for end, longest, of_trial in zip(ends, longest_s, cameras, strict=True)
     ]
     release = (REST_FRAMES - draw.uniform(size=count)) * frames_s
-    counts = [REST_FRAMES + int(end * of_trial.capture_fps) for end, of_trial in zip(until, cameras, strict=True)]
+    counts = [REST_FRAMES + int(end * of_trial.capture_fps) for end, of_trial in zip(stop_s, cameras, strict=True)]
     times: list[Floats] = [
         np.arange(frames, dtype=float) * frame_s for frames, frame_s in zip(counts, frames_s, strict=True)
     ]
-    since = [time_s - begin for time_s, begin in zip(times, release.tolist(), strict=True)]
-    moved = simulate_many(model, true, since, parameters=theta, host=host)
+    since_release = [time_s - begin for time_s, begin in zip(times, release.tolist(), strict=True)]
+    moved = simulate_many(model, true_trials, since_release, parameters=theta, host=host)
     return [
         (trial, _track(time_s, trajectory.observed_position_m, of_trial, draw))
         for trial, time_s, trajectory, of_trial in zip(trials, times, moved, cameras, strict=True)
@@ -164,7 +165,7 @@ def _track(time_s: Floats, position_m: Floats, camera: FilmingPlan, draw: np.ran
 
 
 def _errors(truth: Model, fitted: Model, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, tuple[float, float, bool]]:
-    """Error, stated error and whether the interval held, of n and of ln B by vine (name `B vine`)."""
+    """Error, stated standard error and whether the interval contains the truth, for n and for ln B (`B vine`)."""
     fit_result = fit(fitted, pairs, profile=False)
     names = truth.parameter_names
     rows = {}
@@ -173,11 +174,11 @@ def _errors(truth: Model, fitted: Model, pairs: Sequence[tuple[Trial, Track]]) -
             continue
         vine = number.vine or pairs[0][0].vine
         true = float(truth.parameters_for(vine)[names.index(number.key)])
-        held = number.low <= true <= number.high
+        is_covered = number.low <= true <= number.high
         if number.key == EXPONENT:
-            rows["n"] = number.value - true, number.sigma, held
+            rows["n"] = number.value - true, number.sigma, is_covered
         else:
-            rows[f"B {vine}"] = math.log(number.value / true), number.sigma / number.value, held
+            rows[f"B {vine}"] = math.log(number.value / true), number.sigma / number.value, is_covered
     return rows
 
 
@@ -189,13 +190,13 @@ def _summary(rows: Sequence[dict[str, tuple[float, float, bool]]], failed: int) 
         return float(np.sqrt(np.mean(np.square(values)))) if values else math.nan
 
     vines = [name for name in names if name.startswith("B ")]
-    held = [row[name][2] for row in rows for name in row]
+    covered = [row[name][2] for row in rows for name in row]
     return SimulatedCampaigns(
         campaigns=len(rows),
         n_rms=rms("n", 0),
         n_stated=rms("n", 1),
         B_rms={name[2:]: rms(name, 0) for name in vines},
         B_stated={name[2:]: rms(name, 1) for name in vines},
-        covered=float(np.mean(held)) if held else math.nan,
+        covered=float(np.mean(covered)) if covered else math.nan,
         failed=failed,
     )
