@@ -72,7 +72,7 @@ def test_a_campaign_is_planned_simulated_and_written_as_a_sheet(tmp_path: Path) 
                "--figure", tmp_path / "a.svg", "--yield-pressure-kPa", 3)  # fmt: skip
     assert done.exit_code == 0, done.output
     assert cells(done.output, "this campaign")[1] in done.output.splitlines()[3]
-    assert "simulated 2 times" in done.output
+    assert "2 campaigns simulated" in done.output
     assert cells(done.output, "n ")[0] == "n"
     trials = read_experiment(sheet.parent).trials
     assert len(trials) == int(cells(done.output, "this campaign")[1])
@@ -84,14 +84,14 @@ def test_a_campaign_is_planned_simulated_and_written_as_a_sheet(tmp_path: Path) 
 
 def test_a_campaign_says_what_it_could_see_of_other_effects() -> None:
     output = run("campaign", "--vine", "24x200x280", "--pressure-kPa", "9:40", "--check", 0, "--power").output
-    assert "could see of physics that their model lacks" in output
+    assert "to detect physics that their model lacks" in output
     drag = next(line for line in output.splitlines() if line.strip().startswith("air drag"))
     assert "C_D" in drag
 
 
 def test_a_campaign_out_of_reach_says_what_would_help() -> None:
     output = run("campaign", *TWO, "--n-se", 1e-5, "--most-trials", 30, "--check", 0).output
-    assert "! no campaign of 30 trials or fewer with the allowed pressures and replicates reaches this" in output
+    assert "! no campaign of 30 trials or fewer with the allowed pressures and replicates reaches that" in output
     assert "widen the pressures" in output
 
 

@@ -106,7 +106,7 @@ def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
     output = run("predict", *vine, "--fit", fitted, *FEW).output
     assert float(row(output, "n ")[1]) == pytest.approx(N_TRUE, abs=0.02)
     assert float(row(output, "B ")[1]) == pytest.approx(6.4, rel=0.06)
-    assert f"B, n, P_y as {fitted.as_posix()} knows them" in output
+    assert f"B, n, P_y of {fitted.as_posix()}, with their covariance" in output
     assert "guess" not in output
 
 

@@ -92,7 +92,7 @@ def test_the_printed_yield_pressure_is_believed_of_the_vine_that_it_was_printed_
 
 def test_a_size_beyond_what_is_plausible_is_said() -> None:
     said = StatedValues(effects=("air_drag",), sizes={"air_drag.C_D": Size(99.0, 99.0)})
-    assert predictive_inputs(trial(), said).notes == ("C_D of air_drag is beyond what is plausible, 0 to 3",)
+    assert predictive_inputs(trial(), said).notes == ("C_D of air_drag is outside its plausible range, 0 to 3",)
     assert (
         predictive_inputs(trial(), StatedValues(effects=("air_drag",), sizes={"air_drag.C_D": Size(0.5, 1.5)})).notes
         == ()
@@ -158,7 +158,7 @@ def test_numbers_that_a_fit_left_open_are_named() -> None:
     content = fitted()
     content["covariance"][1] = [*content["covariance"][1][:1], None, None]
     inputs = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "results/a"))
-    assert any("leaves n open" in words for words in inputs.notes)
+    assert any("does not determine n" in words for words in inputs.notes)
     assert np.ptp(inputs.draw(10, 1)[N]) == 0
 
 

@@ -1,4 +1,4 @@
-"""What speaks against a vine before it is grown: burst, no growth, a slack tail, and what the model leaves out."""
+"""Checks of a planned vine: burst, no growth, a compressed or slack tail, and effects that the model leaves out."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from vinetrack.planning.prediction import (
 from vinetrack.planning.predictive_inputs import BAND, YIELD, PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 
-CERTAIN = 0.95
-"""Chosen: the usual level. At 0.9 vines that fail one time in ten pass without a word, at 0.975 a doubtful yield
-pressure alone is named."""
+LEAST_FULL_GROWTH = 0.95
+"""Fraction of draws that must grow to the end, or a warning is given. Chosen: the usual level. At 0.9 vines that fail
+one time in ten pass without a warning, at 0.975 an uncertain yield pressure alone gives one."""
 
-WORTH_A_WORD = 0.05
-"""Share of the draws above which a hazard is named. Chosen: one draw in twenty, as the ends of the band that is stated.
-At half rarer hazards are named, at twice those of one draw in ten."""
+WARNING_FRACTION = 0.05
+"""Fraction of draws above which a hazard is reported. Chosen: one draw in twenty, as at the ends of the stated band. At
+half rarer hazards are reported, at twice only those of one draw in ten."""
 
 FILM_MODULUS_PA = 25e6
 """Young's modulus of the film, 10 to 50 MPa. Chosen: near the geometric middle of that range, 22 MPa. At half the
-stretch that is named doubles, at twice it halves."""
+reported stretch doubles, at twice it halves."""
 
-INEVITABLE = (
+UNIVERSAL_EFFECTS = (
     "air_drag",
     "fold_inertia",
     "gas_inertia",
@@ -47,12 +47,12 @@ INEVITABLE = (
     "tail_friction",
     "wall_stretch",
 )
-"""Effects that every vine has to some extent; the others of the catalogue may or may not be there."""
+"""Effects that every vine has to some extent; the others of the catalogue may be absent."""
 
 
 @dataclass(frozen=True)
 class Neglected:
-    """An effect that the model leaves out, at its typical size, and what it makes of the median final speed, m/s."""
+    """An effect that the model leaves out, its typical size, and the median final speed, m/s, with and without it."""
 
     effect: str
     size: str
@@ -66,7 +66,7 @@ class Neglected:
 
 
 def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
-    """Sentences about what a person should know before building this, most serious first.
+    """Return warnings about a planned vine in sentences, most serious first.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Blank where nothing speaks against it.
+        Empty where there is no warning.
     """
     return (
         *_burst(prediction.inputs.trial),
@@ -104,7 +104,7 @@ def _no_growth(prediction: VinePrediction) -> Iterator[str]:
             f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
             f"{high:.2g}): nothing would evert; raise the pressure"
         )
-    elif prediction.arrives < CERTAIN:
+    elif prediction.arrives < LEAST_FULL_GROWTH:
         yield (
             f"in {1 - prediction.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or "
             "measure its yield pressure"
@@ -113,34 +113,34 @@ def _no_growth(prediction: VinePrediction) -> Iterator[str]:
 
 def _slack(prediction: VinePrediction) -> Iterator[str]:
     trial = prediction.inputs.trial
-    if prediction.slack < WORTH_A_WORD:
+    if prediction.slack < WARNING_FRACTION:
         return
-    often = "in every draw" if prediction.slack > 0.995 else f"in {prediction.slack:.0%} of the draws"
+    frequency = "in every draw" if prediction.slack > 0.995 else f"in {prediction.slack:.0%} of the draws"
     if trial.tail_slack == "free":
         yield (
-            f"the tail goes slack on the way {often}: speeds of the tail are then those of the film at the tip, and a "
-            "payload falls by itself, at a speed that is not told"
+            f"the tail goes slack on the way {frequency}: tail speeds are then those of the film at the tip, and a "
+            "payload falls freely, at a speed that is not predicted"
         )
         return
-    payload = f" and the {EJECTION} is at least what is stated" if trial.payload_kg > 0 else ""
+    payload = f", and the {EJECTION} is at least the one stated" if trial.payload_kg > 0 else ""
     yield (
-        f"the tail would have to push {often} (least tension {_least_tension(prediction)}), which "
-        f"it cannot: the payload runs ahead of the film{payload}; `--tail-slack free` lets it"
+        f"the model predicts compression in the tail {frequency} (least tension {_least_tension(prediction)}), which "
+        f"thin film cannot carry: the payload runs ahead of the film{payload}; `--tail-slack free` allows that"
     )
 
 
 def _least_tension(prediction: VinePrediction) -> str:
-    """The median where that is below 0 itself, else how low it comes in one draw of twenty."""
+    """The median where it is negative; else also the 5 % quantile."""
     tension = prediction[LEAST_TENSION]
     return (
         f"{tension.median:.2g} N"
         if tension.median < 0
-        else f"{tension.median:.2g} N, in one draw of twenty below {tension.low:.2g} N"
+        else f"{tension.median:.2g} N, below {tension.low:.2g} N in one draw of twenty"
     )
 
 
 def _rules(prediction: VinePrediction) -> Iterator[str]:
-    """Broken rules of the audit along the median motion, without what has been said of the tail."""
+    """Warnings of the audit along the median motion, except the one about the tail, which `_slack` gives."""
     inputs = prediction.inputs
     (moved,), _ = follow(inputs, *_medians(inputs))
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
@@ -156,9 +156,9 @@ def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
 
 
 def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
-    """What each effect that no vine is free of would make of the final speed at the medians, largest change first.
+    """Return the final speed at the medians with each of the universal effects added, largest change first.
 
-    Each is put in by itself, at its typical size; those whose columns are blank are passed over.
+    Each is added by itself at its typical size; effects whose columns are blank are left out.
 
     Parameters
     ----------
@@ -173,10 +173,10 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     host = whole_model(inputs.model)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
     neglected_effects = []
-    for name in INEVITABLE:
+    for name in UNIVERSAL_EFFECTS:
         effect = catalogue()[name]
-        held = name in inputs.model or any(name in other.replaces for other in inputs.model)
-        if held or (name == "payload_drag" and inputs.trial.payload_kg == 0):
+        is_in_model = name in inputs.model or any(name in other.replaces for other in inputs.model)
+        if is_in_model or (name == "payload_drag" and inputs.trial.payload_kg == 0):
             continue
         sizes = typical_sizes(name, inputs.trial)
         model = (inputs.model + effect).with_values(sizes)
@@ -189,11 +189,11 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
 
 
 def whole_model(model: Model) -> Model:
-    """The catalogue and the model's own effects: its compiled form serves every model that is looked at here.
+    """Return the model of all effects of the catalogue and of this model, compiled once for every model used here.
 
     Parameters
     ----------
-    model : its effects beside the catalogue are kept.
+    model : whose effects outside the catalogue are included.
 
     Returns
     -------
@@ -204,9 +204,9 @@ def whole_model(model: Model) -> Model:
 
 
 def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
-    """Parameters of an effect where they follow from the vine: wall stretch, (1 − ν/4) D/(2Et) of soft film, ν = ½.
+    """Return parameters of an effect that follow from the vine: for wall stretch κ = (1 − ν/4) D/(2Et), ν = ½.
 
-    Source: thin-walled closed tube, radial strain under hoop stress PD/2t and half of it along the tube.
+    Source: radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
     Returns
     -------
     dict
-        By `effect.parameter`, SI; blank where the effect's defaults serve.
+        By `effect.parameter`, SI; empty where the defaults of the effect apply.
     """
     if name != "wall_stretch":
         return {}
@@ -225,19 +225,19 @@ def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
 
 
 def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
-    """Its parameters at these sizes, else at their typical ones, such as `C_D = 1`."""
+    """Parameters of an effect at these or else their typical sizes, such as `C_D = 1`."""
     values = [(p, sizes.get(f"{effect.name}.{p.name}", p.default)) for p in effect.parameters]
     return ", ".join(f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in values)
 
 
 def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """The final speed at the medians under this model: a payload's at the end, else the leading edge's.
+    """Return the final speed at the medians under this model: a payload's at the end, else the leading edge's.
 
     Parameters
     ----------
-    inputs : predictive inputs; their trial at the medians is simulated.
-    model : what is simulated.
-    host : a model that holds all effects of `model`, compiled once for many.
+    inputs : predictive inputs, whose median trial is simulated.
+    model : the model to simulate.
+    host : a model with all effects of `model`, compiled once for several.
     at_fraction : float
         y/L at which the speed of the leading edge is taken.
 

@@ -1,9 +1,9 @@
-"""The fastest vine within what can be built: films to choose from, ranges of diameter and length, burst, supply.
+"""The fastest vine that can be built from given films, within ranges of diameter and length, burst stress and supply.
 
-At a given diameter, wall and length more pressure is always faster, so the pressure is as high as the supply and the
-wall allow, P = min(P_supply, f · 2tσ/D) with f the share of the burst stress that one dares. Diameter and length are
-searched, at the medians of the predictive inputs; their uncertainties then say how sure the choice is: every draw has
-its own fastest film.
+For a given size a higher pressure always gives a higher speed, so the pressure is the highest that supply and wall
+allow, P = min(P_supply, f · 2tσ/D) with f the allowed fraction of the burst stress σ. Diameter and length are optimised
+by a grid search at the medians of the predictive inputs. How certain the choice of film is follows from their
+distributions: every draw has its own fastest film.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa
 
 GRID = (17, 9)
-"""Diameters and lengths looked at in each round. Chosen: over a range of ten, neighbouring diameters differ by 15 %. At
-half the first round may miss a narrow best, at twice the search takes four times as long."""
+"""Numbers of diameters and lengths in each round. Chosen: over a factor of ten, neighbouring diameters differ by 15 %.
+At half the first round may miss a narrow optimum, at twice the search takes four times as long."""
 
 ROUNDS = 3
-"""Each looks closer about the best of the one before: a range of a tenth is left to a few thousandths. Chosen: the
-speed about its best is flat, so that a few thousandths of size do not show. At half sizes are good to a few per cent,
-at twice only time is spent."""
+"""Rounds of the search, each a finer grid around the optimum of the one before; the last resolves sizes to a few
+thousandths. Chosen: speed is flat at its optimum, so smaller differences do not matter. At half sizes are accurate to a
+few per cent, at twice only time is spent."""
 
-AT_A_BOUND = 0.005
-"""Relative distance from a bound below which a vine counts as limited by it. Chosen: what the last round leaves;
+BOUND_TOLERANCE = 0.005
+"""Relative distance from a bound below which a vine counts as limited by it. Chosen: the resolution of the last round;
 only the wording depends on it."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """What can be built, SI. `rig` holds what all have in common: payload, angle, chamber, yield pressure."""
+    """Limits of what can be built, SI. `rig` has what all share: payload, angle, chamber, yield pressure."""
 
     films_m: tuple[float, ...]
     diameter_m: tuple[float, float]
@@ -49,9 +49,9 @@ class Room:
     burst_stress_Pa: float = BURST_STRESS_PA
 
     def pressure_of(self, diameter_m: float, thickness_m: float) -> float:
-        """The highest pressure that the supply gives and the wall is trusted with, Pa.
+        """Return the highest pressure that supply and wall allow, Pa.
 
-        P = min(P_supply, f · 2tσ/D), with f the share of the burst stress and σ the burst stress.
+        P = min(P_supply, f · 2tσ/D), with f the allowed fraction of the burst stress σ.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Room:
         return min(self.pressure_Pa, self.burst_share * burst_Pa)
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
-        """The trial with a vine of this size, at the highest pressure for it.
+        """Return the trial with a vine of this size at the highest pressure allowed.
 
         Parameters
         ----------
@@ -91,9 +91,9 @@ class Room:
 
 @dataclass(frozen=True)
 class Choice:
-    """The best vine of one film; `limits` say what keeps it from being faster, `odds` how often it is the fastest.
+    """The fastest vine of one film; `limits` are the constraints that are active, `odds` is how often it is fastest.
 
-    `others` has columns diameter_m, lead speed m/s, of the best vine of every diameter: how much the choice matters.
+    `others` has columns diameter, m, and lead speed, m/s, of the fastest vine of every diameter of the first round.
     """
 
     thickness_m: float
@@ -112,19 +112,19 @@ def fastest(
     seed: int = 1,
     at_fraction: float = 0.95,
 ) -> tuple[Choice, ...]:
-    """The best vine of every film, fastest first.
+    """Find the fastest vine of every film, fastest first.
 
     Parameters
     ----------
-    room : what can be built.
-    stated : values of numbers in place of other sources.
+    room : limits of what can be built.
+    stated : stated values, in place of other sources.
     fit : a fit to predict from, if any.
     samples : int
         Draws for bands and odds.
     seed : int
         Of the random numbers.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken.
+        y/L at which the final speed without payload is evaluated.
 
     Returns
     -------
@@ -155,37 +155,37 @@ def fastest(
 def _best(
     room: Room, film_m: float, stated: StatedValues | None, fit: FitNumbers | None, at_fraction: float
 ) -> tuple[PredictiveInputs, Floats]:
-    """The best diameter and length for one film, and the best speed at every diameter of the first round."""
+    """Inputs of the fastest vine of one film, and the highest speed at every diameter of the first round."""
     spans = [room.diameter_m, (max(room.length_m[0], 1e-6), room.length_m[1])]
-    whole = list(spans)
+    limits = list(spans)
     others = np.empty((0, 2))
     inputs: PredictiveInputs | None = None
-    for turn in range(ROUNDS):
+    for round_number in range(ROUNDS):
         axes = [np.unique(np.geomspace(*span, count)) for span, count in zip(spans, GRID, strict=True)]
         vine_inputs = [predictive_inputs(room.trial(D, film_m, L), stated, fit) for D in axes[0] for L in axes[1]]
         speeds = final_speeds(vine_inputs, at_fraction).reshape(axes[0].size, axes[1].size)
         i, j = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
         inputs = vine_inputs[int(i) * axes[1].size + int(j)]
-        if turn == 0:
+        if round_number == 0:
             others = np.column_stack([axes[0], speeds.max(axis=1)])
-        spans = [_about(axis, int(k), span) for axis, k, span in zip(axes, (i, j), whole, strict=True)]
+        spans = [_neighbours(axis, int(k), span) for axis, k, span in zip(axes, (i, j), limits, strict=True)]
     assert inputs is not None
     return inputs, others
 
 
-def _about(axis: Floats, k: int, whole: tuple[float, float]) -> tuple[float, float]:
-    """From the neighbour below the best to the one above."""
-    return max(whole[0], float(axis[max(k - 1, 0)])), min(whole[1], float(axis[min(k + 1, axis.size - 1)]))
+def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[float, float]:
+    """Range from the grid value below the optimum to the one above, within the limits."""
+    return max(limits[0], float(axis[max(k - 1, 0)])), min(limits[1], float(axis[min(k + 1, axis.size - 1)]))
 
 
 def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) -> Floats:
-    """The final speed of every vine at its medians, m/s, shape (n,): a payload's at the end, else the edge's.
+    """Return the final speed of every vine at its medians, m/s: a payload's at the end, else the leading edge's.
 
     Parameters
     ----------
     vine_inputs : predictive inputs, all of one model.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken.
+        y/L at which the final speed without payload is evaluated.
 
     Returns
     -------
@@ -196,8 +196,8 @@ def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) ->
     model = vine_inputs[0].model
     rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
     ends = simulate_many(model, trials, [np.array([0.0, LONGEST_S])] * len(trials), parameters=rows)
-    over = np.array([end.end_time_s if end.status == "ended" else LONGEST_S for end in ends])
-    times = [end * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in over]
+    stop_s = np.array([end.end_time_s if end.status == "ended" else LONGEST_S for end in ends])
+    times = [stop * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for stop in stop_s]
     moved = simulate_many(model, trials, times, parameters=rows)
     speeds = np.zeros(len(trials))
     for k, (trial, end, trajectory) in enumerate(zip(trials, ends, moved, strict=True)):
@@ -213,7 +213,7 @@ def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) ->
 
 
 def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
-    """What keeps a vine from being faster: bounds it sits at, and what holds its pressure."""
+    """The constraints that keep a vine from being faster: of its pressure, and bounds of its size."""
     burst = room.burst_share * burst_pressure_Pa(trial.diameter_m, trial.thickness_m)
     burst *= room.burst_stress_Pa / BURST_STRESS_PA
     limits = ["supply" if room.pressure_Pa <= burst else "burst"]
@@ -221,15 +221,15 @@ def _limits(room: Room, trial: Trial) -> tuple[str, ...]:
         ("diameter", trial.diameter_m, room.diameter_m),
         ("length", trial.length_m, room.length_m),
     ):
-        if high > low and value > high * (1 - AT_A_BOUND):
+        if high > low and value > high * (1 - BOUND_TOLERANCE):
             limits.append(f"largest {name}")
-        elif high > low and value < low * (1 + AT_A_BOUND):
+        elif high > low and value < low * (1 + BOUND_TOLERANCE):
             limits.append(f"smallest {name}")
     return tuple(limits)
 
 
 def _odds(vine_inputs: Sequence[PredictiveInputs], samples: int, seed: int, at_fraction: float) -> list[float]:
-    """How often each is the fastest of them, everything uncertain drawn; what vines have in common is drawn once."""
+    """Fraction of draws in which each is the fastest; inputs that vines share have the same draws in all."""
     speeds = []
     for inputs in vine_inputs:
         trial = inputs.trial

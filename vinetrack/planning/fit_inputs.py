@@ -1,6 +1,6 @@
-"""What a fit knows, in the form in which predictions draw from it: numbers, their covariance, spreads.
+"""Fitted parameters in the form from which predictions draw: means, covariance, between-trial standard deviations.
 
-Taken from a `Fit`, or from what `fit.json` keeps of one. B is held as its logarithm, as in the fit.
+They come from a `Fit` or from `fit.json`. B is held as its logarithm, as in the fit.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
-FEWEST_TO_SPARE = 3
-"""Degrees of freedom that a spread has at least: a fit does not estimate it with fewer trials to spare. Derived: below
-three the t distribution has no variance."""
+LEAST_DOF = 3
+"""Least degrees of freedom of a between-trial standard deviation. Derived: below three the t distribution has no
+variance, and a fit does not estimate it with fewer."""
 
 NORMAL_95 = 1.959963984540054
 """Standard normal quantile of 0.975."""
@@ -32,12 +32,12 @@ _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 
 @dataclass(frozen=True)
 class FitNumbers:
-    """The numbers of a fit; `keys` and `vines` name them, `log` marks those held as logarithms.
+    """The parameters of a fit, named by `keys` and `vines`; `log` marks those held as logarithms.
 
-    `mean`, `covariance` are those of the numbers of the next trial as held, what trials differ by included; numbers
-    that the fit left open have a variance of 0 and stand in `open`. The covariance is stretched so that its normal 95 %
-    are the fit's own, which take Student's t. `spreads` are those of pressure and B from trial to trial, relative, and
-    `spread_dof` their degrees of freedom, infinite where they were told to the fit.
+    `mean` and `covariance` are those of the parameters of a new trial, between-trial differences included. Parameters
+    that the fit does not determine have a variance of 0 and are listed in `open`. The covariance is scaled so that its
+    normal 95 % intervals are those of the fit, which use Student's t. `spreads` are the relative between-trial standard
+    deviations of pressure and B, `spread_dof` their degrees of freedom, infinite where the fit was given them.
     """
 
     source: str
@@ -53,7 +53,7 @@ class FitNumbers:
     n_trials: int
 
     def place(self, key: str, vine: str = "") -> int | None:
-        """Where a number stands, for all vines or for this one; None where it does not.
+        """Return the index of a parameter, shared or of this vine; None where there is none.
 
         Parameters
         ----------
@@ -66,13 +66,13 @@ class FitNumbers:
         -------
         int or None
         """
-        for k, (own_key, own_vine) in enumerate(zip(self.keys, self.vines, strict=True)):
-            if own_key == key and own_vine in ("", vine):
+        for k, (name, of_vine) in enumerate(zip(self.keys, self.vines, strict=True)):
+            if name == key and of_vine in ("", vine):
                 return k
         return None
 
     def sizes(self) -> dict[str, tuple[float, float]]:
-        """Diameter and thickness, m, of every vine that has a B of its own."""
+        """Diameter and thickness, m, of every vine with a fitted B."""
         sizes = {}
         for key, vine in zip(self.keys, self.vines, strict=True):
             if key == DAMPING and (size := size_of(vine)):
@@ -81,7 +81,7 @@ class FitNumbers:
 
 
 def size_of(vine: str) -> tuple[float, float] | None:
-    """Diameter and thickness in metres out of the name of a vine; None where it does not say.
+    """Parse diameter and thickness, m, from the name of a vine; None where the name does not contain them.
 
     Parameters
     ----------
@@ -102,12 +102,12 @@ def size_of(vine: str) -> tuple[float, float] | None:
 
 
 def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
-    """Numbers of a fit from what `fit.json` holds.
+    """Read the parameters of a fit from the content of `fit.json`.
 
     Parameters
     ----------
     content : mapping
-        What `fit.json` holds.
+        Content of `fit.json`.
     source : str
         Named in messages and origins.
 
@@ -129,16 +129,16 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     values = np.array([number["value"] for number in numbers], dtype=float)
     log = np.array([number["parameter"] == DAMPING and number["value"] > 0 for number in numbers], dtype=bool)
     slopes = np.where(log, 1 / np.where(log, values, 1.0), 1.0)
-    stretch = np.array(
-        [_stretch(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)], dtype=float
+    widening = np.array(
+        [_widening(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)], dtype=float
     )
     between = np.array([[_number(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
-    known = np.isfinite(np.diag(covariance))
+    is_known = np.isfinite(np.diag(covariance))
     if between.shape == covariance.shape:
-        # What is predicted is a trial, whose numbers differ from the shared ones.
+        # A prediction is of one trial, whose parameters differ from the shared ones.
         covariance = covariance + np.nan_to_num(between)
-    spare = float(max(len(content["trials"]) - len(numbers), FEWEST_TO_SPARE))
-    held = np.where(known, slopes * stretch, 0.0)
+    dof = float(max(len(content["trials"]) - len(numbers), LEAST_DOF))
+    scale = np.where(is_known, slopes * widening, 0.0)
     return FitNumbers(
         source=source,
         model=tuple(content["model"]),
@@ -146,10 +146,10 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
         vines=tuple(number["vine"] for number in numbers),
         log=log,
         mean=np.where(log, np.log(np.where(log, values, 1.0)), values),
-        covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * held[:, None] * held,
-        open=tuple(number["symbol"] for number, is_known in zip(numbers, known, strict=True) if not is_known),
+        covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * scale[:, None] * scale,
+        open=tuple(number["symbol"] for number, known in zip(numbers, is_known, strict=True) if not known),
         spreads={name: float(spread["value"]) for name, spread in content["spreads"].items()},
-        spread_dof={name: spare if spread["estimated"] else math.inf for name, spread in content["spreads"].items()},
+        spread_dof={name: dof if spread["estimated"] else math.inf for name, spread in content["spreads"].items()},
         n_trials=len(content["trials"]),
     )
 
@@ -158,8 +158,8 @@ def _number(cell: Any) -> float:
     return math.nan if cell is None else float(cell)
 
 
-def _stretch(number: Mapping[str, Any], log: bool) -> float:
-    """By how much the fit's 95 % are wider than those of a normal distribution; 1 where they come from a bound."""
+def _widening(number: Mapping[str, Any], log: bool) -> float:
+    """Ratio of the fit's 95 % interval to that of a normal distribution, at least 1; 1 where a bound determines it."""
     low, high, sigma = (_number(number[key]) for key in ("low_95", "high_95", "sigma"))
     if number["interval"] != "linear" or not sigma > 0 or not low < high or (log and not low > 0):
         return 1.0
@@ -168,7 +168,7 @@ def _stretch(number: Mapping[str, Any], log: bool) -> float:
 
 
 def numbers_of(fit: Fit) -> FitNumbers:
-    """Numbers of a fit as `vinetrack.fit` returns it.
+    """Return the parameters of a fit as `vinetrack.fit` returns it.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def numbers_of(fit: Fit) -> FitNumbers:
 
 
 def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """The fitted vine of this diameter and wall, of any length, for B is a matter of the tip; None if there is none.
+    """Return the fitted vine of this diameter and wall and any length, since B belongs to the tip; None without one.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
     Returns
     -------
     str or None
-        Name of the vine; that of the same length before others.
+        Name of the vine; one of the same length is preferred.
     """
     sizes = [
         (vine, size) for vine, size in numbers.sizes().items() if alike(size, (trial.diameter_m, trial.thickness_m))
@@ -212,7 +212,7 @@ def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
 
 
 def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
-    """Whether two sizes are the same to five digits.
+    """Return whether two sizes are equal to five digits.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
 
 
 def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """The fitted vine whose size is nearest, in logarithms; None where no vine says its size.
+    """Return the fitted vine nearest in ln diameter and ln thickness; None where no name contains a size.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
 
 
 def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
-    """Where the yield pressure of a fitted vine stands; of several the one nearest to what the sheet says.
+    """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value.
 
     Parameters
     ----------

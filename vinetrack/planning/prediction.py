@@ -1,8 +1,8 @@
-"""What a vine will do: position, speed and tension along its growth, with the uncertainty of its inputs.
+"""Prediction of a vine: position, speed and tension along its growth, with the uncertainty of its inputs.
 
-Every uncertainty of the inputs is drawn, every draw simulated from release to the end of growth. Stated are medians and
-the band of nine draws in ten. As growth never turns back, the quantiles of the time at which a place is passed are
-those of the position at a time.
+The uncertain inputs are drawn at random (Monte Carlo), and every draw is simulated from release to the end of growth.
+Results are medians and 90 % bands. Because growth is monotonic, the quantiles of the time at which a place is passed
+are those of the position at a time.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from vinetrack.planning.predictive_inputs import BAND, PredictiveInputs
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
 LONGEST_S = 600.0
-"""A vine that has not grown by then is taken for one that does not get there. Chosen: a thousand times a usual growth.
-At half or twice only vines at the edge of growing at all change sides."""
+"""Duration of a simulation, s; a vine that has not grown by then counts as never reaching its end. Chosen: a thousand
+times a usual growth. At half or twice only vines that barely grow are classed differently."""
 
 POINTS = 400
-"""Instants of each draw: linear between them, speeds are good to a thousandth up to 0.99 of the length. Derived: linear
-interpolation errs by (1/400)²/8 of the curvature."""
+"""Times at which each draw is evaluated. Derived: linear interpolation errs by (1/400)²/8 of the curvature, so speeds
+are accurate to a thousandth up to 0.99 of the length."""
 
 MOST_TENSIONS = 300
-"""Draws whose forces are looked at one by one, a third of a millisecond each. Chosen for time: the ends of a 90 % band
-are then known to 1.3 % of the draws. At half to 1.8 %, at twice to 0.9 %."""
+"""Draws whose forces are evaluated, a third of a millisecond each. Chosen for time: the ends of a 90 % band are then
+known to 1.3 % of the draws. At half to 1.8 %, at twice to 0.9 %."""
 
-ROUNDING = 1e-9
-"""Of the drive, below which a tension is none: forces of a slack tail cancel to rounding. Chosen: far above rounding of
-sums (1e-15), far below any force of interest."""
+ZERO_TENSION = 1e-9
+"""Tension below which the tail is slack, as a fraction of the drive, since the forces of a slack tail cancel only to
+rounding. Chosen: far above rounding of sums (1e-15), far below any force of interest."""
 
-SLACK_SHARE = 0.01
-"""Of the drive ½PA that a tail must lack before it counts as slack: the mere weight of a bare tail does no harm.
-Chosen: half of it names vines whose bare tail pushes by less than its weight; twice passes payloads that run ahead by 2
-% of the drive."""
+COMPRESSION_FRACTION = 0.01
+"""Compression of the tail from which the model is said to be in doubt, as a fraction of the drive ½PA; the weight of a
+tail without payload alone does no harm. Chosen: half of it names vines whose tail is compressed by less than its
+weight; twice it passes payloads that run ahead by 2 % of the drive."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Draws simulated, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`.
+    """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`.
 
-    A place that a draw never reaches has the time inf and the speed 0. Speeds are the leading edge's. Tensions and
-    pressures are those of the first `MOST_TENSIONS` draws, NaN where not reached; `least_tension_N` is the least up to
-    the last place. `slack` tells which of them would have a tail that pushes, or that goes slack where it may.
+    At a place that a draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge. Tensions
+    and pressures are those of the first `MOST_TENSIONS` draws, NaN where not reached; `least_tension_N` is the least up
+    to the last place. `slack` is 1 for draws whose tail is compressed, or goes slack where the model allows it.
     """
 
     places_m: Floats
@@ -77,9 +77,9 @@ def run(
 
     Parameters
     ----------
-    inputs : what is drawn.
+    inputs : the distributions to draw from.
     places_m : array, shape (n_places,), m
-        Growth at which values are taken, rising.
+        Growth at which values are evaluated, increasing.
     samples : int
         Number of draws.
     seed : int
@@ -109,8 +109,8 @@ def run(
         velocity_m_s[i, reached] = np.interp(
             places_m[reached], trajectory.lead_position_m, trajectory.lead_velocity_m_s
         )
-    looked_at = min(samples, MOST_TENSIONS) if with_tension else 0
-    tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:looked_at], rows, moved, places_m)
+    with_forces = min(samples, MOST_TENSIONS) if with_tension else 0
+    tension_N, pressure_Pa, least_N, slack = _forces(inputs, trials[:with_forces], rows, moved, places_m)
     return Runs(
         places_m=places_m,
         time_s=time_s,
@@ -128,11 +128,11 @@ def run(
 
 
 def follow(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> tuple[list[Trajectory], Floats]:
-    """Every draw at `POINTS` instants of its growth, and when it ends.
+    """Simulate every draw at `POINTS` times of its growth.
 
     Parameters
     ----------
-    inputs : their model is simulated.
+    inputs : whose model is simulated.
     trials : sequence, n_draws
     rows : array, shape (n_draws, n_parameters)
         Parameters of the model, SI.
@@ -141,21 +141,21 @@ def follow(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> t
     -------
     trajectories : list of Trajectory
     end_s : array, shape (n_draws,)
-        inf where a draw does not end.
+        inf where a draw does not reach its end.
     """
-    asked = [np.array([0.0, LONGEST_S])] * len(trials)
-    ends = simulate_many(inputs.model, trials, asked, parameters=rows)
-    over = np.array([last.end_time_s if last.status in ("ended", "stalled") else LONGEST_S for last in ends])
-    # An instant short of the end: there the bare vine's speed has left for infinity, and behind it is none.
-    times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in over]
+    until_longest = [np.array([0.0, LONGEST_S])] * len(trials)
+    ends = simulate_many(inputs.model, trials, until_longest, parameters=rows)
+    stop_s = np.array([last.end_time_s if last.status in ("ended", "stalled") else LONGEST_S for last in ends])
+    # Just before the end: without payload the speed diverges there, and is 0 after it.
+    times = [max(end, 1e-9) * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in stop_s]
     moved = simulate_many(inputs.model, trials, times, parameters=rows)
-    return moved, np.where([last.status == "ended" for last in ends], over, math.inf)
+    return moved, np.where([last.status == "ended" for last in ends], stop_s, math.inf)
 
 
 def _forces(
     inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats, moved: Sequence[Trajectory], places_m: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Tension and pressure at the places, least tension up to the last of them, and whether the tail goes slack."""
+    """Tension and pressure at the places, least tension so far, and whether the tail is compressed or slack."""
     names = inputs.model.parameter_names
     tension_N, pressure_Pa = (np.full((len(trials), places_m.size), math.nan) for _ in range(2))
     least_N, slack = np.full(len(trials), math.nan), np.zeros(len(trials))
@@ -164,20 +164,22 @@ def _forces(
         trajectory = moved[i]
         terms = evaluate(model, trial, trajectory.time_s, trajectory.lead_position_m, trajectory.lead_velocity_m_s)
         drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        tension = np.where(np.abs(terms.tension_N) < ROUNDING * drive_N, 0.0, terms.tension_N)
+        tension = np.where(np.abs(terms.tension_N) < ZERO_TENSION * drive_N, 0.0, terms.tension_N)
         reached = places_m <= trajectory.lead_position_m[-1]
         tension_N[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, tension)
         pressure_Pa[i, reached] = np.interp(places_m[reached], trajectory.lead_position_m, terms.pressure_Pa)
         moving = (trajectory.lead_position_m <= places_m[-1]) & (trajectory.lead_velocity_m_s > 0)
         if moving.any():
             least_N[i] = np.min(tension[moving])
-        free = trial.tail_slack == "free"
-        slack[i] = math.isfinite(trajectory.slack_from_s) if free else least_N[i] < -SLACK_SHARE * drive_N
+        may_go_slack = trial.tail_slack == "free"
+        slack[i] = (
+            math.isfinite(trajectory.slack_from_s) if may_go_slack else least_N[i] < -COMPRESSION_FRACTION * drive_N
+        )
     return tension_N, pressure_Pa, least_N, slack
 
 
 def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> Floats:
-    """Tail speed of (P − P_y)A = B ẋⁿ, m/s, weight and further effects left out; NaN for a model without it."""
+    """Tail speed of (P − P_y)A = B ẋⁿ, m/s, without weight or further effects; NaN for a model without damping."""
     names = inputs.model.parameter_names
     if DAMPING not in names:
         return np.full(len(trials), math.nan)
@@ -190,14 +192,15 @@ def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> 
 SAMPLES = 1000
 """Draws of a prediction. Derived: the ends of the 90 % band are known to √(0.05 × 0.95/1000) = 0.7 % of the draws."""
 
-SAMPLES_OF_A_SHARE = 400
+CONTRIBUTION_SAMPLES = 400
 """Draws for the band of one uncertainty alone. Derived: its ends are known to 1.1 % of the draws."""
 
 FINAL_AT_FRACTION = 0.95
-"""y/L at which a bare vine's final speed is taken. Convention, as in a fit: the model's speed diverges at 1."""
+"""y/L at which the final speed without payload is evaluated. Convention, as in a fit: the model's speed diverges at
+1."""
 
 ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
-"""y/L of the curves, dense where everything begins. Farther on a bare vine is faster in the model than anything."""
+"""y/L of the curves, dense at the start. They end at 0.99, since without payload the model's speed diverges at 1."""
 
 CURVE_COLUMNS = (
     "condition",
@@ -227,10 +230,10 @@ HOOP = "hoop stress PD/2t"
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number that is predicted, with its 90 % band, SI.
+    """One predicted quantity with its 90 % band, SI.
 
-    `y_over_L` is where it was taken, NaN where that is nowhere. Of draws that never get there the time is infinite and
-    the speed 0.
+    `y_over_L` is where it is evaluated, NaN where it belongs to no place. For draws that never get there the time is
+    infinite and the speed 0.
     """
 
     name: str
@@ -243,7 +246,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Contribution:
-    """The 90 % band of the final speed, m/s, with one uncertainty alone; `name` and `words` are those of the input."""
+    """The 90 % band of the final speed, m/s, with one uncertain input; `name` and `words` are those of the input."""
 
     name: str
     words: str
@@ -253,11 +256,11 @@ class Contribution:
 
 @dataclass(frozen=True)
 class VinePrediction:
-    """What is predicted of one trial.
+    """Prediction of one trial.
 
-    `curve` has a row a place along the growth, columns `CURVE_COLUMNS`. `shares` tell what each uncertainty alone
-    leaves of `final`, largest first. `arrives` is the part of the draws that grow to the end, `slack` that of those
-    whose tail would have to push (or goes slack, where it may) on the way.
+    `curve` has a row for each place along the growth, columns `CURVE_COLUMNS`. `shares` is the uncertainty budget: the
+    band of `final` with one uncertain input each, widest first. `arrives` is the fraction of draws that grow to the
+    end, `slack` the fraction whose tail is compressed (or goes slack, where the model allows it) on the way.
     """
 
     inputs: PredictiveInputs
@@ -271,26 +274,26 @@ class VinePrediction:
 
     @property
     def final(self) -> Quantity:
-        """The speed that matters: a payload's as it leaves, else the leading edge's at the fraction asked for.
+        """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`.
 
-        Where the tail may go slack a payload has a speed of its own, which nobody follows: then the leading edge's.
+        Where the tail may go slack, the payload moves on its own and is not simulated: then that of the leading edge.
         """
         return self[final_name(self.inputs)]
 
     def __getitem__(self, name: str) -> Quantity:
-        """The quantity of that name; KeyError where there is none."""
+        """Return the quantity of that name; KeyError where there is none."""
         return {quantity.name: quantity for quantity in self.quantities}[name]
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row a quantity, columns `TABLE_COLUMNS`, SI."""
+        """A row for each quantity, columns `TABLE_COLUMNS`, SI."""
         condition = self.inputs.trial.condition
         rows = [(condition, q.name, q.y_over_L, q.median, q.low, q.high, q.unit) for q in self.quantities]
         return pd.DataFrame(rows, columns=list(TABLE_COLUMNS))
 
 
 def told_by_payload(trial: Trial) -> bool:
-    """Whether the final speed is a payload's: not where a slack tail lets it go its own way.
+    """Return whether the final speed is that of a payload, which a slack tail would let move on its own.
 
     Parameters
     ----------
@@ -304,7 +307,7 @@ def told_by_payload(trial: Trial) -> bool:
 
 
 def final_name(inputs: PredictiveInputs) -> str:
-    """Name of the speed that matters for this trial.
+    """Return the name of the final speed of this trial.
 
     Parameters
     ----------
@@ -321,7 +324,7 @@ def final_name(inputs: PredictiveInputs) -> str:
 def predict_vine(
     inputs: PredictiveInputs, *, samples: int = SAMPLES, seed: int = 1, at_fraction: float = FINAL_AT_FRACTION
 ) -> VinePrediction:
-    """Simulate the predictive inputs of a trial: medians, 90 % bands, and what each uncertainty contributes.
+    """Predict a trial by Monte Carlo: medians, 90 % bands, and the contribution of each uncertain input.
 
     Parameters
     ----------
@@ -331,7 +334,8 @@ def predict_vine(
     seed : int
         Of the random numbers; the same gives the same numbers.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken: in the model it diverges as the moving mass goes to zero.
+        y/L at which the final speed without payload is evaluated: in the model it diverges as the moving mass
+        vanishes.
 
     Returns
     -------
@@ -360,7 +364,7 @@ def predict_vine(
         at_fraction=at_fraction,
         quantities=tuple(_quantities(inputs, runs, along, place)),
         curve=_curve(inputs, runs, along),
-        shares=_shares(inputs, at_fraction, min(samples, SAMPLES_OF_A_SHARE), seed),
+        shares=_contributions(inputs, at_fraction, min(samples, CONTRIBUTION_SAMPLES), seed),
         arrives=float(np.mean(np.isfinite(runs.end_s))),
         slack=float(np.mean(runs.slack)),
         samples=samples,
@@ -368,21 +372,21 @@ def predict_vine(
 
 
 def band(values: Floats) -> Floats:
-    """5 %, 50 % and 95 % quantiles along the first axis: values that were drawn, so that infinite ones do no harm.
+    """Return the 5 %, 50 % and 95 % sample quantiles along the first axis, without interpolation (values may be inf).
 
     Parameters
     ----------
     values : array, shape (n_draws, ...)
-        NaN is left out.
+        NaN is ignored.
 
     Returns
     -------
     array, shape (3, ...)
-        NaN where all draws are.
+        NaN where all draws are NaN.
     """
-    nothing = np.isnan(values).all(axis=0)
-    quantiles = np.asarray(np.nanquantile(np.where(nothing, 0.0, values), BAND, axis=0, method="inverted_cdf"))
-    return np.where(nothing, np.nan, quantiles)
+    is_empty = np.isnan(values).all(axis=0)
+    quantiles = np.asarray(np.nanquantile(np.where(is_empty, 0.0, values), BAND, axis=0, method="inverted_cdf"))
+    return np.where(is_empty, np.nan, quantiles)
 
 
 def _quantities(inputs: PredictiveInputs, runs: Runs, along: Floats, place: int) -> Iterator[Quantity]:
@@ -432,8 +436,8 @@ def _curve(inputs: PredictiveInputs, runs: Runs, along: Floats) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True)))
 
 
-def _shares(inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int) -> tuple[Contribution, ...]:
-    """Each uncertainty by itself; a payload's final speed is taken at the end, another's at the fraction."""
+def _contributions(inputs: PredictiveInputs, at_fraction: float, samples: int, seed: int) -> tuple[Contribution, ...]:
+    """Band of the final speed with one uncertain input each, widest first."""
     contributions = []
     place_m = np.array([at_fraction * inputs.trial.length_m])
     for uncertainty in inputs.uncertainties:

@@ -1,8 +1,8 @@
-"""Predictive inputs of a vine before it is grown: a model, the median of every number, and the uncertainty of each.
+"""Predictive inputs of a vine before it is grown: a model, the median of every input, and its distribution.
 
-A number is taken from what a person states, from a fit, or from `vinetrack.planning.scaling_priors`, in this order.
-Every uncertainty draws from a stream of random numbers of its own name: what vines have in common (an exponent, the law
-of the guess) then moves them together, and what each has of its own does not.
+An input comes from a stated value, a fit, or `vinetrack.planning.scaling_priors`, in this order. Every uncertainty has
+its own named stream of random numbers, so that what vines share (the exponent, the scaling law) varies together in all
+of them, and what belongs to one vine varies independently.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
 
 PRESSURE, YIELD = "pressure_Pa", "yield_pressure_Pa"
-"""Names of the two numbers that belong to a trial and not to the model."""
+"""Names of the two inputs that belong to the trial and not to the model."""
 
 BAND = (0.05, 0.5, 0.95)
 """Convention: median and 90 % band of a prediction."""
 
-_FOR_BANDS = 4000
+_BAND_SAMPLES = 4000
 """Draws for the bands of the inputs. Derived: their ends are known to 0.35 % of the draws."""
 
 Draws = dict[str, Floats]
-"""By name of parameter, `effect.parameter`, or of a pressure: values, shape (n,)."""
+"""Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure."""
 
-Move = Callable[[Draws, np.random.Generator], Draws]
+Sampler = Callable[[Draws, np.random.Generator], Draws]
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """One uncertainty; `move` gives draws in which it varies, from those in which it does not.
+    """One uncertainty; `sample` returns draws in which it varies, given draws in which it does not.
 
-    `key` names its stream of random numbers: uncertainties of one key vary together, in different vines too.
+    `key` names its stream of random numbers: uncertainties of the same key vary together, in different vines too.
     """
 
     name: str
     words: str
     key: str
-    move: Move = field(repr=False, compare=False)
+    sample: Sampler = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
 class Input:
-    """One number that went into a prediction: median and 90 % band, SI, and where they come from."""
+    """One input of a prediction: median and 90 % band, SI, and their origin."""
 
     name: str
     symbol: str
@@ -63,8 +63,9 @@ class Input:
 class PredictiveInputs:
     """The distributions from which one trial is predicted.
 
-    `trial` and `model` stand at the medians; `origins` says by number where it comes from; `spreads` are those of
-    pressure and B from trial to trial, relative, and among the uncertainties too; `notes` are sentences for people.
+    `trial` and `model` are at the medians; `origins` gives the origin of each input by name; `spreads` are the relative
+    between-trial standard deviations of pressure and B, which are among the uncertainties too; `notes` are sentences
+    for the user.
     """
 
     trial: Trial
@@ -76,19 +77,19 @@ class PredictiveInputs:
 
     @property
     def medians(self) -> dict[str, float]:
-        """Every number, SI, as it stands with nothing uncertain."""
+        """Median of every input, SI."""
         values = dict(zip(self.model.parameter_names, self.model.parameters_of(self.trial).tolist(), strict=True))
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
     def draw(self, count: int, seed: int, only: Iterable[str] | None = None) -> Draws:
-        """Draw every number `count` times; the same seed gives the same draws.
+        """Draw every input `count` times; the same seed gives the same draws.
 
         Parameters
         ----------
         count : int
             Number of draws.
         seed : int
-            The same seed gives the same draws, whatever else varies.
+            The same seed gives the same draws of an uncertainty, whichever others vary.
         only : iterable of str, optional
             Names of the uncertainties that vary; the others stay at their medians. By default all vary.
 
@@ -101,11 +102,11 @@ class PredictiveInputs:
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for uncertainty in self.uncertainties:
             if chosen is None or uncertainty.name in chosen:
-                draws = uncertainty.move(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
+                draws = uncertainty.sample(draws, np.random.default_rng([seed, zlib.crc32(uncertainty.key.encode())]))
         return _within_bounds(draws, self.model)
 
     def laid_out(self, draws: Draws) -> tuple[list[Trial], Floats]:
-        """Trials and parameters, shape (n, n_parameters), of these draws, as the simulator takes them.
+        """Return the trials and model parameters of these draws, as the simulator takes them.
 
         Parameters
         ----------
@@ -114,7 +115,7 @@ class PredictiveInputs:
         Returns
         -------
         trials : list of Trial
-            One a draw, with its pressures.
+            One for each draw, with its pressures.
         parameters : array, shape (n, n_parameters), SI
         """
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
@@ -124,7 +125,7 @@ class PredictiveInputs:
         ], rows
 
     def bands(self, seed: int = 1) -> list[Input]:
-        """Every number with its 90 % band; those that never vary have a band of no width.
+        """Return every input with its 90 % band; fixed inputs have a band of zero width.
 
         Parameters
         ----------
@@ -136,7 +137,7 @@ class PredictiveInputs:
         list of Input
             B, n and the pressures first.
         """
-        draws = self.draw(_FOR_BANDS, seed)
+        draws = self.draw(_BAND_SAMPLES, seed)
         names = {
             f"{effect.name}.{parameter.name}": (parameter.symbol, parameter.unit)
             for effect in self.model
@@ -154,7 +155,7 @@ class PredictiveInputs:
 
 
 def _within_bounds(draws: Draws, model: Model) -> Draws:
-    """No number beyond what physics allows of it."""
+    """The draws, clipped to the physical bounds of each input."""
     bounds = {f"{effect.name}.{p.name}": p.bounds for effect in model for p in effect.parameters}
     bounds |= {YIELD: (0.0, math.inf), PRESSURE: (0.0, math.inf)}
     return {name: np.clip(values, *bounds[name]) for name, values in draws.items()}
@@ -165,7 +166,7 @@ def wanted_model(
     further: Iterable[str] = (),
     user_effects: Mapping[str, Effect] | None = None,
 ) -> Model:
-    """A model of these effects and further ones, each once.
+    """Return a model of these effects and further ones, each once.
 
     Parameters
     ----------
@@ -190,19 +191,19 @@ def wanted_model(
 
 @dataclass(frozen=True)
 class Size:
-    """How large an effect is taken: a value and, where it is uncertain, the range it evenly lies in; SI."""
+    """Assumed value of a parameter: the range of a uniform distribution, of zero width for a fixed value; SI."""
 
     low: float
     high: float
 
     @property
     def middle(self) -> float:
-        """Half-way."""
+        """Middle of the range."""
         return (self.low + self.high) / 2
 
 
 def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, Size]]:
-    """Name and sizes of an effect from `NAME`, `NAME=value`, `NAME=low:high`, several parameters joined by commas.
+    """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
 
     Parameters
     ----------
@@ -216,7 +217,7 @@ def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[
     name : str
         Of the effect.
     sizes : dict
-        By `effect.parameter`; blank where the text gives none.
+        By `effect.parameter`; empty where the text gives none.
 
     Raises
     ------
@@ -235,9 +236,9 @@ def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[
     if not sizes_text.strip():
         return effect.name, {}
     cells = [cell.strip() for cell in sizes_text.split(",")]
-    known = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
+    parameters = ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters) or "none"
     if len(cells) > len(effect.parameters):
-        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {known}.")
+        raise EffectError(f"{effect.name} has {len(effect.parameters)} parameters, not {len(cells)}: {parameters}.")
     return effect.name, {
         f"{effect.name}.{parameter.name}": _size(effect, parameter.name, cell, parameter.bounds)
         for parameter, cell in zip(effect.parameters, cells, strict=False)
@@ -261,25 +262,26 @@ def _size(effect: Effect, parameter: str, cell: str, bounds: tuple[float, float]
     return Size(low, high)
 
 
-FARTHEST = 20.0
-"""At which a deviate of Student's t is cut: a factor ten of a guessed B, beyond all vines. Chosen: it cuts one draw
-in 400 of t with two degrees of freedom, at half one in 100, at twice one in 1600; the 90 % band ends at 2.9."""
+LARGEST_T_DEVIATE = 20.0
+"""At which deviates of Student's t are clipped: a factor of ten in the scaling prior of B, beyond all vines. Chosen: it
+clips one draw in 400 of t with two degrees of freedom, at half one in 100, at twice one in 1600; the 90 % band ends at
+2.9."""
 
 
 def _deviates(draw: np.random.Generator, count: int, dof: float = math.inf) -> Floats:
-    """Normal deviates, or Student's with so many degrees of freedom, shape (count,)."""
+    """Standard normal deviates, or deviates of Student's t with `dof` degrees of freedom, shape (count,)."""
     if math.isinf(dof):
         return draw.standard_normal(count)
-    return np.clip(draw.standard_t(dof, count), -FARTHEST, FARTHEST)
+    return np.clip(draw.standard_t(dof, count), -LARGEST_T_DEVIATE, LARGEST_T_DEVIATE)
 
 
-def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Move:
-    """Multiplied by a factor whose logarithm has this standard deviation, or scale of Student's t.
+def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
+    """Return a sampler that multiplies an input by a log-normal (or log-t) factor.
 
     Parameters
     ----------
     name : str
-        Number that is drawn.
+        Input that is drawn.
     log_sigma : float
         Standard deviation, or scale of Student's t, of the logarithm of the factor.
     dof : float
@@ -287,43 +289,43 @@ def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Move:
 
     Returns
     -------
-    Move
+    Sampler
     """
 
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] * np.exp(log_sigma * _deviates(draw, draws[name].size, dof))}
 
-    return move
+    return sample
 
 
-def shifted(name: str, sigma: float) -> Move:
-    """Moved by a normal deviate, SI.
+def shifted(name: str, sigma: float) -> Sampler:
+    """Return a sampler that adds a normal deviate to an input.
 
     Parameters
     ----------
     name : str
-        Number that is drawn.
+        Input that is drawn.
     sigma : float
         Standard deviation, SI.
 
     Returns
     -------
-    Move
+    Sampler
     """
 
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] + sigma * draw.standard_normal(draws[name].size)}
 
-    return move
+    return sample
 
 
-def relative(name: str, sigma: float, dof: float = math.inf) -> Move:
-    """Multiplied by one plus a deviate of this standard deviation, or scale of Student's t.
+def relative(name: str, sigma: float, dof: float = math.inf) -> Sampler:
+    """Return a sampler that multiplies an input by one plus a normal (or t) deviate.
 
     Parameters
     ----------
     name : str
-        Number that is drawn.
+        Input that is drawn.
     sigma : float
         Relative standard deviation, or scale of Student's t.
     dof : float
@@ -331,30 +333,30 @@ def relative(name: str, sigma: float, dof: float = math.inf) -> Move:
 
     Returns
     -------
-    Move
+    Sampler
     """
 
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] * (1 + sigma * _deviates(draw, draws[name].size, dof))}
 
-    return move
+    return sample
 
 
-def even(name: str, size: Size) -> Move:
-    """Drawn evenly from a range.
+def even(name: str, size: Size) -> Sampler:
+    """Return a sampler that draws an input uniformly from a range.
 
     Parameters
     ----------
     name : str
-        Number that is drawn.
+        Input that is drawn.
     size : range, SI.
 
     Returns
     -------
-    Move
+    Sampler
     """
 
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+    def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draw.uniform(size.low, size.high, draws[name].size)}
 
-    return move
+    return sample

@@ -1,8 +1,8 @@
-"""Whether speeds agree with the stated pressures, as far as damping coefficients of such tubes are known.
+"""Check of stated pressures against measured speeds, for errors of unit.
 
 The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the scaling
-prior (`vinetrack.planning.scaling_priors`). A pressure in psi under the name of kPa is 6.9 times too low, and P − P_y
-lower still.
+prior (`vinetrack.planning.scaling_priors`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even
+more.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from vinetrack.core.units import convert
 from vinetrack.planning.scaling_priors import damping_prior
 
 FAR_OFF = 4.0
-"""Chosen: factor between implied and prior damping from which another unit is tried. The four printed values lie within
-1.2 of the prior, films of other makers may lie further off: at 2 they would be asked, at 7 psi would not."""
+"""Factor between implied and prior damping from which another unit is tried. Chosen: the four printed values lie within
+1.2 of the prior, films of other makers may lie further off. At 2 those would be tested, at 7 psi would not be found."""
+
 NEAR = 2.5
-"""Chosen: factor to the prior within which the other unit explains the speeds."""
+"""Factor to the prior within which the other unit explains the speeds. Chosen below the factor of 4 of `FAR_OFF`."""
 
 
 def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield_pressure_Pa: float) -> float:
-    """Damping coefficient that a trial implies over that of the scaling prior; NaN without growth or drive.
+    """Return the damping coefficient that a trial implies over its scaling prior; NaN without growth or drive.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield
 
 
 def track_speed(track: Track) -> float:
-    """Mean speed of the leading edge over the middle of its travel.
+    """Return the mean speed of the leading edge over the middle of its travel.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def track_speed(track: Track) -> float:
 
     Returns
     -------
-    m/s; NaN where the track does not say.
+    m/s; NaN where the track does not show it.
     """
     time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
     travel_m = np.maximum.accumulate(position_m - position_m[0]) if position_m.size else position_m
@@ -69,13 +70,13 @@ def track_speed(track: Track) -> float:
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
-    """A warning where the speeds contradict the pressures as stated and agree with them in another unit.
+    """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit.
 
-    That may be psi, or kPa where psi are stated, or pressures counted from those of the air.
+    The other unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
 
     Parameters
     ----------
-    speeds : trials of everting vines with the mean speed of the leading edge, m/s; others are passed over.
+    speeds : trials with the mean speed of the leading edge, m/s; those of bodies that do not evert are ignored.
 
     Returns
     -------
@@ -90,18 +91,18 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     less = _middle_ratio(gauge, 1.0, 1.0)
     if 1 / NEAR < less < NEAR and all(trial.pressure_Pa > 0 for trial, _ in gauge):
         message = (
-            f"looks like absolute pressure: the speeds seen imply {number(as_stated, 2)} times the damping that tubes"
-            f" of this size have, and {number(less, 2)} times once the pressure of the air is taken off"
+            f"looks like absolute pressure: the measured speeds imply {number(as_stated, 2)} times the damping of tubes"
+            f" of this size, and {number(less, 2)} times after the ambient pressure is subtracted"
         )
-        return [Problem(message=message, remedy="state what the gauge shows beyond the pressure of the air", **place)]
+        return [Problem(message=message, remedy="state gauge pressure, relative to the ambient pressure", **place)]
     psi = convert(1.0, "psi", "kPa")
     factor, wrong = (psi, "psi, not kPa") if as_stated < 1 else (1 / psi, "kPa, not psi")
     for yield_factor in (1.0, factor):
         converted = _middle_ratio(pairs, factor, yield_factor)
         if 1 / NEAR < converted < NEAR:
             message = (
-                f"looks like {wrong} (1 psi is {psi:.4g} kPa): the speeds seen imply {number(as_stated, 2)} times the "
-                f"damping that tubes of this size have, and {number(converted, 2)} times in the other unit"
+                f"looks like {wrong} (1 psi is {psi:.4g} kPa): the measured speeds imply {number(as_stated, 2)} times "
+                f"the damping of tubes of this size, and {number(converted, 2)} times in the other unit"
             )
             remedy = "name the column pressure_psi" if factor > 1 else "name the column pressure_kPa"
             return [Problem(message=message, remedy=remedy, **place)]
@@ -109,9 +110,9 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
 
 
 def _middle_ratio(pairs: list[tuple[Trial, float]], factor: float, yield_factor: float) -> float:
-    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where none says anything.
+    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where no trial has a ratio.
 
-    A trial that moves although the pressure does not exceed the yield pressure implies no damping at all.
+    A trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
     """
     ratios = []
     for trial, speed in pairs:

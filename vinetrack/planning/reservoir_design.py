@@ -1,10 +1,11 @@
-"""The chamber that keeps the gauge pressure while a vine grows out of it.
+"""Volume of the chamber that keeps the gauge pressure nearly constant while a vine grows.
 
     (P + P_atm) (V₀/(V₀ + S))^γ = (1 − ε) P + P_atm
     V₀ = S q/(1 − q) with q = (((1 − ε) P + P_atm)/(P + P_atm))^(1/γ)
 
-with S the volume swept, A·y, and ε the share of the gauge pressure that may be lost. The gas law needs *absolute*
-pressure. γ = 1 is growth slow enough for the gas to stay at room temperature, 1.4 growth too fast for any heat.
+with S = A·y the volume filled and ε the allowed loss as a fraction of the gauge pressure. The gas law needs *absolute*
+pressure. γ = 1 is isothermal: growth so slow that the gas stays at room temperature. γ = 1.4 is adiabatic: growth too
+fast for heat exchange.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from vinetrack.planning.prediction import LONGEST_S, POINTS
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}
-"""The two ends between which every growth lies."""
+"""Gas laws between which every growth lies."""
 
 
 def swept_m3(trial: Trial) -> float:
-    """Volume of the grown vine, m³.
+    """Return the volume of the grown vine, m³.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ def swept_m3(trial: Trial) -> float:
 
 
 def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float, ambient_Pa: float) -> float:
-    """Share of the gauge pressure lost when the volume `swept`, m³, has been filled from a closed chamber.
+    """Return the fraction of the gauge pressure lost after the volume `swept` is filled from a closed chamber.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float
 
 
 def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, ambient_Pa: float) -> float:
-    """Volume of the closed chamber, m³, that loses just this share of its gauge pressure.
+    """Return the volume of the closed chamber, m³, that loses exactly this fraction of its gauge pressure.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, amb
     swept : float
         Volume filled, m³.
     loss : float
-        Share of the gauge pressure that may be lost.
+        Allowed loss, as a fraction of the gauge pressure.
     gamma : float
         Exponent of the gas law, 1 to 1.4.
     ambient_Pa : float
@@ -96,14 +97,14 @@ def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, amb
 
 
 def chamber_by_gauge(swept: float, loss: float) -> float:
-    """What Boyle's law gives where gauge pressure is put into it, m³: V₁/V₂ = 1 − ε. It is too small.
+    """Return the volume, m³, by Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, which is too small.
 
     Parameters
     ----------
     swept : float
         Volume filled, m³.
     loss : float
-        Share of the gauge pressure that may be lost.
+        Allowed loss, as a fraction of the gauge pressure.
 
     Returns
     -------
@@ -114,7 +115,7 @@ def chamber_by_gauge(swept: float, loss: float) -> float:
 
 @dataclass(frozen=True)
 class Chamber:
-    """One chamber and what becomes of the pressure in it: `losses` by gas law, share of the gauge pressure."""
+    """One chamber and the loss of pressure in it: `losses` by gas law, as a fraction of the gauge pressure."""
 
     name: str
     volume_m3: float
@@ -122,13 +123,13 @@ class Chamber:
 
 
 def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
-    """The chambers worth looking at: that asked about, those that keep the pressure, and what the gauge rule says.
+    """Return the chambers to compare: the stated one, those that keep the pressure, and the one by gauge pressure.
 
     Parameters
     ----------
-    trial : pressure, size, ambient pressure and, where it has one, chamber.
+    trial : pressure, size, ambient pressure and, where stated, chamber.
     loss : float
-        Share of the gauge pressure that may be lost.
+        Allowed loss, as a fraction of the gauge pressure.
 
     Returns
     -------
@@ -155,7 +156,7 @@ def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
 
 
 def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
-    """Largest share of the gauge pressure lost at the medians with a supply that closes the gap in `tau_s`.
+    """Return the largest fraction of the gauge pressure lost at the medians with a supply of time constant `tau_s`.
 
     Parameters
     ----------
@@ -182,13 +183,13 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
 
 
 def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
-    """Volume of the chamber, m³, that with such a supply loses just this share; 0 where the supply alone will do.
+    """Return the volume of the chamber that with such a supply loses exactly this fraction; 0 where none is needed.
 
     Parameters
     ----------
     inputs : predictive inputs; the medians are simulated.
     loss : float
-        Share of the gauge pressure that may be lost.
+        Allowed loss, as a fraction of the gauge pressure.
     tau_s : float
         Time constant of the supply, s.
     gamma : float
@@ -200,20 +201,20 @@ def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma:
         m³
     """
 
-    def beyond(log_volume: float) -> float:
+    def excess_loss(log_volume: float) -> float:
         return supplied_loss(inputs, math.exp(log_volume), tau_s, gamma) - loss
 
     closed = chamber_for(
         inputs.trial.pressure_Pa, swept_m3(inputs.trial), loss, gamma, inputs.trial.ambient_pressure_Pa
     )
     low, high = math.log(closed / 1e4), math.log(closed * 1.01)
-    if beyond(low) <= 0:
+    if excess_loss(low) <= 0:
         return 0.0
-    return math.exp(brentq(beyond, low, high, xtol=1e-3))
+    return math.exp(brentq(excess_loss, low, high, xtol=1e-3))
 
 
 def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fraction: float) -> float:
-    """The final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`.
+    """Return the final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`.
 
     Parameters
     ----------
@@ -223,7 +224,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
     gamma : float
         Exponent of the gas law.
     at_fraction : float
-        y/L at which a bare vine's speed is taken.
+        y/L at which the speed without payload is evaluated.
 
     Returns
     -------
@@ -235,7 +236,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
 
 
 def _with(model: Model, name: str, **values: float) -> Model:
-    """The model with this effect at these values, in place of any other law of the chamber."""
+    """The model with this effect in place of any other effect of the chamber."""
     for other in ("reservoir_depletion", "supply_refill"):
         model = model - other if other in model else model
     return (model + catalogue()[name]).with_values({f"{name}.{key}": value for key, value in values.items()})

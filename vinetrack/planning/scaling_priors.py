@@ -1,10 +1,10 @@
-"""Guesses for vines that nobody has measured, each with the error that its origin leaves it.
+"""Scaling priors for vines that have not been measured, each with a standard error.
 
     B ≈ 6.44 (t/200 µm) (D/24 mm)^0.75 N·(s/m)ⁿ
 
-joins the four printed values and the printed linear rise with wall thickness. All four lie on one line of t/D, so what
-t and D do apart from each other is not in them: `SPLIT_SIGMA` stands for that. Nothing here is a measurement, and
-whatever is made of it says so.
+describes the four printed values and the printed linear rise with wall thickness. All four have nearly the same t/D, so
+they do not determine the exponents of t and D separately: `SPLIT_SIGMA` allows for that. None of these values is a
+measurement, and every output that uses them says so.
 """
 
 from __future__ import annotations
@@ -14,47 +14,48 @@ import math
 from vinetrack.core import published
 
 DIAMETER_EXPONENT = 0.75
-"""Exponent of D in the guessed B. Derived: through the printed B of the smallest and largest vine with that of t at 1
+"""Exponent of D in the prior of B. Derived: through the printed B of the smallest and largest vine with that of t at 1
 (see `published`); `SPLIT_SIGMA` allows for another split."""
 
 THICKNESS_EXPONENT = 1.0
-"""Exponent of t in the guessed B. Published: the rise of B with thickness is printed as near-linear."""
+"""Exponent of t in the prior of B. Published: the rise of B with thickness is printed as near-linear."""
 
 SCATTER_DOF = 2
-"""Four printed values less the two numbers of the law that were drawn through them. Derived: 4 − 2."""
+"""Degrees of freedom of the scatter about the prior. Derived: four printed values less two fitted parameters."""
 
 SPLIT_SIGMA = 0.25
-"""Error of the exponent of t against that of D, their sum kept. The printed rise with t at one diameter is near-linear
-and may have an intercept: an exponent between 0.6 and 1.4 in nine of ten cases. Derived: ±0.4 at 90 % is ±0.25 at one
-standard deviation (0.4/1.645)."""
+"""Standard error of the exponent of t against that of D, at constant sum. The printed rise with t at one diameter is
+near-linear and may have an intercept: an exponent between 0.6 and 1.4 with 90 % probability. Derived: ±0.4 at 90 % is
+±0.25 at one standard deviation (0.4/1.645)."""
 
 PRINTED_ERROR = 0.05
-"""Relative error of a printed B, of which nothing is printed but R²: points that scatter by 10 to 20 % about the law,
-some ten of them, make 3 to 6 %. Derived: 15 %/√10 = 5 %."""
+"""Relative standard error of a printed B, for which only R² is printed: about ten points that scatter by 10 to 20 %
+about the law give 3 to 6 %. Derived: 15 %/√10 = 5 %."""
 
 YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
 PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)
-"""Of the printed yield pressure, for the vine that it was printed for: "about 3 kPa", so to a whole number."""
+"""Standard error of the printed yield pressure, Pa. Derived: "about 3 kPa" is rounded to a whole number, so 1/√12
+kPa."""
 
 YIELD_FACTOR = 3.0
-"""One yield pressure is printed, for one vine: nine of ten others are taken to lie within this factor of it. Chosen: at
-half (1.5) bands would be as narrow as if films were alike, at twice (6) a band at low pressure says nothing."""
+"""Factor of the one printed yield pressure within which nine of ten other vines are assumed to lie. Chosen: at half
+(1.5) bands would be as narrow as if all films were alike, at twice (6) a band at low pressure is of no use."""
 
 BURST_STRESS_PA = 7.8e6
-"""Hoop stress PD/2t at which film bursts, from the fast vine alone, which was grown at 7.75 MPa, just under it. Derived
-from one published vine that held; at half of it safe vines are refused, at twice some are planned that burst."""
+"""Assumed hoop stress PD/2t at burst, Pa. Derived from one published vine, which held 7.75 MPa; at half safe vines are
+refused, at twice some that burst are planned."""
 
 NINE_OF_TEN = 1.6448536269514722
-"""Standard deviations of the normal distribution that hold 90 %."""
+"""Half width of the central 90 % of the normal distribution, in standard deviations."""
 
 PRESSURE_SPREAD, DAMPING_SPREAD = 0.01, 0.03
-"""From trial to trial, relative: what a batch of vines shows. Chosen: a regulator repeats to about one per cent, film
-and seals to a few; a fit replaces both. At half and twice, bands of speed from this source halve and double (σ_v/v =
-σ_B/(nB))."""
+"""Relative between-trial standard deviations of pressure and B. Chosen: a regulator repeats to about one per cent, film
+and seals to a few; a fit replaces both. At half and twice, the bands of speed from this source halve and double
+(σ_v/v = σ_B/(nB))."""
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
-    """B of a vine of this size, N·(s/m)ⁿ.
+    """Return the prior of B of a vine of this size, N·(s/m)ⁿ.
 
     Parameters
     ----------
@@ -77,23 +78,23 @@ def damping_prior(diameter_m: float, thickness_m: float) -> float:
 
 
 def damping_scatter() -> float:
-    """Standard deviation of ln B of the four printed values about the guess.
+    """Return the standard deviation of ln B of the four printed values about the prior.
 
     >>> round(damping_scatter(), 3)
     0.113
     """
-    off = [
+    residuals = [
         math.log(B / damping_prior(1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]))
         for scale, B in published.DAMPING_B.items()
     ]
-    return math.sqrt(sum(difference**2 for difference in off) / SCATTER_DOF)
+    return math.sqrt(sum(residual**2 for residual in residuals) / SCATTER_DOF)
 
 
 def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
-    """Standard error, of Student's t, of the prediction of ln B of a vine with t/D as printed.
+    """Return the standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed.
 
-    That of a line drawn through the four printed points and read off at another, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²), z
-    being the size in logarithms: it grows beyond the smallest and the largest vine.
+    It is the prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z
+    the logarithm of the size; it grows beyond the smallest and the largest vine.
 
     Parameters
     ----------
@@ -114,13 +115,13 @@ def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
         for scale in published.DAMPING_B
     ]
     middle = sum(sizes) / len(sizes)
-    away = math.log(damping_prior(diameter_m, thickness_m)) - middle
-    leverage = 1 / len(sizes) + away**2 / sum((size - middle) ** 2 for size in sizes)
+    distance = math.log(damping_prior(diameter_m, thickness_m)) - middle
+    leverage = 1 / len(sizes) + distance**2 / sum((size - middle) ** 2 for size in sizes)
     return damping_scatter() * math.sqrt(1 + leverage)
 
 
 def split_leverage(diameter_m: float, thickness_m: float) -> float:
-    """By how much ln B moves when one is added to the exponent of t and taken from that of D; 0 for t/D as printed.
+    """Return the change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D as printed.
 
     Parameters
     ----------
@@ -137,25 +138,26 @@ def split_leverage(diameter_m: float, thickness_m: float) -> float:
 
 
 def exponent_sigma() -> float:
-    """Standard error of the printed n, from the printed R² of the four fits with about ten pressures each.
+    """Return the standard error of the printed n, from the printed R² of the four fits with about ten pressures each.
 
-    That of a slope n of N points is n √((1 − R²)/R²/(N − 2)); the four together are weighed by it.
+    The standard error of a slope n of N points is n √((1 − R²)/R²/(N − 2)); the four are combined with inverse-variance
+    weights.
 
     >>> round(exponent_sigma(), 3)
     0.012
     """
-    spare = sum(published.CONDITIONS) / len(published.CONDITIONS) - 2
-    squares = [published.EXPONENT**2 * (1 - R2) / R2 / spare for R2 in published.DAMPING_R2.values()]
-    return 1 / math.sqrt(sum(1 / square for square in squares))
+    dof = sum(published.CONDITIONS) / len(published.CONDITIONS) - 2
+    variances = [published.EXPONENT**2 * (1 - R2) / R2 / dof for R2 in published.DAMPING_R2.values()]
+    return 1 / math.sqrt(sum(1 / variance for variance in variances))
 
 
 def yield_log_sigma() -> float:
-    """Standard deviation of the logarithm of a guessed yield pressure."""
+    """Return the standard deviation of the logarithm of the prior of a yield pressure."""
     return math.log(YIELD_FACTOR) / NINE_OF_TEN
 
 
 def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
-    """Gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine.
+    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine.
 
     Parameters
     ----------
@@ -175,7 +177,7 @@ def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
 
 
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
-    """Hoop stress PD/2t of the wall, Pa.
+    """Return the hoop stress PD/2t of the wall, Pa.
 
     Parameters
     ----------

@@ -131,9 +131,7 @@ def make(
         replace(
             trial,
             pressure_Pa=trial.pressure_Pa * float(factor),
-            yield_pressure_Pa=max(
-                trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * yield_errors[trial.vine], 0.0
-            ),
+            yield_pressure_Pa=max(trial.yield_pressure_Pa + trial.yield_pressure_sigma_Pa * misread[trial.vine], 0.0),
         )
         for trial, factor in zip(trials, pressure_factors, strict=True)
     ]
