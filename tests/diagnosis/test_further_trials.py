@@ -10,7 +10,7 @@ import pytest
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_questions
+from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.further_trials import further_trials
 from vinetrack.diagnosis.linear_power import effect_power, power_of
 from vinetrack.diagnosis.power import FurtherTrials, Power
@@ -44,7 +44,7 @@ def design() -> CampaignDesign:
 
 @pytest.fixture(scope="module")
 def power(design: CampaignDesign) -> Power:
-    return power_of(planned_questions(design)[0], curved=True)
+    return power_of(planned_tests(design)[0], curved=True)
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +62,14 @@ def test_the_plan_keeps_its_promise_when_its_trials_are_in_the_sheet(
         design, trials=(*design.trials, *added), cameras=design.cameras[:1] * count,
         slow_error_m=(math.nan,) * count, has_trace=(False,) * count,
     )  # fmt: skip
-    again = effect_power(planned_questions(made)[0], "leak")
+    again = effect_power(planned_tests(made)[0], "leak")
     assert again is not None
     assert plan.power is not None
     assert again.size_at(0.9) == pytest.approx(plan.power.size_at(0.9), rel=0.02)
 
 
 def test_one_pair_less_does_not_do(plan: FurtherTrials) -> None:
-    fewer = [added.probability for added in plan.trials if added.probability < plan.reach]
+    fewer = [added.probability for added in plan.trials if added.probability < plan.target]
     assert len(fewer) == len(plan.trials) - 2
 
 
@@ -90,7 +90,7 @@ def test_what_no_trial_within_the_limits_shows_is_said(design: CampaignDesign, p
     tight = LIMITS.model_copy(update={"trials": 4})
     never = further_trials(design, power["air_drag"], 0.05, 0.9, Limits(**tight.model_dump()))
     assert not never.is_reached
-    assert never.endless < 0.9
+    assert never.unlimited < 0.9
     assert any(line.startswith("No number of trials within `limits` suffices") for line in further_lines(never))
 
 

@@ -13,7 +13,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign
 from vinetrack.diagnosis.family_test import family_p_value, family_test
-from vinetrack.diagnosis.null_calibration import TESTS, CalibratedTest, TestChances, calibrated, null_chances
+from vinetrack.diagnosis.null_calibration import TESTS, CalibratedTest, CampaignPValues, calibrate, null_p_values
 from vinetrack.narrative.calibration_text import calibration_lines
 from vinetrack.planning.campaign_information import FilmingPlan
 
@@ -81,9 +81,9 @@ def test_few_campaigns_without_a_tail_decide_nothing() -> None:
 
 def test_what_changes_is_said_in_words() -> None:
     observed = dict.fromkeys(TESTS, 0.5) | {"scores of all candidates": 1e-4}
-    null = [TestChances(k, dict.fromkeys(TESTS, chance)) for k, chance in enumerate(nulls(0.3))]
-    null.append(TestChances(999, {}, "FitError: none"))
-    calibration = calibrated(observed, null, ("gravity",))
+    null = [CampaignPValues(k, dict.fromkeys(TESTS, chance)) for k, chance in enumerate(nulls(0.3))]
+    null.append(CampaignPValues(999, {}, "FitError: none"))
+    calibration = calibrate(observed, null, ("gravity",))
     assert (calibration.campaigns, calibration.failed) == (400, 1)
     assert calibration.was_called
     assert calibration.still_called is False
@@ -104,7 +104,7 @@ def test_a_null_campaign_of_a_design_raises_no_alarm() -> None:
         vt.predictive_inputs(trials[0]).model, tuple(trials), (FilmingPlan(500.0, 1e-4),) * count, (0.005, 0.01),
         (math.nan,) * count, (False,) * count, ("leak", "tail_friction", "air_drag"),
     )  # fmt: skip
-    answer = null_chances(design, 4)
+    answer = null_p_values(design, 4)
     assert answer.failed == ""
-    assert set(answer.chances) == set(TESTS)
-    assert all(TESTS[name] < chance <= 1 for name, chance in answer.chances.items())
+    assert set(answer.p_values) == set(TESTS)
+    assert all(TESTS[name] < chance <= 1 for name, chance in answer.p_values.items())

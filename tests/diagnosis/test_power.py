@@ -13,22 +13,22 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import expected_scores
-from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
+from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_tests
 from vinetrack.diagnosis.expected_scores import (
     NoiselessStart,
     beyond,
-    displacements,
     fitted_without,
     noiseless_start,
+    residual_displacements,
     score_ratio,
 )
-from vinetrack.diagnosis.linear_power import effect_power, power_of, spread_widening
+from vinetrack.diagnosis.linear_power import effect_power, error_inflation, power_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.diagnosis.score_test import informations_at, scores_of
 from vinetrack.diagnosis.shape_products import fit_columns
-from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
+from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis, rates_of, simulated_diagnosis
 from vinetrack.inference import sensitivity
 from vinetrack.narrative.power_text import effect_sentence
 from vinetrack.narrative.verdict_summary import facts
@@ -54,7 +54,7 @@ def planned(replicates: int, spreads: tuple[float, float] = (0.01, 0.03)) -> Cam
 
 @pytest.fixture(scope="module")
 def six() -> MisfitTests:
-    return planned_questions(planned(2))[0]
+    return planned_tests(planned(2))[0]
 
 
 @pytest.fixture(scope="module")
@@ -79,16 +79,16 @@ def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTes
 
 
 def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: MisfitTests) -> None:
-    held = spread_widening(six)
+    held = error_inflation(six)
     assert held[0] == pytest.approx(np.ones(held.shape[1]))
-    many = planned_questions(planned(4))[0]
-    widening = spread_widening(many)
+    many = planned_tests(planned(4))[0]
+    widening = error_inflation(many)
     assert widening.max() > 1.2
     assert np.all(np.diff(widening, axis=0) > -1e-9)
 
 
 def test_information_at_other_spreads_is_that_of_scores_at_those_spreads() -> None:
-    many = planned_questions(planned(4))[0]
+    many = planned_tests(planned(4))[0]
     ways = [(0.002, 0.01), (0.01, 0.03), (0.03, 0.09)]
     direct = [scores_of(many.fit, many.products, replace(many.fit.state, spread=way)).information for way in ways]
     assert informations_at(many.fit, many.products, ways) == pytest.approx(np.array([np.diag(one) for one in direct]))
@@ -96,21 +96,21 @@ def test_information_at_other_spreads_is_that_of_scores_at_those_spreads() -> No
 
 def test_four_times_the_trials_halve_the_size(power: Power) -> None:
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
-    few = power_of(planned_questions(planned(4))[0])["leak"].size_at(0.5)
-    many = power_of(planned_questions(planned(16))[0])["leak"].size_at(0.5)
+    few = power_of(planned_tests(planned(4))[0])["leak"].size_at(0.5)
+    many = power_of(planned_tests(planned(16))[0])["leak"].size_at(0.5)
     assert few / many == pytest.approx(2.0, rel=0.25)
     assert power["leak"].size_at(0.5) > few
 
 
 def test_more_scatter_hides_more() -> None:
-    calm = power_of(planned_questions(planned(3, (0.002, 0.006)))[0])
-    usual = power_of(planned_questions(planned(3))[0])
+    calm = power_of(planned_tests(planned(3, (0.002, 0.006)))[0])
+    usual = power_of(planned_tests(planned(3))[0])
     assert usual["pressure_gain"].size_at(0.9) > 1.5 * calm["pressure_gain"].size_at(0.9)
 
 
 def test_two_effects_that_do_the_same_are_taken_for_each_other() -> None:
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
-    power = power_of(planned_questions(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0])
+    power = power_of(planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0])
     assert "pressure_gain" in power["area_scale"].taken_for
     assert "area_scale" in power["pressure_gain"].taken_for
 
@@ -131,7 +131,7 @@ def test_false_alarms_add_up_over_the_tests(power: Power) -> None:
 def test_a_sheet_that_states_days_has_one_more_test() -> None:
     design = planned(2)
     dated = replace(design, trials=tuple(replace(trial, day=trial.name[-1]) for trial in design.trials))
-    rates = power_of(planned_questions(dated)[0]).false_alarms
+    rates = power_of(planned_tests(dated)[0]).false_alarms
     assert rates["specimens, days or the order of trials"] == FALSE_ALARM_LEVEL_FIRST_ROUND
 
 
@@ -144,7 +144,7 @@ def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Po
 
 def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six: MisfitTests, power: Power) -> None:
     k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
-    moved_m = size * displacements(six.fit, six.products)[k]
+    moved_m = size * residual_displacements(six.fit, six.products)[k]
     after = fitted_without(six.fit, six.sensitivities.shapes[k], size, noiseless_start(six.fit))
     left = [block[:, -1] for block in after.solution.columns]
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
@@ -323,8 +323,8 @@ def test_the_exact_interval_of_a_rate() -> None:
     assert Rate(0, 0).interval == (0.0, 1.0)
 
 
-def answer(seed: int, verdict: str, answer_set: tuple[str, ...] = (), **more: object) -> SimulatedAnswer:
-    return SimulatedAnswer("leak", 0.5, seed, verdict, answer_set, **more)  # type: ignore[arg-type]
+def answer(seed: int, verdict: str, answer_set: tuple[str, ...] = (), **more: object) -> SimulatedDiagnosis:
+    return SimulatedDiagnosis("leak", 0.5, seed, verdict, answer_set, **more)  # type: ignore[arg-type]
 
 
 def test_answers_are_counted() -> None:
@@ -341,13 +341,13 @@ def test_answers_are_counted() -> None:
 
 
 def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
-    found = simulated_answer(planned(2, (0.002, 0.006)), "leak", 0.02, 3)
+    found = simulated_diagnosis(planned(2, (0.002, 0.006)), "leak", 0.02, 3)
     assert found.failed == ""
     assert found.is_found
 
 
 def test_the_design_of_a_fit_films_as_long_as_its_trials() -> None:
-    questions, _ = planned_questions(planned(1))
+    questions, _ = planned_tests(planned(1))
     design = design_of_fit(questions.fit)
     for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):
         assert camera.stops_s == pytest.approx(trial.time_s[-1] - trial.release_s)

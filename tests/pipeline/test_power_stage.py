@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign
-from vinetrack.diagnosis.null_calibration import TESTS, TestChances
-from vinetrack.diagnosis.simulated_power import SimulatedAnswer
+from vinetrack.diagnosis.null_calibration import TESTS, CampaignPValues
+from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis
 from vinetrack.figures.registry import draw
 from vinetrack.pipeline import simulated_answers
 from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
@@ -79,11 +79,11 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
 def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[int] = []
 
-    def chances(design: CampaignDesign, seed: int) -> TestChances:  # noqa: ARG001
+    def chances(design: CampaignDesign, seed: int) -> CampaignPValues:  # noqa: ARG001
         asked_for.append(seed)
-        return TestChances(seed, dict.fromkeys(TESTS, 0.1 * (seed + 1)))
+        return CampaignPValues(seed, dict.fromkeys(TESTS, 0.1 * (seed + 1)))
 
-    monkeypatch.setattr(simulated_answers, "null_chances", chances)
+    monkeypatch.setattr(simulated_answers, "null_p_values", chances)
     monkeypatch.setattr(simulated_answers, "fingerprint", lambda _: "design")
     how = simulated_answers.Simulation(2, 0, 1, tmp_path / "chances.csv")
     design: Any = None
@@ -91,7 +91,7 @@ def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeyp
     again = simulated_answers.simulate_null_tests(design, replace(how, campaigns=3))
     assert asked_for == [0, 1, 2]
     assert again[:2] == first
-    assert again[2].chances["any smooth force"] == pytest.approx(0.3)
+    assert again[2].p_values["any smooth force"] == pytest.approx(0.3)
 
 
 def test_a_sheet_that_nobody_has_filmed_cannot_be_calibrated(folder: Path) -> None:
@@ -112,12 +112,12 @@ def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:
 def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[tuple[str, int]] = []
 
-    def answered(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedAnswer:  # noqa: ARG001
+    def answered(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:  # noqa: ARG001
         asked_for.append((effect, seed))
         verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
-        return SimulatedAnswer(effect, value, seed, verdict, names, (), 1.0)
+        return SimulatedDiagnosis(effect, value, seed, verdict, names, (), 1.0)
 
-    monkeypatch.setattr(simulated_answers, "simulated_answer", answered)
+    monkeypatch.setattr(simulated_answers, "simulated_diagnosis", answered)
     asked = PowerRequest(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
     first = power_of_target(asked)
     assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]

@@ -66,7 +66,7 @@ def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> P
     FitError
         If no trial of the design can be fitted.
     """
-    questions, blind = planned_questions(design)
+    questions, blind = planned_tests(design)
     return power_of(questions, blind, inputs, curved=True)
 
 
@@ -157,7 +157,7 @@ def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> Campa
     )
 
 
-def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
+def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
     """Hold a campaign without noise against all candidates, with the noise and spreads of its design.
 
     Parameters
@@ -199,14 +199,19 @@ def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, st
     noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
     noise = (noise_m, design.cameras[0].noise_correlation)
     fitted = fit(
-        design.to_fit, as_measured(design, pairs), spreads=design.spreads, noise=noise, host=host, profile=False,
+        design.to_fit,
+        with_measurement_errors(design, pairs),
+        spreads=design.spreads,
+        noise=noise,
+        host=host,
+        profile=False,
         thorough=False,
-    )  # fmt: skip
+    )
     effects, blind = testable(questioned, fitted.predictor.data)
     return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), blind
 
 
-def as_measured(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
+def with_measurement_errors(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
     """Give tracks the slow error that a tracker states, and the pressure where the campaign measures it.
 
     Parameters

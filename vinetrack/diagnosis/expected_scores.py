@@ -105,7 +105,7 @@ def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
     return other
 
 
-def followed_sizes(questions: MisfitTests, place: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
+def score_ratios(questions: MisfitTests, place: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
     """Sizes that an effect is followed at, and by what its expected scores there differ from proportion to the size.
 
     Where the score at seven units, beyond any threshold, is in proportion, no other size is tried; else, and where it
@@ -178,7 +178,7 @@ def score_ratio(questions: MisfitTests, place: int, size: float, start: Noiseles
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
-def least_sizes(questions: MisfitTests) -> Floats:
+def sizes_at_systematic_error(questions: MisfitTests) -> Floats:
     """Sizes at which an effect moves positions by as much as their systematic errors.
 
     Parameters
@@ -194,11 +194,11 @@ def least_sizes(questions: MisfitTests) -> Floats:
     systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
     if not systematic_m > 0:
         return np.zeros(len(questions.sensitivities.shapes))
-    moved_m = displacements(fit, questions.products)
+    moved_m = residual_displacements(fit, questions.products)
     return np.asarray(systematic_m / np.maximum(moved_m, 1e-300))
 
 
-def displacements(fit: Fit, sums: Products) -> Floats:
+def residual_displacements(fit: Fit, sums: Products) -> Floats:
     """How far a fit without an effect stays from trajectories with a unit of its size, to first order.
 
     Parameters
@@ -234,7 +234,7 @@ def displacements(fit: Fit, sums: Products) -> Floats:
     return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
 
 
-def beyond(least: float, sizes: Floats) -> Floats:
+def half_power_below(least: float, sizes: Floats) -> Floats:
     """Return sizes by probability where a finding below the least size counts half.
 
     Parameters

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_questions
-from vinetrack.diagnosis.linear_power import effect_power, typical_place
+from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
+from vinetrack.diagnosis.linear_power import effect_power, typical_shape_index
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials
 from vinetrack.diagnosis.score_test import scores_of
@@ -76,7 +76,7 @@ MOST_VINES_TRIED = 2
 
 
 def further_trials(
-    design: CampaignDesign, now: EffectPower, value: float, reach: float, limits: Limits | None = None
+    design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
 ) -> FurtherTrials:
     """Look for the fewest further trials with which an effect of some size is found with a wanted probability.
 
@@ -86,7 +86,7 @@ def further_trials(
     now : power of these trials for the effect.
     value : float
         Of its parameter, SI.
-    reach : float
+    target : float
         Wanted probability, below 1.
     limits : Limits, optional
         Within what further trials can be made; what they leave open follows the trials so far. `limits.trials` counts
@@ -104,20 +104,20 @@ def further_trials(
     limits = limits or Limits()
     most = limits.trials if "trials" in limits.model_fields_set else MOST_ADDED
     before = now.probability_at(value)
-    plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, reach, before, power=now)
+    plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, target, before, power=now)
     every = conditions(design.trials, limits)
-    if before >= reach or not every:
-        return replace(plan, endless=before)
+    if before >= target or not every:
+        return replace(plan, unlimited=before)
     search = _Search(design, every, now.effect)
     away = abs(value - now.zero)
-    wanted = search.information(()) * (abs(now.size_at(reach) - now.zero) / away) ** 2
+    wanted = search.information(()) * (abs(now.size_at(target) - now.zero) / away) ** 2
     if not math.isfinite(wanted):
         wanted = (FIRST_GUESS / away) ** 2
     for _ in range(ROUNDS):
         chosen, needed = search.fewest(wanted, most // REPLICATES)
-        plan = _judged(design, search, replace(plan, looked_at=len(search.conditions), needed=needed), chosen)
+        plan = _judged(design, search, replace(plan, n_conditions=len(search.conditions), needed=needed), chosen)
         assert plan.power is not None
-        short = abs(plan.power.size_at(reach) - now.zero) / away
+        short = abs(plan.power.size_at(target) - now.zero) / away
         if plan.is_reached or not math.isfinite(short) or len(chosen) >= most // REPLICATES:
             break
         wanted = 1.02 * search.information(chosen) * short**2
@@ -150,7 +150,7 @@ class _Search:
     def _total(self, chosen: Sequence[int]) -> Floats:
         return np.asarray(self.so_far + self.each[list(chosen)].sum(axis=0))
 
-    def endless(self) -> float:
+    def unlimited_information(self) -> float:
         """Information with all conditions made without end."""
         return float(_left((self.so_far + ENDLESS * self.each.sum(axis=0))[None])[0])
 
@@ -262,7 +262,7 @@ def _questions(design: CampaignDesign, added: Sequence[Condition], candidates: t
         has_trace=(*design.has_trace, *(design.has_trace[k] for k in places)),
         candidates=candidates,
     )
-    return planned_questions(extended)[0]
+    return planned_tests(extended)[0]
 
 
 def _wide(asked: MisfitTests, effect: str) -> Floats:
@@ -270,7 +270,7 @@ def _wide(asked: MisfitTests, effect: str) -> Floats:
     fit, sums, problem = asked.fit, asked.products, asked.fit.solution.problem
     blocks = blocks_of(fit, sums, fit.state)
     keys, free, n = sums.n_keys, problem.prior_mean.size, len(blocks)
-    shape = keys + 1 + typical_place(asked, effect)
+    shape = keys + 1 + typical_shape_index(asked, effect)
     systematics = np.arange(keys + 1 + sums.n_shapes, blocks.shape[1])
     columns = np.concatenate([np.arange(keys), systematics, [shape]])
     taken = blocks[:, columns[:, None], columns]
@@ -313,12 +313,14 @@ def _judged(design: CampaignDesign, search: _Search, plan: FurtherTrials, chosen
         for _ in range(REPLICATES):
             trial = replace(condition.trial, name=f"added_{len(trials) + 1}")
             trials.append(AddedTrial(trial, condition.changed, condition.effort == NEW_VINE, probability))
-        if probability >= plan.reach:
+        if probability >= plan.target:
             break
     assert power is not None
-    ratio = math.sqrt(search.endless() / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300))
+    ratio = math.sqrt(
+        search.unlimited_information() / max(search.information(chosen[: len(trials) // REPLICATES]), 1e-300)
+    )
     endless = power.probability_at(power.zero + ratio * (plan.value - power.zero))
-    return replace(plan, trials=tuple(trials), power=power, endless=max(endless, probability))
+    return replace(plan, trials=tuple(trials), power=power, unlimited=max(endless, probability))
 
 
 def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:

@@ -11,11 +11,11 @@ So a size is found with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_
 - The diagnosis also asks that the score exceed what the scatter of single trials allows (Student's t). With the scores
   of single trials independent, s_i ~ N(I_i a, I_i), the mean that is needed, μ > c max(1, t_c r / c) − z₀ with r the
   ratio of both errors, is drawn jointly with z₀; its quantiles replace c + Φ⁻¹(p).
-- The fit without the effect takes a part of it for scatter between trials, which widens σ (`spread_widening`): the
+- The fit without the effect takes a part of it for scatter between trials, which widens σ (`error_inflation`): the
   score x that would be seen at the true spreads must exceed c g(x), g the ratio of the errors.
 - A diagnosis does not count an effect that moves positions by less than their systematic errors, unless it predicts
   left-out conditions better (`contradictions`). So small an effect does that about as often as not: below the size that
-  moves positions so far, the probability counts half (`expected_scores.beyond`).
+  moves positions so far, the probability counts half (`expected_scores.half_power_below`).
 - An effect whose small sizes do nothing is followed at finite sizes, between which μ_j(a) is interpolated.
 
 What an effect is taken for follows from draws of the joint normal distribution at that size.
@@ -32,7 +32,12 @@ from scipy.stats import norm, t
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range
-from vinetrack.diagnosis.expected_scores import beyond, followed_sizes, least_sizes, noiseless_start
+from vinetrack.diagnosis.expected_scores import (
+    half_power_below,
+    noiseless_start,
+    score_ratios,
+    sizes_at_systematic_error,
+)
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
@@ -101,7 +106,7 @@ def power_of(
     -------
     Power
     """
-    joint, widening, least = _joint_draws(questions), spread_widening(questions), least_sizes(questions)
+    joint, widening, least = _joint_draws(questions), error_inflation(questions), sizes_at_systematic_error(questions)
     effects = [
         power
         for response in _responses(questions, curved=curved)
@@ -141,11 +146,15 @@ def effect_power(questions: MisfitTests, name: str) -> EffectPower | None:
     if not responses:
         return None
     return _effect_power(
-        questions, responses[0], _joint_draws(questions), spread_widening(questions), least_sizes(questions)
+        questions,
+        responses[0],
+        _joint_draws(questions),
+        error_inflation(questions),
+        sizes_at_systematic_error(questions),
     )
 
 
-def typical_place(questions: MisfitTests, name: str) -> int:
+def typical_shape_index(questions: MisfitTests, name: str) -> int:
     """The place of the shape that an effect is followed in.
 
     Parameters
@@ -200,7 +209,7 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
         scores = information[places] * sizes[:, None] / root
         if start is not None and not shapes[0].whole:
             unit = float(sizes[0])
-            sizes, bend = followed_sizes(questions, places[0], unit, start)
+            sizes, bend = score_ratios(questions, places[0], unit, start)
             scores = scores[0] * (bend * sizes / unit)[:, None]
         responses.append(
             _Response(effect, shapes[0], places[0], sizes, np.where(np.diag(information) > 0, scores, 0.0))
@@ -245,7 +254,7 @@ def _effect_power(
     needed = np.quantile(_needed_means(questions, place, widening[:, place]), PROBABILITIES)
     steps = np.array([_between(means, response.sizes, mean) for mean in needed])
     if not response.shape.whole and np.isfinite(steps).all():
-        steps = beyond(float(least[response.place]), steps)
+        steps = half_power_below(float(least[response.place]), steps)
     taken_for, alone = _taken_for(questions, response, float(steps[PROBABILITIES.index(0.9)]), joint)
     effect, shape = response.effect, response.shape
     if not effect.parameters:
@@ -302,7 +311,7 @@ def _needed_means(questions: MisfitTests, place: int, widening: Floats) -> Float
     return np.asarray(np.maximum(threshold, by_scatter * ratio) - score)
 
 
-def spread_widening(questions: MisfitTests) -> Floats:
+def error_inflation(questions: MisfitTests) -> Floats:
     """By what factor the error of every shape grows once the fit has taken a part of it for scatter between trials.
 
     The spreads of pressure and B are estimated without the effect. Multiplied by f_P and f_B they are those at which

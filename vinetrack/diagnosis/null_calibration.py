@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.campaign_power import CampaignDesign, as_measured
+from vinetrack.diagnosis.campaign_power import CampaignDesign, with_measurement_errors
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.family_test import family_p_value
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
@@ -55,13 +55,13 @@ LEAST_CHANCE = 1e-12
 
 
 @dataclass(frozen=True)
-class TestChances:
+class CampaignPValues:
     """p-values of the tests of one campaign, by name; `seed` negative for the observed one."""
 
     __test__ = False
 
     seed: int
-    chances: Mapping[str, float]
+    p_values: Mapping[str, float]
     failed: str = ""
 
 
@@ -215,7 +215,7 @@ class NullCalibration:
         }
 
 
-def chances_of(questions: MisfitTests) -> dict[str, float]:
+def p_values_of(questions: MisfitTests) -> dict[str, float]:
     """Return the p-value of each test of a fitted model.
 
     Parameters
@@ -234,7 +234,7 @@ def chances_of(questions: MisfitTests) -> dict[str, float]:
     return dict(zip(TESTS, (family, structure.p, structure.smallest_probe_p, questions.trial_effect_p), strict=True))
 
 
-def null_chances(design: CampaignDesign, seed: int) -> TestChances:
+def null_p_values(design: CampaignDesign, seed: int) -> CampaignPValues:
     """Make one campaign of a design with nothing missing, fit it, and ask every test.
 
     Parameters
@@ -244,7 +244,7 @@ def null_chances(design: CampaignDesign, seed: int) -> TestChances:
 
     Returns
     -------
-    TestChances
+    CampaignPValues
     """
     try:
         questioned = candidates_of(design.to_fit, design.candidates, design.model.user_effects)
@@ -254,14 +254,14 @@ def null_chances(design: CampaignDesign, seed: int) -> TestChances:
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            fitted = initial_fit(design.to_fit, as_measured(design, pairs), questioned, profile=False)
+            fitted = initial_fit(design.to_fit, with_measurement_errors(design, pairs), questioned, profile=False)
             effects, _ = testable(questioned, fitted.predictor.data)
-            return TestChances(seed, chances_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)))
+            return CampaignPValues(seed, p_values_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)))
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
-        return TestChances(seed, {}, f"{type(error).__name__}: {error}")
+        return CampaignPValues(seed, {}, f"{type(error).__name__}: {error}")
 
 
-def calibrated(observed: Mapping[str, float], null: Sequence[TestChances], model: Sequence[str]) -> NullCalibration:
+def calibrate(observed: Mapping[str, float], null: Sequence[CampaignPValues], model: Sequence[str]) -> NullCalibration:
     """Hold the p-values of a diagnosis against those of null campaigns.
 
     Parameters
@@ -276,7 +276,7 @@ def calibrated(observed: Mapping[str, float], null: Sequence[TestChances], model
     """
     given = [campaign for campaign in null if not campaign.failed]
     tests = tuple(
-        CalibratedTest(name, level, observed[name], tuple(campaign.chances[name] for campaign in given))
+        CalibratedTest(name, level, observed[name], tuple(campaign.p_values[name] for campaign in given))
         for name, level in TESTS.items()
     )
     return NullCalibration(tests, len(given), len(null) - len(given), tuple(model))

@@ -236,7 +236,7 @@ class AddedTrial:
 class FurtherTrials:
     """Trials that bring an effect of one size to a wanted probability of being found.
 
-    `before` is the probability with the trials so far; `endless` that with the best of all trials within the limits,
+    `before` is the probability with the trials so far; `unlimited` that with the best of all trials within the limits,
     made without end; `looked_at` counts the conditions. `trials` come in the order in which they help most; empty where
     none is needed, or none helps. `needed` tells how many trials it takes by what they ask for: the rig so far, another
     rig, a new vine. `power` is that of all trials together.
@@ -247,10 +247,10 @@ class FurtherTrials:
     symbol: str
     unit: str
     value: float
-    reach: float
+    target: float
     before: float
-    endless: float = math.nan
-    looked_at: int = 0
+    unlimited: float = math.nan
+    n_conditions: int = 0
     trials: tuple[AddedTrial, ...] = ()
     needed: Mapping[str, int] = field(default_factory=dict)
     power: EffectPower | None = None
@@ -263,7 +263,7 @@ class FurtherTrials:
     @property
     def is_reached(self) -> bool:
         """Whether the wanted probability is reached."""
-        return self.after >= self.reach
+        return self.after >= self.target
 
     def to_json(self) -> dict[str, Any]:
         """As the key `further_trials` of what `vinetrack power --json` writes."""
@@ -272,11 +272,11 @@ class FurtherTrials:
             "parameter": self.parameter,
             "unit": self.unit,
             "value": self.value,
-            "wanted": self.reach,
+            "wanted": self.target,
             "probability_before": self.before,
             "probability_after": self.after,
-            "probability_endless": self.endless,
-            "conditions_looked_at": self.looked_at,
+            "probability_endless": self.unlimited,
+            "conditions_looked_at": self.n_conditions,
             "needed": dict(self.needed),
             "taken_for": dict(self.power.taken_for) if self.power else {},
             "trials": [

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.diagnosis.campaign_power import CampaignDesign, as_measured
+from vinetrack.diagnosis.campaign_power import CampaignDesign, with_measurement_errors
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.power import Rate, SimulatedRates
@@ -23,7 +23,7 @@ from vinetrack.planning.simulated_campaigns import make
 
 
 @dataclass(frozen=True)
-class SimulatedAnswer:
+class SimulatedDiagnosis:
     """What the diagnosis of one simulated campaign said.
 
     `effect` and `value` are what was in it, blank and NaN where nothing was; `failed` is the reason why there is no
@@ -55,7 +55,7 @@ class SimulatedAnswer:
         return " or ".join(self.answer_set) or self.verdict
 
 
-def simulated_answer(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedAnswer:
+def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:
     """Make one campaign of a design and diagnose it from beginning to end.
 
     Parameters
@@ -67,7 +67,7 @@ def simulated_answer(design: CampaignDesign, effect: str, value: float, seed: in
 
     Returns
     -------
-    SimulatedAnswer
+    SimulatedDiagnosis
     """
     begun = time.perf_counter()
     try:
@@ -78,17 +78,17 @@ def simulated_answer(design: CampaignDesign, effect: str, value: float, seed: in
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             answer = diagnose(
-                as_measured(truth, pairs), model=design.to_fit, candidates=design.candidates, ladder=False,
+                with_measurement_errors(truth, pairs), model=design.to_fit, candidates=design.candidates, ladder=False,
                 advice=False, user_effects=design.model.user_effects,
             )  # fmt: skip
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
-        return SimulatedAnswer(effect, value, seed, failed=f"{type(error).__name__}: {error}")
-    return SimulatedAnswer(
+        return SimulatedDiagnosis(effect, value, seed, failed=f"{type(error).__name__}: {error}")
+    return SimulatedDiagnosis(
         effect, value, seed, answer.verdict, answer.answer_set, answer.effects, time.perf_counter() - begun
     )
 
 
-def rates_of(answers: Sequence[SimulatedAnswer], promised: float) -> SimulatedRates:
+def rates_of(answers: Sequence[SimulatedDiagnosis], promised: float) -> SimulatedRates:
     """Count the answers about campaigns with the same effect at the same size.
 
     Parameters

@@ -364,12 +364,12 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 
     size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
     what = f"{plain(plan.effect)} at {plan.symbol} = {size}"
-    if plan.before >= plan.reach:
+    if plan.before >= plan.target:
         return [f"{what} is detected with {percent(plan.before)} power by these trials: none need be added."]
-    if not plan.looked_at:
+    if not plan.n_conditions:
         return [f"{what}: no further trial within `limits` can be made and filmed."]
     count = len(plan.trials)
-    lines = [f"To detect {what} with {percent(plan.reach)} power ({percent(plan.before)} with the trials so far):"]
+    lines = [f"To detect {what} with {percent(plan.target)} power ({percent(plan.before)} with the trials so far):"]
     rows, done = [], 0
     while done < count:
         added = plan.trials[done]
@@ -390,13 +390,13 @@ def further_lines(plan: FurtherTrials) -> list[str]:
         head = ("trials", "vine", "pressure", "payload", "new", "power then")
         lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
     if not plan.is_reached:
-        if plan.endless < plan.reach:
+        if plan.unlimited < plan.target:
             lines.append(
-                f"No number of trials within `limits` suffices: with unlimited replicates of all {plan.looked_at} "
-                f"conditions considered, the power would be {percent(plan.endless)}."
+                f"No number of trials within `limits` suffices: with unlimited replicates of all {plan.n_conditions} "
+                f"conditions considered, the power would be {percent(plan.unlimited)}."
             )
         else:
-            lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.endless)} power.")
+            lines.append(f"{count} further trials do not suffice; more would, up to {percent(plan.unlimited)} power.")
     changes = {"with a new vine"} if any(added.new_vine for added in plan.trials) else set()
     changes |= {"with another rig"} if any(added.changed for added in plan.trials) else set()
     alternatives = [

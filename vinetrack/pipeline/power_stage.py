@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
-from vinetrack.diagnosis.null_calibration import NullCalibration, calibrated, chances_of
+from vinetrack.diagnosis.null_calibration import NullCalibration, calibrate, p_values_of
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
@@ -397,11 +397,11 @@ def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCal
         questioned = candidates_of(model, candidates, measured.user_effects)
         fitted = initial_fit(model, measured.pairs, questioned, profile=False)
     effects, _ = testable(questioned, fitted.predictor.data)
-    observed = chances_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND))
+    observed = p_values_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND))
     path = asked.answers or _answers_file(asked.target)
     path = path.with_name(f"{path.stem}_calibration.csv")
     how = Simulation(asked.calibrate, asked.first_seed, asked.jobs, path)
-    return calibrated(observed, simulate_null_tests(design_of_fit(fitted, candidates), how), fitted.model.names)
+    return calibrate(observed, simulate_null_tests(design_of_fit(fitted, candidates), how), fitted.model.names)
 
 
 def _answers_file(target: Path) -> Path:

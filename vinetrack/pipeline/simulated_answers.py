@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vinetrack.diagnosis.campaign_power import CampaignDesign
-from vinetrack.diagnosis.null_calibration import TESTS, TestChances, null_chances
-from vinetrack.diagnosis.simulated_power import SimulatedAnswer, simulated_answer
+from vinetrack.diagnosis.null_calibration import TESTS, CampaignPValues, null_p_values
+from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis, simulated_diagnosis
 from vinetrack.pipeline.pool import map_unordered
 
 Task = tuple[CampaignDesign, str, float, int]
@@ -39,7 +39,7 @@ class Simulation:
 
 def simulate_answers(
     design: CampaignDesign, wanted: Sequence[tuple[str, float]], how: Simulation
-) -> dict[tuple[str, str, int], SimulatedAnswer]:
+) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
     """Diagnose simulated campaigns from beginning to end.
 
     Parameters
@@ -75,7 +75,7 @@ def simulate_answers(
     return kept
 
 
-def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[TestChances]:
+def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[CampaignPValues]:
     """Ask every test of simulated campaigns in which nothing is missing.
 
     Parameters
@@ -85,21 +85,21 @@ def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[TestCha
 
     Returns
     -------
-    list of TestChances
+    list of CampaignPValues
         One a campaign, in the order of the seeds.
     """
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
-    kept = {chances.seed: chances for chances in _stored_p_values(how.path, mark)}
+    kept = {campaign.seed: campaign for campaign in _stored_p_values(how.path, mark)}
     tasks = [(design, seed) for seed in how.seeds if seed not in kept]
     bar: Progress[None]
     with progress(how.campaigns, "calibrating", unit="campaign") as bar:
         bar.advance(how.campaigns - len(tasks))
-        for chances in map_unordered(_test_task, tasks, how.jobs):
-            values = [f"{chances.chances[name]:.6g}" if chances.chances else "" for name in TESTS]
-            _append_row(how.path, P_VALUE_COLUMNS, [mark, chances.seed, *values, chances.failed])
-            kept[chances.seed] = chances
+        for campaign in map_unordered(_test_task, tasks, how.jobs):
+            values = [f"{campaign.p_values[name]:.6g}" if campaign.p_values else "" for name in TESTS]
+            _append_row(how.path, P_VALUE_COLUMNS, [mark, campaign.seed, *values, campaign.failed])
+            kept[campaign.seed] = campaign
             bar.advance()
     return [kept[seed] for seed in how.seeds]
 
@@ -118,12 +118,12 @@ def size_key(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.9g}"
 
 
-def _diagnose_task(task: Task) -> SimulatedAnswer:
-    return simulated_answer(*task)
+def _diagnose_task(task: Task) -> SimulatedDiagnosis:
+    return simulated_diagnosis(*task)
 
 
-def _test_task(task: tuple[CampaignDesign, int]) -> TestChances:
-    return null_chances(*task)
+def _test_task(task: tuple[CampaignDesign, int]) -> CampaignPValues:
+    return null_p_values(*task)
 
 
 def fingerprint(design: CampaignDesign) -> str:
@@ -148,7 +148,7 @@ def fingerprint(design: CampaignDesign) -> str:
     return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
 
 
-def stored_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
+def stored_answers(path: Path, mark: str) -> list[SimulatedDiagnosis]:
     """Answers that an earlier run has kept about this design; those about others are passed over.
 
     Parameters
@@ -158,10 +158,10 @@ def stored_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
 
     Returns
     -------
-    list of SimulatedAnswer
+    list of SimulatedDiagnosis
     """
     return [
-        SimulatedAnswer(
+        SimulatedDiagnosis(
             effect=row["effect"],
             value=float(row["value"] or "nan"),
             seed=int(row["seed"]),
@@ -175,10 +175,10 @@ def stored_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
     ]
 
 
-def _stored_p_values(path: Path, mark: str) -> list[TestChances]:
+def _stored_p_values(path: Path, mark: str) -> list[CampaignPValues]:
     """Chances that an earlier run has kept about this design."""
     return [
-        TestChances(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
+        CampaignPValues(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
         for row in _stored_rows(path, mark)
     ]
 
@@ -191,7 +191,7 @@ def _stored_rows(path: Path, mark: str) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
 
 
-def _row(mark: str, answer: SimulatedAnswer) -> list[object]:
+def _row(mark: str, answer: SimulatedDiagnosis) -> list[object]:
     seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
     return [
         mark, answer.effect, size_key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
