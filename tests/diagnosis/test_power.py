@@ -16,8 +16,8 @@ from vinetrack.diagnosis import expected_scores
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_tests
 from vinetrack.diagnosis.expected_scores import (
     NoiselessStart,
-    beyond,
     fitted_without,
+    half_power_below,
     noiseless_start,
     residual_displacements,
     score_ratio,
@@ -210,12 +210,12 @@ def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories
 
 def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
     sizes = 1 + 0.1 * norm.ppf(PROBABILITIES)
-    found = beyond(1.12, sizes)
+    found = half_power_below(1.12, sizes)
     assert found[PROBABILITIES.index(0.9)] == pytest.approx(sizes[PROBABILITIES.index(0.9)])
     assert found[PROBABILITIES.index(0.4)] == pytest.approx(sizes[PROBABILITIES.index(0.8)])
     assert found[PROBABILITIES.index(0.6)] == pytest.approx(1.12)
-    assert beyond(0.0, sizes) == pytest.approx(sizes)
-    assert beyond(1.12, -sizes) == pytest.approx(-found)
+    assert half_power_below(0.0, sizes) == pytest.approx(sizes)
+    assert half_power_below(1.12, -sizes) == pytest.approx(-found)
 
 
 def test_an_effect_is_followed_at_further_sizes_only_where_its_score_bends(
