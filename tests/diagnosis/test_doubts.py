@@ -148,7 +148,7 @@ def test_errors_that_few_trials_feel_count_as_if_every_trial_had_a_column_for_th
         fitted, fit_columns(fitted), answers, Systematics([column[:, :-1] for column in wide], every, felt.count)
     )
     one_by_one = scores_of(fitted, dense)
-    for name in ("score", "information", "scores", "informations"):
+    for name in ("score", "information", "trial_scores", "trial_informations"):
         expected = getattr(one_by_one, name)
         assert np.allclose(
             getattr(questioned.scores, name), expected, rtol=1e-6, atol=1e-9 * np.max(np.abs(expected))

@@ -25,7 +25,7 @@ from vinetrack.diagnosis.misfit_tests import (
     SINGLE_PROBE_LEVEL,
     MisfitTests,
 )
-from vinetrack.diagnosis.score_test import Scores, _beside_systematics, _systematics_turn
+from vinetrack.diagnosis.score_test import Scores, _marginalisation, _marginalised
 from vinetrack.diagnosis.structure_test import Structure, structure_from_scores
 from vinetrack.inference.fit_result import Number
 
@@ -157,7 +157,11 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
         unit = scores(draw, 12, 1, sizes=true * 300)
         scale = np.array([[300.0]])
         of = Scores(
-            unit.score * 300, unit.information * scale**2, unit.scores * 300, unit.informations * scale**2, 11.0
+            unit.score * 300,
+            unit.information * scale**2,
+            unit.trial_scores * 300,
+            unit.trial_informations * scale**2,
+            11.0,
         )
         answers = EffectSensitivities((shape,), [], ())
         fit: Any = None
@@ -172,13 +176,13 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
 def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     together = scores(np.random.default_rng(20609), 12, 5)
-    turn = _systematics_turn(together.information, 3)
-    score, information = _beside_systematics(together.score, together.information, turn)
+    turn = _marginalisation(together.information, 3)
+    score, information = _marginalised(together.score, together.information, turn)
     A, B, C = together.information[:3, :3], together.information[:3, 3:], together.information[3:, 3:]
     inner = np.linalg.inv(C + np.eye(2))
     assert information == pytest.approx(A - B @ inner @ B.T)
     assert score == pytest.approx(together.score[:3] - B @ inner @ together.score[3:])
-    assert (together.scores @ turn).sum(axis=0) == pytest.approx(score)
+    assert (together.trial_scores @ turn).sum(axis=0) == pytest.approx(score)
 
 
 def known_fit(log_likelihood: float, numbers: tuple[Number, ...] = (), covariance: Floats | None = None) -> Any:

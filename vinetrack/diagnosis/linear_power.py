@@ -297,7 +297,7 @@ def _needed_means(questions: MisfitTests, place: int, widening: Floats) -> Float
     passes = SCORES / widening >= limit
     threshold = float(SCORES[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
-    single = np.maximum(scores.informations[:, place, place], 0.0)
+    single = np.maximum(scores.trial_informations[:, place, place], 0.0)
     trials, total = single.size, float(single.sum())
     if trials < FEWEST_CLUSTERS or not total > 0:
         return threshold - draw.standard_normal(DRAWS)

@@ -112,15 +112,15 @@ def structure_from_scores(scores: Scores) -> Structure:
     # In the principal directions the scores are uncorrelated and have variance 1 by the noise model.
     z = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
     directions = (vectors / root[informative][:, None])[:, keep] / np.sqrt(values[keep])
-    trial_z = scores.scores[:, informative] @ directions
-    trial_informations = scores.informations[:, informative][:, :, informative]
+    trial_z = scores.trial_scores[:, informative] @ directions
+    trial_informations = scores.trial_informations[:, informative][:, :, informative]
     explained = np.einsum("jk,njl,lk->nk", directions, trial_informations, directions) * z
     robust = cluster_variance(trial_z - explained, scores.degrees)
     chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
     # A probe to which few trials respond has as few degrees of freedom (effective number of trials).
-    by_trial = np.einsum("njj->nj", scores.informations)[:, informative]
+    by_trial = np.einsum("njj->nj", scores.trial_informations)[:, informative]
     n_effective = by_trial.sum(axis=0) ** 2 / np.maximum(np.sum(by_trial**2, axis=0), 1e-300)
     p_values = 2 * t.sf(np.abs(scores.z[informative]), np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0)))
     smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
