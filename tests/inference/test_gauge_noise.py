@@ -12,8 +12,8 @@ from lsoda_vine import as_track
 
 import vinetrack as vt
 from vinetrack.inference.gauge_clock import Growth, gauge_clocks
-from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
-from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of, noises_of
+from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
+from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of_traces, white_noise_sd
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 PASSED_PA = 9.5e3 + 22.0  # half-way between two samples
@@ -23,7 +23,7 @@ LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
 def without_noise(pressure_Pa: np.ndarray, growth_m: np.ndarray | None = None) -> np.ndarray:
     """A trace alone; the tip stands still where no growth is given."""
     growth_m = np.zeros(pressure_Pa.size) if growth_m is None else growth_m
-    (quiet,) = quiet_traces([as_track(1e-3 * np.arange(pressure_Pa.size), growth_m, pressure_Pa)])
+    (quiet,) = denoised_traces([as_track(1e-3 * np.arange(pressure_Pa.size), growth_m, pressure_Pa)])
     assert quiet is not None
     return quiet.pressure_Pa
 
@@ -34,7 +34,7 @@ def test_most_of_the_noise_goes(sigma_Pa: float):
     lefts = []
     for seed in range(10):
         noisy = LET_DOWN + sigma_Pa * np.random.default_rng(seed).standard_normal(TIMES_S.size)
-        assert noise_of(noisy) == pytest.approx(sigma_Pa, rel=0.15)
+        assert white_noise_sd(noisy) == pytest.approx(sigma_Pa, rel=0.15)
         lefts.append(without_noise(noisy) - LET_DOWN)
     assert np.sqrt(np.mean(np.square(lefts))) < 0.5 * sigma_Pa
     assert np.max(np.abs(lefts)) < 5 * sigma_Pa
@@ -107,7 +107,7 @@ def test_the_clock_of_a_gauge_is_the_same_in_every_trial_and_told_by_all_togethe
         traces.append(np.interp(np.arange(TIMES_S.size), read_at, readings_Pa))
         growths.append(Growth(growth_m, 1e-3))
     read = gauge_readings(traces)
-    noises = noises_of(read, 0.0)
+    noises = noise_of_traces(read, 0.0)
     told = gauge_clocks(read, growths, noises)
     alone = [gauge_clocks(read[i : i + 1], growths[i : i + 1], noises[i : i + 1])[0] for i in range(12)]
     off = np.array([clock.offset - offset for clock in told if clock is not None])
@@ -132,7 +132,7 @@ def test_a_chamber_empties_as_all_trials_together_tell(exponent: float):
         tracks.append(as_track(TIMES_S, growth_m, pressure_Pa + 5.0 * rng.standard_normal(TIMES_S.size)))
         true_Pa.append(pressure_Pa)
     off = np.array(
-        [trace.pressure_Pa - true for trace, true in zip(quiet_traces(tracks), true_Pa, strict=True) if trace]
+        [trace.pressure_Pa - true for trace, true in zip(denoised_traces(tracks), true_Pa, strict=True) if trace]
     )
     assert off.shape == (20, TIMES_S.size)
     assert np.max(np.abs(np.mean(off, axis=0))) < 1.0
@@ -149,7 +149,7 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
         readings_Pa += 10.0 * np.random.default_rng(200 + seed).standard_normal(read_at.size)
         tracks.append(as_track(TIMES_S, growth_m, np.interp(np.arange(TIMES_S.size), read_at, readings_Pa)))
         true_Pa.append(pressure_Pa)
-    quiet = quiet_traces(tracks)
+    quiet = denoised_traces(tracks)
     off_Pa = [trace.pressure_Pa - pressure_Pa for trace, pressure_Pa in zip(quiet, true_Pa, strict=True) if trace]
     assert len(off_Pa) == 12
     assert np.max(cut_Pa) > 50.0
@@ -167,7 +167,7 @@ def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
     growth_m = np.cumsum(np.linspace(0.0, 1.0, 150)) * 2e-3
     alone = [without_noise(pressure_Pa, growth_m) for pressure_Pa in noisy]
     assert sum(np.ptp(curve) > 0 for curve in alone) > 3
-    together = quiet_traces([as_track(TIMES_S[:150], growth_m, pressure_Pa) for pressure_Pa in noisy])
+    together = denoised_traces([as_track(TIMES_S[:150], growth_m, pressure_Pa) for pressure_Pa in noisy])
     bent = sum(trace is None or np.ptp(trace.pressure_Pa) > 1e-6 for trace in together)
     # Of sixty traces each is refused every curve by chance once in a few hundred, and left to straight lines.
     assert bent <= 2
@@ -176,7 +176,7 @@ def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
 def test_errors_that_are_stated_cover_those_that_are_made():
     """Of chambers that empty: what is left of the noise, along each error, is as large as stated."""
     made = [emptied(seed) for seed in range(40)]
-    quiet = quiet_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
+    quiet = denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
     sizes = []
     for trace, (pressure_Pa, _, _) in zip(quiet, made, strict=True):
         assert trace is not None
@@ -225,7 +225,7 @@ def test_readings_are_told_though_samples_were_rounded_afterwards(per_reading: f
     frames = np.arange(int(read_at[0]) + 1, int(read_at[-1]))
     traces = [digit_Pa * np.round(np.interp(frames, read_at, each) / digit_Pa) for each in readings_Pa]
     told = gauge_readings(traces)
-    assert np.mean([noise.sigma_Pa for noise in noises_of(told, 0.0)]) == pytest.approx(100.0, rel=0.15)
+    assert np.mean([noise.sigma_Pa for noise in noise_of_traces(told, 0.0)]) == pytest.approx(100.0, rel=0.15)
     for trace, each in zip(traces, told, strict=True):
         assert each.places.size < 1.1 * trace.size / per_reading + 2
         off_Pa = np.interp(np.arange(trace.size), each.places, each.values_Pa) - trace
@@ -251,10 +251,10 @@ def test_readings_in_coarse_steps_are_told_though_many_are_alike(per_reading: fl
     assert np.max(np.abs(places - read_at[which])) < 1.0
     np.testing.assert_array_equal(held.values_Pa, readings_Pa[which])
     rounded_Pa = np.hypot(60.0, 100.0 / np.sqrt(12))
-    assert noises_of([held], 0.0)[0].sigma_Pa == pytest.approx(rounded_Pa, rel=0.2)
+    assert noise_of_traces([held], 0.0)[0].sigma_Pa == pytest.approx(rounded_Pa, rel=0.2)
     # Lines that stand still for several readings are one: the noise is that of readings that differ.
     assert joined.places.size > 0.6 * read_at.size
-    assert rounded_Pa < noises_of([joined], 0.0)[0].sigma_Pa < 1.6 * rounded_Pa
+    assert rounded_Pa < noise_of_traces([joined], 0.0)[0].sigma_Pa < 1.6 * rounded_Pa
 
 
 def test_a_fall_told_in_steps_coarser_than_its_noise_is_smooth_and_known_to_a_part_of_a_step():
@@ -267,7 +267,7 @@ def test_a_fall_told_in_steps_coarser_than_its_noise_is_smooth_and_known_to_a_pa
         told_Pa = 50.0 * np.round((pressure_Pa + 5.0 * draw.standard_normal(400)) / 50.0)
         tracks.append(as_track(TIMES_S[:400], growth_m, told_Pa))
     off, stated = [], []
-    for quiet, pressure_Pa in zip(quiet_traces(tracks), true_Pa, strict=True):
+    for quiet, pressure_Pa in zip(denoised_traces(tracks), true_Pa, strict=True):
         assert quiet is not None
         off.append(quiet.pressure_Pa - pressure_Pa)
         stated.append(np.hypot(np.linalg.norm(quiet.errors_Pa, axis=1), quiet.mean_error_Pa))
@@ -280,7 +280,7 @@ def test_readings_that_are_all_alike_but_a_few_break_nothing():
     told_Pa = np.full(60, 20e3)
     told_Pa[30] = 20.1e3
     assert noise_correlation([told_Pa] * 4) == 0.0
-    (quiet,) = quiet_traces([as_track(TIMES_S[:60], TIMES_S[:60], told_Pa)])
+    (quiet,) = denoised_traces([as_track(TIMES_S[:60], TIMES_S[:60], told_Pa)])
     assert quiet is not None
     assert np.isfinite(quiet.pressure_Pa).all()
 
@@ -308,7 +308,7 @@ def test_noise_behind_a_filter_is_told_by_how_it_differs_over_four_readings():
             traces.append(20e3 * (1 + TIMES_S[:300] / 0.4) ** -0.3 + 100.0 * noise)
         told = noise_correlation(traces)
         assert told == pytest.approx(rho, abs=0.05)
-        sigmas = [noise.sigma_Pa for noise in noises_of(gauge_readings(traces), told)]
+        sigmas = [noise.sigma_Pa for noise in noise_of_traces(gauge_readings(traces), told)]
         assert np.mean(sigmas) == pytest.approx(100.0 * np.sqrt(1 - rho**2), rel=0.1)
 
 
@@ -322,11 +322,11 @@ def test_of_steady_pressures_hardly_any_course_is_left(per_reading: int):
         read_at = np.arange(-1.0, frames.size + per_reading, per_reading)
         readings_Pa = 8e3 + 100.0 * draw.standard_normal(read_at.size)
         tracks.append(as_track(frames / 500, frames**2 * 1e-6, np.interp(frames, read_at, readings_Pa)))
-    off = [trace.pressure_Pa - 8e3 for trace in quiet_traces(tracks) if trace is not None]
+    off = [trace.pressure_Pa - 8e3 for trace in denoised_traces(tracks) if trace is not None]
     assert len(off) == 30
     # A slope that is not quite unlikely has its share, a tenth of the 200 Pa that it would be.
     assert sum(float(np.ptp(each)) > 20.0 for each in off) <= 1
-    stated = [trace.mean_error_Pa for trace in quiet_traces(tracks) if trace is not None]
+    stated = [trace.mean_error_Pa for trace in denoised_traces(tracks) if trace is not None]
     assert 0.7 < np.sqrt(np.mean((np.array([each.mean() for each in off]) / stated) ** 2)) < 1.4
 
 
@@ -334,15 +334,15 @@ def test_a_pressure_goes_on_beyond_its_end_along_its_last_line_but_not_below_tha
     times_s = np.linspace(0.0, 0.2, 201)
     falls = np.where(times_s < 0.1, 30e3, 30e3 - 50e3 * (times_s - 0.1))
     errors = np.column_stack([np.full(201, 20.0), 100 * times_s])
-    longer = QuietTrace(times_s, falls, 5.0, errors).extended()
+    longer = DenoisedTrace(times_s, falls, 5.0, errors).extended()
     assert longer.time_s[:-1] == pytest.approx(times_s)
     assert longer.time_s[-1] == pytest.approx(0.24)
     assert longer.pressure_Pa[-1] == pytest.approx(25e3 - 50e3 * 0.04)
     assert longer.errors_Pa[-1] == pytest.approx([20.0, 24.0])
     assert longer.mean_error_Pa == 5.0
-    let_out = QuietTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
+    let_out = DenoisedTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
     assert let_out.pressure_Pa[-1] == 0.0
-    level = QuietTrace(times_s, np.full(201, 2e4), 0.0, np.zeros((201, 0))).extended()
+    level = DenoisedTrace(times_s, np.full(201, 2e4), 0.0, np.zeros((201, 0))).extended()
     assert level.pressure_Pa[-1] == pytest.approx(2e4)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
-from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
+from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
 from vinetrack.tracks.smoothed_positions import Smoothing
 
@@ -180,7 +180,7 @@ Pairs = Iterable[tuple[Trial, Track]]
 def prepare_trial(
     trial: Trial,
     track: Track,
-    quiet: QuietTrace | None = None,
+    quiet: DenoisedTrace | None = None,
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
 ) -> FitTrial:
@@ -190,8 +190,8 @@ def prepare_trial(
     ----------
     trial : row of the sheet.
     track : its positions.
-    quiet : QuietTrace, optional
-        Its denoised pressure from `quiet_traces` of the whole campaign; by default from this track alone.
+    quiet : DenoisedTrace, optional
+        Its denoised pressure from `denoised_traces` of the whole campaign; by default from this track alone.
     smoothing : Smoothing, optional
         How its positions were smoothed; of the points that a window correlates, one is kept.
     rounding_m : float, m
@@ -245,7 +245,7 @@ def prepare_trial(
             f"{moving} usable point{'s' * (moving != 1)} in motion, at least {FEWEST_MOVING} are needed: film faster,"
             " or see in its overlay what hides the edge"
         )
-    quiet = quiet or quiet_traces([track])[0]
+    quiet = quiet or denoised_traces([track])[0]
     extended = None if quiet is None else quiet.extended()
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
@@ -289,7 +289,7 @@ def _position_systematic_m(trial: Trial) -> float:
     return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
-def _gauge_error(quiet: QuietTrace, moving_s: Floats) -> float:
+def _gauge_error(quiet: DenoisedTrace, moving_s: Floats) -> float:
     """Relative error of the denoised pressure that is constant over the motion."""
     in_motion = (quiet.time_s >= moving_s[0]) & (quiet.time_s <= moving_s[-1])
     typical_Pa = abs(float(np.median(quiet.pressure_Pa[in_motion]))) if in_motion.any() else math.nan

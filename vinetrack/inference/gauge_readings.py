@@ -1,9 +1,9 @@
-"""What a gauge read, and the noise of its readings.
+"""The readings of a pressure gauge behind a recorded trace, and their noise.
 
-A gauge that is read a hundred times a second has fewer readings than a film has frames. Between them a trace is filled
-up by straight lines or by repeating the last value, and its noise is no longer independent from frame to frame; nor is
-that of a gauge behind a filter, or what rounding to coarse steps leaves of a quiet pressure. Each would pass for a
-pressure that wanders, which a light vine follows.
+A gauge that is read a hundred times a second has fewer readings than a film has frames. Between them the trace is
+interpolated linearly or repeats the last value (sample and hold), so its noise is not independent from frame to frame.
+The same holds for a gauge behind a filter, and for the error left by rounding a quiet pressure to coarse steps. Each
+would look like a fluctuating pressure, which a light vine follows.
 """
 
 from __future__ import annotations
@@ -20,77 +20,78 @@ from vinetrack.core.records import Floats
 from vinetrack.inference.whitening import whiten
 from vinetrack.tracks.position_noise import rough_noise
 
-STRAIGHT = 1e-9
-"""Part of the largest pressure by which samples may be off a straight line that was drawn between readings, if no last
-digit is coarser. Derived: a million times the rounding of double precision."""
+EXACT_TOLERANCE = 1e-9
+"""Deviation of samples from a line drawn between readings, relative to the largest pressure, if the last digit is not
+coarser. Derived: a million times the rounding of double precision."""
 
-FILLED = 0.25
-"""Part of the samples that lie on a line through two others from which a trace is taken for filled up. Chosen: of
-three samples a reading a third do, of white noise none; at half a trace of which an eighth stands still is
-taken for one, at twice a gauge of two fifths of the frame rate is not seen."""
+INTERPOLATED_PART = 0.25
+"""Fraction of samples on a line through two others above which a trace counts as interpolated. Chosen: with three
+samples per reading a third do, of white noise none; at half, a trace of which an eighth stands still counts as
+interpolated; at twice, a gauge at two fifths of the frame rate is not recognised."""
 
-DIGITS = 2.0
-"""Last digits by which readings found in traces scatter at least, in the median; else they are none, since any samples
-rounded to a coarse digit lie on lines. Measured on 400 samples at 2.2 to 40 a reading: noise without readings scatters
-by 1.1 digits at most where every trace seems filled up, readings of two digits of noise and more by 1.6. At half noise
-of a digit is taken for readings; at twice readings with noise of three digits are taken for samples."""
+LEAST_SCATTER_DIGITS = 2.0
+"""Least median scatter, in last digits, of the readings found in traces; below it they are not accepted, since any
+samples rounded to a coarse digit lie on lines. Measured on 400 samples at 2.2 to 40 per reading: noise without readings
+scatters by at most 1.1 digits where every trace seems interpolated, readings with noise of two digits and more by 1.6.
+At half, noise of one digit is taken for readings; at twice, readings with noise of three digits are taken for
+samples."""
 
-BEAT_OFF, BEAT_CHANCE = 0.75, 1e-4
-"""Samples by which a change may be off the even beat of a gauge, and the chance of changes at random to keep to one.
-Derived: a reading shows first up to a sample later, half a sample either way, and the beat that is fitted to few of
-them is off by half of that. Chosen: one trace in ten thousand; at half and at twice a gauge of five samples a reading
-must change half a time more or less often."""
+PERIOD_TOLERANCE, PERIOD_FALSE_ALARM = 0.75, 1e-4
+"""Samples by which a change may deviate from the even sampling period of a gauge, and the probability that random
+changes are that regular. Derived: a reading shows up to one sample late, half a sample either way, and a period fitted
+to few of them is off by half of that. Chosen: one trace in ten thousand; at half and at twice, a gauge of five samples
+per reading must change half a time more or less often."""
 
-SEEN = 0.25
-"""Part of a line that must show at an end of a trace for the reading that it leads to. Chosen: a line through rounded
-samples is then known to four digits there; at half to eight, at twice the noise of one reading more is lost of every
-other trace."""
+LEAST_LINE_PART = 0.25
+"""Fraction of a line that must be visible at an end of a trace to determine the reading that it leads to. Chosen: a
+line through rounded samples is then known to four digits there; at half to eight; at twice, one more reading of noise
+is lost in every other trace."""
 
-QUIET = 1e-4
-"""Noise below this part of the median pressure is rounding, and left as it is. Chosen: a tenth of the last digit that
-pressure gauges print."""
+NEGLIGIBLE_NOISE = 1e-4
+"""Noise below this fraction of the median pressure is rounding, and is not removed. Chosen: a tenth of the last digit
+that pressure gauges print."""
 
-FEWEST = 9
-"""Samples below which a trace does not tell its noise. Derived: twice the degrees of freedom of a cubic, and one."""
+FEWEST_SAMPLES = 9
+"""Samples below which a trace does not determine its noise. Derived: twice the degrees of freedom of a cubic, and
+one."""
 
 FEWEST_BLOCKS = 4
-"""Blocks at least into which a trace in coarse steps is parted, and samples at least in each. Chosen: four tell a slope
-from a bend; at half a pressure that falls by less than a step is a line at most, at twice its means hang together.
-Traces of shorter blocks are left as they are."""
+"""Least number of blocks into which a trace in coarse steps is divided, and least number of samples in each. Chosen:
+four distinguish a slope from a bend; at half, a pressure that falls by less than a step is a line at most; at twice,
+the block means are correlated. Traces with shorter blocks are left unchanged."""
 
-KNOWN = 1e6
-"""Degrees of freedom of a noise that is derived. Derived: as good as endless."""
+DERIVED_DEGREES = 1e6
+"""Degrees of freedom of a noise that is derived instead of estimated. Derived: practically infinite."""
 
 FEWEST_WITH_OTHERS = 3
-"""Samples below which a trace is left as it is where others tell the noise. Derived: a mean, and two to test it by."""
+"""Samples below which a trace is left unchanged although other traces determine the noise. Derived: a mean, and two to
+test it."""
 
-CLIPPED, KEPT, CLIPPED_ROUNDS = 3.0, 0.9950, 3
-"""Standard deviations at which differences are clipped for the noise, what that leaves of the variance of normal noise
-(derived: 0.9707 + 9 · 0.0027), and rounds, of which the last changes it by 1e-4. Chosen: on 2,000 traces of 300
-samples it errs by 6.2 %, at 2 by 6.4 %; a corner of ten standard deviations raises it by 1.2 %, at 4 by 1.7 %."""
+CLIP_SIGMAS, VARIANCE_KEPT, CLIP_ROUNDS = 3.0, 0.9950, 3
+"""Standard deviations at which differences are clipped in the noise estimate, the part of the variance of normal noise
+that remains (derived: 0.9707 + 9 · 0.0027), and iterations, of which the last changes it by 1e-4. Chosen: on 2,000
+traces of 300 samples its error is 6.2 %, with clipping at 2 6.4 %; a corner of ten standard deviations raises it by 1.2
+%, with clipping at 4 by 1.7 %."""
 
 NOISE_DEGREES = 2 / 4.62
-"""Degrees of freedom of the variance of the noise per sample. Derived: neighbouring third differences are correlated by
+"""Degrees of freedom of the noise variance per sample. Derived: neighbouring third differences are correlated by
 -15/20, 6/20 and -1/20, so that the relative variance of their mean square is 2 (1 + 2 · 0.655) / n = 4.62 / n."""
 
-ALIKE = 20.0
-"""Degrees of freedom that the other traces of a campaign add to what a trace tells of its noise. Chosen: one gauge
-reads them all; as much as 46 readings of its own. At half the noise of short traces is what it is by chance, at twice a
-gauge whose noise grows with the pressure is misjudged more."""
+DEGREES_FROM_OTHERS = 20.0
+"""Degrees of freedom that the other traces of a campaign add to the noise of a trace. Chosen: one gauge reads them all;
+as much as 46 readings of its own. At half, the noise estimate of short traces is dominated by chance; at twice, a gauge
+whose noise grows with the pressure is misjudged more."""
 
-APART, SURELY_CORRELATED, MOST_CORRELATED = 4, 3.0, 0.97
-"""How many readings apart noise is held against that of neighbours, from how many standard deviations it is taken for
-correlated, and the largest correlation. Chosen: 4 apart noise of a correlation of 0.5 is as good as independent, 8
-apart pressures move as far on their own; 3 are a chance of 1e-3; a correlation of 0.97 lasts for 33 readings, beyond
-which noise and the course of a pressure are one."""
+COMPARED_LAG, CORRELATION_SIGMAS, LARGEST_CORRELATION = 4, 3.0, 0.97
+"""Lag at which noise is compared with that of neighbouring readings, standard deviations from which it counts as
+correlated, and the largest correlation. Chosen: at lag 4, noise of correlation 0.5 is practically independent, while at
+lag 8 pressures themselves move as far; 3 standard deviations have a probability of 1e-3; a correlation of 0.97 lasts
+for 33 readings, beyond which noise and pressure changes cannot be separated."""
 
 
 @dataclass(frozen=True)
 class GaugeNoise:
-    """Noise of a gauge: what is new in a reading, Pa, how surely that is known, correlation of neighbours.
-
-    `degrees` are the degrees of freedom of its variance.
-    """
+    """Noise of a gauge: innovation standard deviation, Pa; degrees of freedom of its variance; lag-one correlation."""
 
     sigma_Pa: float
     degrees: float
@@ -99,11 +100,11 @@ class GaugeNoise:
 
 @dataclass(frozen=True)
 class Readings:
-    """What a gauge read in the course of a trace, Pa, and where, in samples from its first; both of shape (n,).
+    """Readings of a gauge during a trace, Pa, and their places, in samples from the first; both of shape (n,).
 
-    `rounding_Pa` is the standard deviation that rounding leaves in each, 0 where nothing is rounded. Where it is
-    `all_noise`, what the readings scatter by tells nothing of it. Where readings are means of blocks of samples, these
-    begin and end at `edges`, shape (n + 1,).
+    `rounding_Pa` is the standard deviation of the rounding error, 0 where nothing is rounded. Where the readings are
+    `all_noise`, their scatter does not determine the noise. Where they are means of blocks of samples, `edges`, shape
+    (n + 1,), are the limits of the blocks.
     """
 
     places: Floats
@@ -113,7 +114,7 @@ class Readings:
     edges: NDArray[np.intp] | None = None
 
     def means_of(self, curves: Floats) -> Floats:
-        """Means over the blocks of curves at all samples, where the readings are such means.
+        """Block means of curves given at all samples, where the readings are such means.
 
         Parameters
         ----------
@@ -130,39 +131,39 @@ class Readings:
 
 
 def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
-    """Readings of a gauge: the samples of a trace, or those among them between which it was filled up.
+    """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held.
 
     Parameters
     ----------
     traces : sequence of arrays, shape (n,), Pa
-        Samples of one gauge, evenly spaced, perhaps rounded after they were filled up.
+        Evenly spaced samples of one gauge, possibly rounded after interpolation.
 
     Returns
     -------
     list of Readings
-        Their places increase; the first and the last may have been read before and after the trace.
+        Their places increase; the first and the last may lie before and after the trace.
     """
-    told = [_filled(pressure_Pa) for pressure_Pa in traces]
-    in_digits = [digits for _, digits in filter(None, told)]
-    # Where samples are rounded to more than they are noisy by, lines run through them for no other reason.
-    filled = bool(in_digits) and float(np.median(in_digits)) >= DIGITS
+    candidates = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
+    scatter_digits = [digits for _, digits in filter(None, candidates)]
+    # Samples rounded to steps coarser than their noise lie on lines for that reason alone.
+    interpolated = bool(scatter_digits) and float(np.median(scatter_digits)) >= LEAST_SCATTER_DIGITS
     return [
-        each[0] if filled and each is not None else _sampled(pressure_Pa)
-        for each, pressure_Pa in zip(told, traces, strict=True)
+        candidate[0] if interpolated and candidate is not None else _samples_as_readings(pressure_Pa)
+        for candidate, pressure_Pa in zip(candidates, traces, strict=True)
     ]
 
 
-def _sampled(pressure_Pa: Floats) -> Readings:
-    """Samples that are readings themselves; of those in steps coarser than their noise the means of blocks.
+def _samples_as_readings(pressure_Pa: Floats) -> Readings:
+    """Samples as readings; where they are in steps coarser than their noise, means of blocks of samples.
 
-    How much such samples are off by rounding hangs together over as many as the pressure takes for a step.
+    The rounding errors of such samples are correlated over as many samples as the pressure takes for one step.
     """
     count = pressure_Pa.size
     plain = Readings(np.arange(float(count)), pressure_Pa)
-    rounding_Pa = _digit_of(pressure_Pa) / math.sqrt(12)
-    if rounding_Pa <= QUIET * abs(float(np.median(pressure_Pa))) or count < FEWEST:
+    rounding_Pa = _resolution(pressure_Pa) / math.sqrt(12)
+    if rounding_Pa <= NEGLIGIBLE_NOISE * abs(float(np.median(pressure_Pa))) or count < FEWEST_SAMPLES:
         return plain
-    if noise_of(pressure_Pa) >= rounding_Pa:
+    if white_noise_sd(pressure_Pa) >= rounding_Pa:
         return replace(plain, rounding_Pa=rounding_Pa)
     steps = float(np.ptp(pressure_Pa)) / (math.sqrt(12) * rounding_Pa) + 1
     blocks = max(round(steps), FEWEST_BLOCKS)
@@ -176,37 +177,39 @@ def _sampled(pressure_Pa: Floats) -> Readings:
     )  # fmt: skip
 
 
-def _filled(pressure_Pa: Floats) -> tuple[Readings, float] | None:
-    """Readings between which samples were filled up and by how many last digits they scatter, or None."""
+def _interpolated_readings(pressure_Pa: Floats) -> tuple[Readings, float] | None:
+    """Readings of an interpolated or held trace and their scatter in last digits; None if it is neither."""
     steps = np.abs(np.diff(pressure_Pa))
     if pressure_Pa.size < 4 or not steps.any():
         return None
-    digit_Pa = _digit_of(pressure_Pa)
-    if np.mean(steps == 0.0) > FILLED and (held := _held(pressure_Pa, digit_Pa)) is not None:
-        return _rounded(*held), math.inf
-    begins = _straight_runs(pressure_Pa, max(0.5 * digit_Pa, STRAIGHT * float(np.max(np.abs(pressure_Pa)))))
+    digit_Pa = _resolution(pressure_Pa)
+    if (
+        np.mean(steps == 0.0) > INTERPOLATED_PART
+        and (held_readings := _sample_and_hold_readings(pressure_Pa, digit_Pa)) is not None
+    ):
+        return _with_rounding(*held_readings), math.inf
+    begins = _straight_runs(pressure_Pa, max(0.5 * digit_Pa, EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa)))))
     within = np.diff(begins, append=pressure_Pa.size) - 2
-    if begins.size == 1 or np.sum(np.maximum(within, 0)) < FILLED * pressure_Pa.size:
+    if begins.size == 1 or np.sum(np.maximum(within, 0)) < INTERPOLATED_PART * pressure_Pa.size:
         return None
-    places, values_Pa = _joined(pressure_Pa, begins)
-    return _rounded(places, values_Pa), _scatter(places, values_Pa) / digit_Pa if digit_Pa > 0 else math.inf
+    places, values_Pa = _line_intersections(pressure_Pa, begins)
+    return _with_rounding(places, values_Pa), _noise_of_uneven(
+        places, values_Pa
+    ) / digit_Pa if digit_Pa > 0 else math.inf
 
 
-def _rounded(places: Floats, values_Pa: Floats) -> Readings:
-    """Readings with what their own steps leave of noise at least."""
-    return Readings(places, values_Pa, _digit_of(values_Pa) / math.sqrt(12))
+def _with_rounding(places: Floats, values_Pa: Floats) -> Readings:
+    """Readings with the rounding error that follows from their own resolution."""
+    return Readings(places, values_Pa, _resolution(values_Pa) / math.sqrt(12))
 
 
-def _digit_of(pressure_Pa: Floats) -> float:
-    """The step in which pressures are told, Pa; 0 where they are told in none."""
-    return _last_digit(pressure_Pa, STRAIGHT * float(np.max(np.abs(pressure_Pa))))
+def _resolution(pressure_Pa: Floats) -> float:
+    """Resolution of pressures, Pa: the largest step of which they are all multiples; 0 without one."""
+    return _common_divisor(pressure_Pa, EXACT_TOLERANCE * float(np.max(np.abs(pressure_Pa))))
 
 
-def _last_digit(values: Floats, exact: float) -> float:
-    """The largest number of which all differences of values are multiples to within `exact`; 0 where there is none.
-
-    By Euclid's algorithm.
-    """
+def _common_divisor(values: Floats, exact: float) -> float:
+    """Largest number that divides all differences of values to within `exact`, by Euclid's algorithm; 0 if none."""
     left = np.unique(np.abs(values - values[0]))
     left = left[left > exact]
     while left.size > 1:
@@ -218,111 +221,115 @@ def _last_digit(values: Floats, exact: float) -> float:
 
 
 def _straight_runs(values: Floats, reach: float) -> NDArray[np.intp]:
-    """First samples of runs, each as long as it goes, that one straight line fits to within `reach`.
+    """First samples of maximal runs that a straight line fits to within `reach`.
 
-    A line through intervals exists where the slopes that any two of them allow have one in common.
+    A line through intervals exists if the ranges of slopes that each pair of them allows have a common value.
     """
     begins = [0]
     low, high = -math.inf, math.inf
     for j in range(1, values.size):
-        apart = np.arange(j - begins[-1], 0, -1)
+        distance = np.arange(j - begins[-1], 0, -1)
         rise = values[j] - values[begins[-1] : j]
-        low = max(low, float(np.max((rise - 2 * reach) / apart)))
-        high = min(high, float(np.min((rise + 2 * reach) / apart)))
+        low = max(low, float(np.max((rise - 2 * reach) / distance)))
+        high = min(high, float(np.min((rise + 2 * reach) / distance)))
         if low > high:
             begins.append(j)
             low, high = -math.inf, math.inf
     return np.array(begins)
 
 
-def _scatter(places: Floats, values: Floats) -> float:
-    """Typical noise of values on a smooth course, from divided differences of the third order or the most there are."""
+def _noise_of_uneven(places: Floats, values: Floats) -> float:
+    """Noise of values at uneven places on a smooth curve, from divided differences of up to third order."""
     windows = np.lib.stride_tricks.sliding_window_view
     x, y = (windows(each, min(values.size, 4)) for each in (places, values))
-    apart = x[:, :, None] - x[:, None, :]
-    np.einsum("kii->ki", apart)[:] = 1.0
-    weights = 1 / np.prod(apart, axis=2)
+    differences = x[:, :, None] - x[:, None, :]
+    np.einsum("kii->ki", differences)[:] = 1.0
+    weights = 1 / np.prod(differences, axis=2)
     return float(np.median(np.abs(np.sum(weights * y, axis=1)) / np.linalg.norm(weights, axis=1))) / 0.6745
 
 
-def _held(pressure_Pa: Floats, digit_Pa: float) -> tuple[Floats, Floats] | None:
-    """Readings that were repeated until the next; each was read up to a sample before it shows first.
+def _sample_and_hold_readings(pressure_Pa: Floats, digit_Pa: float) -> tuple[Floats, Floats] | None:
+    """Readings that are held until the next one; each was read up to a sample before it first appears.
 
-    Of readings in coarse steps many are the same as those before: they are told by the even beat of all that differ.
-    None where the trace does not look like that.
+    In coarse steps many readings equal the previous one: they follow from the even period of those that differ. None if
+    the trace is not held.
     """
     steps = np.diff(pressure_Pa)
     changes = np.flatnonzero(steps) + 1
-    runs_on = (np.abs(np.diff(steps)) <= 2 * digit_Pa) & (steps[1:] != 0) & (steps[:-1] != 0)
-    if np.mean(runs_on) > FILLED / 2:
+    continues = (np.abs(np.diff(steps)) <= 2 * digit_Pa) & (steps[1:] != 0) & (steps[:-1] != 0)
+    if np.mean(continues) > INTERPOLATED_PART / 2:
         return None
     if np.median(np.abs(steps[changes - 1])) > 1.5 * digit_Pa:
         places = np.concatenate([[0.0], changes - 0.5])
-        # When the first was read, the trace does not show.
+        # The trace does not show when its first value was read.
         if places.size > 2:
             places[0] = min(0.0, places[1] - float(np.median(np.diff(places)[1:])))
         return places, pressure_Pa[[0, *changes]]
-    beat = _beat(changes.astype(float) - 0.5)
-    if beat is None:
+    period_found = _sampling_period(changes.astype(float) - 0.5)
+    if period_found is None:
         return None
-    first, period = beat
+    first, period = period_found
     places = np.arange(first - math.ceil(first / period) * period, pressure_Pa.size - 1.0, period)
     middle = np.clip(np.round(places + 0.5 * period), 0, pressure_Pa.size - 1).astype(int)
     return places, pressure_Pa[middle]
 
 
-def _beat(instants: Floats) -> tuple[float, float] | None:
-    """The first of the instants and the period, samples, on which all of them fall; None where they have none."""
+def _sampling_period(instants: Floats) -> tuple[float, float] | None:
+    """First instant and period, samples, of a regular grid that contains all the instants; None if there is none."""
     gaps = np.diff(instants)
     if gaps.size < 3 or gaps.min() < 2:
         return None
     period = float(gaps.min())
-    # From short gaps to long ones, so that a period a little off never counts one too few or too many.
-    for most in (1.5, 4.0, 12.0, math.inf):
-        told = gaps <= most * period
-        period = float(np.sum(gaps[told]) / np.sum(np.round(gaps[told] / period)))
-    counted = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
-    slope, first = np.polyfit(counted, instants, 1)
-    off = np.max(np.abs(instants - first - slope * counted))
-    if off > BEAT_OFF or gaps.size * math.log(slope / (2 * BEAT_OFF)) < -math.log(BEAT_CHANCE):
+    # Refine the period from short gaps to long ones, so that the number of periods in a gap is never miscounted.
+    for longest in (1.5, 4.0, 12.0, math.inf):
+        short_gaps = gaps <= longest * period
+        period = float(np.sum(gaps[short_gaps]) / np.sum(np.round(gaps[short_gaps] / period)))
+    periods = np.concatenate([[0.0], np.cumsum(np.round(gaps / period))])
+    slope, first = np.polyfit(periods, instants, 1)
+    largest_error = np.max(np.abs(instants - first - slope * periods))
+    if largest_error > PERIOD_TOLERANCE or gaps.size * math.log(slope / (2 * PERIOD_TOLERANCE)) < -math.log(
+        PERIOD_FALSE_ALARM
+    ):
         return None
     return float(first), float(slope)
 
 
-def _joined(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Readings that were joined by straight lines: where the lines through neighbouring runs of samples meet.
+def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Readings that were interpolated linearly: the intersections of lines through neighbouring runs of samples.
 
-    `begins` are the first samples of the runs. A trace begins and ends between two readings: those outside it are where
-    its first and last line come to after as long as the others take.
+    `begins` are the first samples of the runs. A trace begins and ends between two readings: the readings outside it
+    are the values of its first and last line after the typical spacing.
     """
     lines: list[tuple[float, float]] = []
     for begin, end in itertools.pairwise([*begins, pressure_Pa.size]):
         at = np.arange(begin, end)
-        # A sample alone has the slope of the line before it.
+        # A single sample gets the slope of the previous line.
         slope = np.polyfit(at, pressure_Pa[at], 1)[0] if at.size > 1 else lines[-1][0]
         lines.append((slope, float(np.mean(pressure_Pa[at])) - slope * float(np.mean(at))))
     places, values = [], []
     for begin, (slope, at_0), (next_slope, next_at_0) in zip(begins[1:], lines, lines[1:], strict=False):
-        meets = (next_at_0 - at_0) / (slope - next_slope) if slope != next_slope else begin - 0.5
-        place = float(np.clip(meets, begin - 1, begin))
+        intersection = (next_at_0 - at_0) / (slope - next_slope) if slope != next_slope else begin - 0.5
+        place = float(np.clip(intersection, begin - 1, begin))
         places.append(place)
         values.append(0.5 * (slope * place + at_0 + next_slope * place + next_at_0))
     spacing = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
     last = pressure_Pa.size - 1.0
     ends = []
     for inner, end, (slope, at_0) in ((places[0], 0.0, lines[0]), (places[-1], last, lines[-1])):
-        shows = abs(end - inner)
-        # A line that is longer than others passes over a reading.
-        place = inner + math.copysign(max(spacing, shows), end - inner)
-        ends.append([(place, slope * place + at_0)] if shows >= SEEN * spacing and shows > 0 else [])
+        shown_length = abs(end - inner)
+        # A line longer than the typical spacing contains a further reading.
+        place = inner + math.copysign(max(spacing, shown_length), end - inner)
+        ends.append(
+            [(place, slope * place + at_0)] if shown_length >= LEAST_LINE_PART * spacing and shown_length > 0 else []
+        )
     readings = np.array([*ends[0], *zip(places, values, strict=True), *ends[1]])
     return readings[:, 0], readings[:, 1]
 
 
-def noise_of(pressure_Pa: Floats) -> float:
-    """Standard deviation of white noise on a smooth course, from third differences; their variance is 20 σ².
+def white_noise_sd(pressure_Pa: Floats) -> float:
+    """Standard deviation of white noise on a smooth curve, from third differences; their variance is 20 σ².
 
-    Differences beyond three standard deviations, such as at a corner, count as if they were no more.
+    Differences beyond three standard deviations, such as at a corner, are clipped (Winsorised).
 
     Parameters
     ----------
@@ -331,55 +338,54 @@ def noise_of(pressure_Pa: Floats) -> float:
 
     Returns
     -------
-    float
-        Pa
+    float, Pa
     """
     third = np.diff(pressure_Pa, 3) / math.sqrt(20)
     sigma = rough_noise(pressure_Pa)
-    for _ in range(CLIPPED_ROUNDS):
-        sigma = math.sqrt(float(np.mean(np.minimum(third**2, (CLIPPED * sigma) ** 2))) / KEPT)
+    for _ in range(CLIP_ROUNDS):
+        sigma = math.sqrt(float(np.mean(np.minimum(third**2, (CLIP_SIGMAS * sigma) ** 2))) / VARIANCE_KEPT)
     return sigma
 
 
-def noises_of(readings: Sequence[Readings], rho: float) -> list[GaugeNoise]:
-    """Noise of every trace, those of a gauge being about alike; 0 where there is none, or too few readings tell of it.
+def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise]:
+    """Noise of every trace, shrunk towards that of other traces of the gauge; 0 if negligible or undetermined.
 
     Parameters
     ----------
     readings : sequence of Readings
     rho : float
-        Correlation of neighbours.
+        Lag-one correlation.
 
     Returns
     -------
     list of GaugeNoise
     """
-    alone = [math.nan] * len(readings)
+    own_sigma = [math.nan] * len(readings)
     for i, each in enumerate(readings):
-        if each.values_Pa.size >= FEWEST and not each.all_noise:
-            alone[i] = noise_of(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
-    told = [sigma for sigma in alone if math.isfinite(sigma)]
-    typical = float(np.median(told)) if len(told) > 1 else 0.0
+        if each.values_Pa.size >= FEWEST_SAMPLES and not each.all_noise:
+            own_sigma[i] = white_noise_sd(whitened(each.values_Pa, rho)[1:] if rho else each.values_Pa)
+    known_sigmas = [sigma for sigma in own_sigma if math.isfinite(sigma)]
+    typical = float(np.median(known_sigmas)) if len(known_sigmas) > 1 else 0.0
     noises = []
-    for sigma, each in zip(alone, readings, strict=True):
+    for sigma, each in zip(own_sigma, readings, strict=True):
         if each.all_noise:
-            noises.append(GaugeNoise(each.rounding_Pa, KNOWN, 0.0))
+            noises.append(GaugeNoise(each.rounding_Pa, DERIVED_DEGREES, 0.0))
             continue
-        told_here = NOISE_DEGREES * each.values_Pa.size if math.isfinite(sigma) else 0.0
-        told_by_others = ALIKE if typical > 0 and each.values_Pa.size >= FEWEST_WITH_OTHERS else 0.0
-        degrees = told_here + told_by_others
-        squares = told_by_others * typical**2 + (told_here * sigma**2 if told_here else 0.0)
-        together = max(math.sqrt(squares / degrees), each.rounding_Pa) if degrees else 0.0
-        quiet = together <= QUIET * abs(float(np.median(each.values_Pa)))
-        noises.append(GaugeNoise(0.0 if quiet else together, degrees, rho))
+        own_degrees = NOISE_DEGREES * each.values_Pa.size if math.isfinite(sigma) else 0.0
+        degrees_of_others = DEGREES_FROM_OTHERS if typical > 0 and each.values_Pa.size >= FEWEST_WITH_OTHERS else 0.0
+        degrees = own_degrees + degrees_of_others
+        squares = degrees_of_others * typical**2 + (own_degrees * sigma**2 if own_degrees else 0.0)
+        pooled_sigma = max(math.sqrt(squares / degrees), each.rounding_Pa) if degrees else 0.0
+        negligible = pooled_sigma <= NEGLIGIBLE_NOISE * abs(float(np.median(each.values_Pa)))
+        noises.append(GaugeNoise(0.0 if negligible else pooled_sigma, degrees, rho))
     return noises
 
 
 def noise_correlation(traces: Sequence[Floats]) -> float:
-    """Correlation of the noise of neighbouring readings, alike in all traces; 0 where it is white as far as they tell.
+    """Lag-one correlation of the noise of readings, the same in all traces; 0 unless significantly positive.
 
-    Third differences of readings that lie APART are larger than those of neighbours by what these have together. A
-    pressure that moves has slow differences too, but not in most of them.
+    If noise is correlated, third differences of readings COMPARED_LAG apart are larger than those of neighbours. A
+    changing pressure has slow differences too, but not in most traces, so the median over traces is used.
 
     Parameters
     ----------
@@ -391,35 +397,40 @@ def noise_correlation(traces: Sequence[Floats]) -> float:
     """
     ratios, counts = [], []
     for readings_Pa in traces:
-        far = [readings_Pa[begin::APART] for begin in range(APART)]
-        near = noise_of(readings_Pa) if far[-1].size >= FEWEST else 0.0
-        if near > QUIET * abs(float(np.median(readings_Pa))):
-            # Of readings in coarse steps those far apart may all be the same.
-            apart = max(float(np.mean([noise_of(each) ** 2 for each in far])), QUIET * near**2)
-            ratios.append(math.log(apart / near**2))
+        distant = [readings_Pa[begin::COMPARED_LAG] for begin in range(COMPARED_LAG)]
+        neighbour_sigma = white_noise_sd(readings_Pa) if distant[-1].size >= FEWEST_SAMPLES else 0.0
+        if neighbour_sigma > NEGLIGIBLE_NOISE * abs(float(np.median(readings_Pa))):
+            # In coarse steps, distant readings may all be equal.
+            distant_variance = max(
+                float(np.mean([white_noise_sd(each) ** 2 for each in distant])), NEGLIGIBLE_NOISE * neighbour_sigma**2
+            )
+            ratios.append(math.log(distant_variance / neighbour_sigma**2))
             counts.append(readings_Pa.size)
     if not ratios:
         return 0.0
-    chance = SURELY_CORRELATED * math.sqrt(4 / NOISE_DEGREES * APART / sum(counts))
+    threshold = CORRELATION_SIGMAS * math.sqrt(4 / NOISE_DEGREES * COMPARED_LAG / sum(counts))
     ratio = float(np.median(ratios))
-    if ratio < chance:
+    if ratio < threshold:
         return 0.0
-    rhos = np.linspace(0.0, MOST_CORRELATED, 98)
-    return float(np.interp(ratio, np.log(_third(rhos**APART) / _third(rhos)), rhos))
+    rhos = np.linspace(0.0, LARGEST_CORRELATION, 98)
+    return float(
+        np.interp(
+            ratio, np.log(_third_difference_variance(rhos**COMPARED_LAG) / _third_difference_variance(rhos)), rhos
+        )
+    )
 
 
-def _third(rho: Floats) -> Floats:
-    """Variance of third differences of samples of which neighbours have the correlation `rho`, of 1 where it is 0."""
+def _third_difference_variance(rho: Floats) -> Floats:
+    """Variance of third differences of noise with lag-one correlation `rho`, relative to that of white noise."""
     return np.asarray(1 - 1.5 * rho + 0.6 * rho**2 - 0.1 * rho**3)
 
 
 def whitened(values: Floats, rho: float) -> Floats:
-    """What is new in every reading, where noise of neighbours has the correlation `rho`.
+    """Readings, or columns of curves through them, whitened for noise of the given lag-one correlation.
 
     Parameters
     ----------
     values : array, shape (n,) or (n, k)
-        Readings, or columns of a curve through them.
     rho : float
 
     Returns

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_trial
-from vinetrack.inference.gauge_noise import quiet_traces
+from vinetrack.inference.gauge_noise import denoised_traces
 from vinetrack.tracks.noise_shape import ar1_difference_gain, noise_shape
 from vinetrack.tracks.position_noise import common_rounding_noise
 from vinetrack.tracks.smoothed_positions import detect_smoothing
@@ -39,7 +39,7 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
-    for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
+    for (trial, track), quiet in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
         try:
             data.append(prepare_trial(trial, track, quiet, smoothing, rounding_m))
         except FitError as error:
