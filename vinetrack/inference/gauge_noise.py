@@ -45,8 +45,8 @@ HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000
 best width is met within a quarter."""
 
 AGREE_SIGMAS = 4.0
-"""Half width, in standard deviations, of the intervals around the values of local lines that must have a common point.
-Chosen (Lepski's rule with κ of 3 to 4): at half, corners are found in noise; at twice, corners are rounded."""
+"""Half width, in standard deviations, of the intervals of local lines that must overlap. Chosen (Lepski's rule with κ
+of 3 to 4): at half, corners are found in noise; at twice, corners are rounded."""
 
 RESIDUAL_FALSE_ALARM = 1e-5
 """Probability with which pure noise leaves a larger residual sum of squares than is accepted. Chosen: one false alarm
@@ -130,10 +130,9 @@ class DenoisedTrace:
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A trace to be denoised: its readings, number of samples, noise, growth and clock offset.
+    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown.
 
-    `growth` and `clock` are None where no growth is known. The exponent of the emptying chamber has an error, which is
-    shared by `n_trials` trials.
+    The exponent of the emptying chamber has an error, which is shared by `n_trials` trials.
     """
 
     readings: Readings
@@ -148,8 +147,7 @@ class _Recorded:
     def basis(self, kind: int, offset_sigmas: float = 0.0) -> tuple[Floats, Floats]:
         """Basis functions of a kind of curve at the readings, orthonormal, and at all samples; the first is the mean.
 
-        With few readings the curve between them still follows the growth. `offset_sigmas` shifts the clock by so many
-        of its standard deviations.
+        `offset_sigmas` shifts the clock by so many of its standard deviations.
         """
         at_samples = self._columns(kind, np.arange(float(self.count)), offset_sigmas)
         means = self.readings.edges is not None
@@ -159,17 +157,17 @@ class _Recorded:
         q, r = np.linalg.qr(at_readings)
         return q, np.linalg.solve(r.T, at_samples.T).T
 
-    def _columns(self, kind: int, places_wanted: Floats, offset_sigmas: float) -> Floats:
+    def _columns(self, kind: int, where: Floats, offset_sigmas: float) -> Floats:
         """Powers of time, or of time and growth, at places among the samples."""
         places = self.readings.places
-        t = 2 * (places_wanted - places[0]) / (places[-1] - places[0]) - 1
+        t = 2 * (where - places[0]) / (places[-1] - places[0]) - 1
         if kind <= LARGEST_DEGREE:
             return legvander(t, kind)
         assert self.growth is not None
         assert self.clock is not None
         offset = self.clock.offset + offset_sigmas * self.clock.sigma
         seen_m = self.growth.at(places + offset)
-        grown = (self.growth.at(places_wanted + offset) - seen_m[0]) / np.ptp(seen_m)
+        grown = (self.growth.at(where + offset) - seen_m[0]) / np.ptp(seen_m)
         return polynomial_along(t, grown, *GROWTH_DEGREES[kind - LARGEST_DEGREE - 1])
 
     def criteria(self, exponents: Sequence[float] | None = None) -> Floats:
@@ -350,7 +348,6 @@ def _with_common_exponent(noisy: dict[int, _Recorded]) -> dict[int, _Recorded]:
     deviances = np.sum(informative, axis=0)
     likelihood = np.exp(-0.5 * (deviances - np.min(deviances)))
     exponent = float(np.average(EXPONENTS, weights=likelihood))
-    # Each exponent of the grid stands for the interval around it.
     width = (EXPONENTS[-1] - EXPONENTS[0]) / (len(EXPONENTS) - 1)
     variance = float(np.average((np.array(EXPONENTS) - exponent) ** 2, weights=likelihood)) + width**2 / 12
     return {
@@ -360,7 +357,7 @@ def _with_common_exponent(noisy: dict[int, _Recorded]) -> dict[int, _Recorded]:
 
 
 def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
-    """Interpolate columns from places among the samples to all samples, with linear extrapolation at both ends."""
+    """Interpolate columns from places to all samples, with linear extrapolation at both ends."""
     samples = np.arange(count)
     if places.size == count:
         return curves
@@ -391,10 +388,7 @@ def _polynomials(count: int, degree: int) -> Floats:
 
 
 def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats) -> bool:
-    """Whether the residual of a curve has no slow or local part and no more than the noise.
-
-    `fitted` is the number of parameters of the curve, `slow` are the polynomials tested for.
-    """
+    """Whether a curve with so many parameters leaves no slow or local part and no more than the noise."""
     if np.any(np.abs(slow.T @ residual_Pa) > _quantile_Pa(SLOW_SIGMAS, noise)):
         return False
     # A corner that is cut leaves residuals only in the samples around it.
@@ -437,10 +431,10 @@ def _local_lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
 
 
 def _local_line(y: Floats, half: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Value at every sample of the line through its neighbours, `half` to each side where there are so many.
+    """Value at every sample of the line through its neighbours, up to `half` to each side.
 
-    Also its standard deviation relative to that of a sample, and the residual sum of squares with its degrees of
-    freedom. Shapes (n,).
+    Also its standard deviation relative to that of a sample, the residual sum of squares and its degrees of freedom.
+    (n,).
     """
     y_mean = float(np.mean(y))
     y = y - y_mean
