@@ -74,8 +74,8 @@ GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4)
 degree in the growth to 1e-4 of its pressure; a supply that refills it is slow in time."""
 
 LEAST_WEIGHT = 0.01
-"""Probability, relative to the likeliest kind of curve, from which a kind enters the average. Chosen: a tenth of the
-difference of such a kind is then an error; at half and at twice, 0.07 and 0.14 of it are neglected."""
+"""Probability, relative to the likeliest kind of curve, from which a kind is averaged. Chosen: a tenth of its
+difference is then an error; at half and at twice, 0.07 and 0.14 of it are neglected."""
 
 END_PART, EXTRAPOLATED_PART = 0.1, 0.2
 """Last part of a trace whose line extrapolates it beyond its end, and for how long, both relative to its duration.
@@ -370,10 +370,8 @@ def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
 
 
 def _weights(criteria: Floats) -> Floats:
-    """Probability of each kind of curve relative to the likeliest, of the shape of `criteria`, (n_traces, n_kinds).
-
-    0 for kinds that are negligible, and for all kinds of a trace that no curve explains.
-    """
+    """Probabilities of kinds of curves relative to the likeliest; 0 if negligible, or if no curve explains the
+    trace."""
     possible = np.asarray(np.isfinite(criteria).any(axis=1))
     lowest = np.where(possible, criteria.min(axis=1), 0.0)
     totals = criteria - 2 * np.log(frequencies_in_other_trials(np.exp(-0.5 * (criteria - lowest[:, None]))))
