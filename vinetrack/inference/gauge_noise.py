@@ -370,8 +370,7 @@ def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
 
 
 def _weights(criteria: Floats) -> Floats:
-    """Probabilities of kinds of curves relative to the likeliest; 0 if negligible, or if no curve explains the
-    trace."""
+    """Probabilities of kinds of curves relative to the likeliest; 0 if negligible or if none explains a trace."""
     possible = np.asarray(np.isfinite(criteria).any(axis=1))
     lowest = np.where(possible, criteria.min(axis=1), 0.0)
     totals = criteria - 2 * np.log(frequencies_in_other_trials(np.exp(-0.5 * (criteria - lowest[:, None]))))
