@@ -30,7 +30,7 @@ def read(tmp_path: Path, text: str) -> ExperimentSettings:
     return read_experiment_settings(path)
 
 
-def problems_of(tmp_path: Path, text: str) -> tuple[Problem, ...]:
+def draft_problems(tmp_path: Path, text: str) -> tuple[Problem, ...]:
     with pytest.raises(ExperimentError) as caught:
         read(tmp_path, text)
     return caught.value.problems
@@ -108,36 +108,36 @@ def test_a_range_of_sizes_is_looked_at_in_equal_ratios(tmp_path: Path) -> None:
 
 
 def test_an_unknown_key_suggests_the_nearest(tmp_path: Path) -> None:
-    (problem,) = problems_of(tmp_path, "strict: true\npresure_kPa: 28\n")
+    (problem,) = draft_problems(tmp_path, "strict: true\npresure_kPa: 28\n")
     assert (problem.column, problem.line, problem.file) == ("presure_kPa", 2, "experiment.yaml")
     assert "did you mean pressure_kPa?" in problem.remedy
 
 
 def test_an_unknown_key_of_a_calibration_suggests_the_nearest(tmp_path: Path) -> None:
-    found = problems_of(tmp_path, "calibration:\n  kind: mm_per_px\n  mm_per_px: 0.3\n  kinds: 3\n")
+    found = draft_problems(tmp_path, "calibration:\n  kind: mm_per_px\n  mm_per_px: 0.3\n  kinds: 3\n")
     assert [(problem.column, problem.line) for problem in found] == [("calibration.kinds", 4)]
     assert "kind?" in found[0].remedy
 
 
 def test_an_unknown_kind_of_calibration_names_those_there_are(tmp_path: Path) -> None:
-    (problem,) = problems_of(tmp_path, "calibration: {kind: chess}\n")
+    (problem,) = draft_problems(tmp_path, "calibration: {kind: chess}\n")
     assert problem.column == "calibration"
     assert "checkerboard" in str(problem)
 
 
 def test_a_key_missing_in_a_calibration_is_named(tmp_path: Path) -> None:
-    (problem,) = problems_of(tmp_path, "calibration: {kind: mm_per_px}\n")
+    (problem,) = draft_problems(tmp_path, "calibration: {kind: mm_per_px}\n")
     assert (problem.column, problem.message) == ("calibration.mm_per_px", "is missing")
 
 
 def test_a_key_written_twice_is_refused(tmp_path: Path) -> None:
-    (problem,) = problems_of(tmp_path, "strict: true\npayload_g: 1\nstrict: false\n")
+    (problem,) = draft_problems(tmp_path, "strict: true\npayload_g: 1\nstrict: false\n")
     assert (problem.column, problem.line, problem.message) == ("strict", 3, "is set twice")
     assert "line 1" in problem.remedy
 
 
 def test_a_syntax_error_names_line_and_remedy(tmp_path: Path) -> None:
-    (problem,) = problems_of(tmp_path, "strict: true\npayload_g: [1, 2\nuse: yes\n")
+    (problem,) = draft_problems(tmp_path, "strict: true\npayload_g: [1, 2\nuse: yes\n")
     assert problem.file == "experiment.yaml"
     assert problem.line >= 2
     assert "quotes" in problem.remedy
@@ -145,7 +145,7 @@ def test_a_syntax_error_names_line_and_remedy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["- a\n- b\n", "just text\n", "3\n"])
 def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
-    (problem,) = problems_of(tmp_path, text)
+    (problem,) = draft_problems(tmp_path, text)
     assert problem.message == "holds no settings"
 
 
@@ -190,14 +190,14 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_a_value_that_is_not_allowed_is_named_with_its_key(tmp_path: Path, line: str, words: str) -> None:
-    (problem,) = problems_of(tmp_path, f"# first line\n{line}\n")
+    (problem,) = draft_problems(tmp_path, f"# first line\n{line}\n")
     assert problem.line == 2
     assert problem.column.startswith(line.split(":")[0])
     assert words in str(problem)
 
 
 def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
-    found = problems_of(tmp_path, "strikt: true\npressure_kPa: -1\ntail_slack: x\n")
+    found = draft_problems(tmp_path, "strikt: true\npressure_kPa: -1\ntail_slack: x\n")
     assert sorted(problem.line for problem in found) == [1, 2, 3]
 
 

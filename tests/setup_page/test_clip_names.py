@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vinetrack.setup_page.clip_names import (
-    guess_columns,
+    columns_from_names,
     list_pictures,
     list_recordings,
     list_tables,
@@ -51,12 +51,12 @@ def test_recordings_are_films_and_folders_of_pictures_in_the_order_of_their_numb
     ],
 )  # fmt: skip
 def test_a_name_says(name: str, cells: dict[str, str]) -> None:
-    assert guess_columns([name]) == [cells]
+    assert columns_from_names([name]) == [cells]
 
 
 def test_a_unit_that_all_names_share_is_kept_and_mixed_ones_are_converted() -> None:
-    assert guess_columns(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
-    assert guess_columns(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
+    assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
+    assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
 
 
 def test_names_of_trials_are_unique_also_where_case_alone_differs() -> None:

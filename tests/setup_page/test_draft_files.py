@@ -10,9 +10,9 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.experiment.folder import check_experiment
-from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, write_draft
+from vinetrack.setup_page.draft_files import Draft, draft_folder, open_draft, write_draft
 from vinetrack.setup_page.settings_draft import first_settings, shared_values, with_shared
-from vinetrack.setup_page.setup_command import write_blanks
+from vinetrack.setup_page.setup_command import write_templates
 from vinetrack.setup_page.sheet_draft import SheetDraft
 
 SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_folder_of_recordings_gets_both_files_with_blanks(folder: Path) -> None:
     lines: list[str] = []
-    write_blanks(folder, lines.append)
+    write_templates(folder, lines.append)
     table = read_table(folder / "trials.csv")
     assert table.rows[1]["diameter_mm"] == "12"
     assert table.rows[1]["pressure_kPa"] == "30"
@@ -43,7 +43,7 @@ def test_a_folder_of_recordings_gets_both_files_with_blanks(folder: Path) -> Non
 def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) -> None:
     (folder / "trials.csv").write_text(SHEET)
     (folder / "experiment.yaml").write_text(SETTINGS)
-    write_blanks(folder, lambda _line: None)
+    write_templates(folder, lambda _line: None)
     text = (folder / "trials.csv").read_text()
     assert text.startswith("trial;video;pressure_kPa;note")
     assert "old;a.mp4;24,5;keep me" in text
@@ -52,9 +52,9 @@ def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) ->
 
 
 def test_a_second_run_changes_no_byte(folder: Path) -> None:
-    write_blanks(folder, lambda _line: None)
+    write_templates(folder, lambda _line: None)
     before = [(folder / name).read_bytes() for name in ("trials.csv", "experiment.yaml")]
-    write_blanks(folder, lambda _line: None)
+    write_templates(folder, lambda _line: None)
     assert [(folder / name).read_bytes() for name in ("trials.csv", "experiment.yaml")] == before
 
 
@@ -94,7 +94,7 @@ def test_a_draft_is_checked_without_touching_the_folder(folder: Path) -> None:
     sheet = SheetDraft(
         ("trial", "video", "pressure_kPa"), ({"trial": "a", "video": "a.mp4", "pressure_kPa": "12 kPa"},)
     )
-    with drafted(folder, Draft(sheet, SETTINGS, "")) as copy:
+    with draft_folder(folder, Draft(sheet, SETTINGS, "")) as copy:
         problems = check_experiment(copy)
     assert [problem.trial for problem in problems if problem.column == "pressure_kPa"] == ["a"]
     assert not (folder / "trials.csv").exists()

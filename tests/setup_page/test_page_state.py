@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vinetrack.core.yaml_document import parse_yaml
-from vinetrack.setup_page.page_state import draft_of, page_state, problems_of
+from vinetrack.setup_page.page_state import draft_from_json, draft_problems, page_state
 
 
 def sent(folder: Path, **more: Any) -> dict[str, Any]:
@@ -18,8 +18,8 @@ def sent(folder: Path, **more: Any) -> dict[str, Any]:
 
 
 def fields(folder: Path, **more: Any) -> set[tuple[str, str, str]]:
-    draft = draft_of(folder, sent(folder, **more))
-    return {(one["field"], one["trial"], one["column"]) for one in problems_of(folder, draft)["problems"]}
+    draft = draft_from_json(folder, sent(folder, **more))
+    return {(one["field"], one["trial"], one["column"]) for one in draft_problems(folder, draft)["problems"]}
 
 
 def test_a_new_folder_is_unsaved_and_filled_in_from_names(clips: Path) -> None:
@@ -48,18 +48,18 @@ def test_a_wrong_cell_is_named_by_its_trial_and_its_column_in_the_unit_of_the_sh
 def test_a_whole_draft_has_no_errors(clips: Path) -> None:
     shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
     scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}
-    draft = draft_of(clips, sent(clips, shared=shared, calibration=scale))
-    found = problems_of(clips, draft)["problems"]
+    draft = draft_from_json(clips, sent(clips, shared=shared, calibration=scale))
+    found = draft_problems(clips, draft)["problems"]
     assert [one for one in found if one["severity"] == "error"] == []
     assert parse_yaml(draft.settings, "").content["calibration"] == scale
 
 
 def test_an_axis_is_set_and_cleared(clips: Path) -> None:
     axis = {"from_px": [10, 80], "to_px": [460, 80]}
-    text = draft_of(clips, sent(clips, axis=axis)).settings
+    text = draft_from_json(clips, sent(clips, axis=axis)).settings
     assert parse_yaml(text, "").content["axis"] == axis
     (clips / "experiment.yaml").write_text(text + "# mine\n")
-    cleared = draft_of(clips, sent(clips, axis=None)).settings
+    cleared = draft_from_json(clips, sent(clips, axis=None)).settings
     assert parse_yaml(cleared, "").content["axis"] is None
     assert cleared.endswith("# mine\n")
 

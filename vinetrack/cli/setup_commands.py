@@ -41,9 +41,9 @@ def _setup(
 
             serve(folder, typer.echo, port, browser=browser)
         else:
-            from vinetrack.setup_page.setup_command import write_blanks
+            from vinetrack.setup_page.setup_command import write_templates
 
-            write_blanks(folder, typer.echo)
+            write_templates(folder, typer.echo)
 
 
 def _track(

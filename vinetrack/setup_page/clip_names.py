@@ -1,4 +1,4 @@
-"""Recordings in a folder, and what their names say of the trials: `d12_24kPa_1` is a vine of 12 mm at 24 kPa."""
+"""Recordings in a folder, and the columns that their names give: `d12_24kPa_1` is a vine of 12 mm at 24 kPa."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.schema import COLUMNS
 
-FEWEST_PICTURES = 5
-"""Pictures that make a folder a recording; chosen: a track needs as many frames. With half, a folder of two photographs
-would be one; with twice, a short burst would be missed."""
+MIN_PICTURES = 5
+"""Pictures from which a folder counts as a recording; chosen: a track needs as many frames. With half, a folder of two
+photographs would be one; with twice, a short burst would be missed."""
 
-DEEPEST = 4
-"""Folders below the experiment's that are looked into; chosen: vine, day, pressure and a folder of pictures. At half
-such an order is missed; twice changes nothing but how long a disk is searched."""
+MAX_FOLDER_DEPTH = 4
+"""Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures. At half such a hierarchy
+is missed; twice only makes the search longer."""
 
 _NUMBER = r"(?P<number>\d+(?:[.p]\d+)?)"
-_BY_UNIT: dict[str, str] = {
+_COLUMN_BY_UNIT: dict[str, str] = {
     "kpa": "pressure_kPa",
     "psi": "pressure_psi",
     "mbar": "pressure_mbar",
@@ -34,9 +34,9 @@ _BY_UNIT: dict[str, str] = {
     "cm": "length_cm",
     "in": "diameter_in",
 }
-"""What a number with a unit says, by the unit in small letters."""
+"""Column of a number with a unit, by the unit in lower case."""
 
-_BY_LETTER = {
+_COLUMN_BY_LETTER = {
     "d": "diameter_mm",
     "dia": "diameter_mm",
     "diam": "diameter_mm",
@@ -49,13 +49,13 @@ _BY_LETTER = {
     "specimen": "specimen",
     "tube": "specimen",
 }
-"""What a letter or word before a number says; a unit behind the number overrides that of the column."""
+"""Column of a number after a letter or word; a unit after the number overrides that of the column."""
 
 _WORD = re.compile(rf"(?P<letter>[a-z]*?){_NUMBER}(?P<unit>[a-zµ]*)", re.IGNORECASE)
 
 
 def list_recordings(folder: Path) -> list[str]:
-    """Recordings below a folder, as paths relative to it, in the order of their names and numbers.
+    """Return the recordings below a folder, as relative paths in natural order.
 
     Parameters
     ----------
@@ -64,15 +64,15 @@ def list_recordings(folder: Path) -> list[str]:
     Returns
     -------
     paths with slashes
-        Films, folders of at least `FEWEST_PICTURES` pictures and stacks of pictures; results, the calibration and
+        Films, folders of at least `MIN_PICTURES` pictures and stacks of pictures; results, the calibration and
         hidden files are left out.
     """
-    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, DEEPEST)]
-    return sorted(names, key=_natural)
+    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, MAX_FOLDER_DEPTH)]
+    return sorted(names, key=_natural_order)
 
 
 def list_pictures(folder: Path) -> list[str]:
-    """Single pictures and films that may show a ruler or a board, as paths relative to the folder.
+    """Return single pictures and films that may show a ruler or a board, as paths relative to the folder.
 
     Parameters
     ----------
@@ -84,16 +84,16 @@ def list_pictures(folder: Path) -> list[str]:
     """
     kinds = _suffixes("IMAGES")
     films = _suffixes("CONTAINERS")
-    there = [path for path in _entries(folder) if path.is_file() and path.suffix.lower() in kinds]
-    there = there if len(there) < FEWEST_PICTURES else []
+    pictures = [path for path in _entries(folder) if path.is_file() and path.suffix.lower() in kinds]
+    pictures = pictures if len(pictures) < MIN_PICTURES else []
     for sub in _entries(folder):
         if sub.is_dir() and _is_calibration(sub):
-            there += [path for path in _entries(sub) if path.suffix.lower() in kinds | films]
-    return sorted((path.relative_to(folder).as_posix() for path in there), key=_natural)
+            pictures += [path for path in _entries(sub) if path.suffix.lower() in kinds | films]
+    return sorted((path.relative_to(folder).as_posix() for path in pictures), key=_natural_order)
 
 
 def list_tables(folder: Path) -> list[str]:
-    """Tables that may be pressure traces, as paths relative to the folder.
+    """Return tables that may be pressure traces, as paths relative to the folder.
 
     Parameters
     ----------
@@ -101,21 +101,21 @@ def list_tables(folder: Path) -> list[str]:
 
     Returns
     -------
-    paths with slashes : CSV files in the folder and in those directly in it, but for sheet and corrections.
+    paths with slashes : CSV files in the folder and in those directly in it, except sheet and corrections.
     """
     folders = [folder, *(path for path in _entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in _entries(place) if path.suffix.lower() == ".csv"]
     names = (path.relative_to(folder).as_posix() for path in tables)
-    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=_natural)
+    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=_natural_order)
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
-    """A name for the trial of each recording: that of its file, with its folder's where two are called alike.
+    """Return a trial name for each recording: that of its file, with those of its folders if two are the same.
 
     Parameters
     ----------
     recordings : relative paths.
-    taken : names that trials have already.
+    taken : names of existing trials.
 
     Returns
     -------
@@ -139,53 +139,53 @@ def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[st
     return names
 
 
-def guess_columns(recordings: Sequence[str]) -> list[dict[str, str]]:
-    """What the names of recordings say, as cells of a trial sheet.
+def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
+    """Return the cells of a trial sheet given by the names of recordings.
 
-    Only what carries a letter or a unit is read: a bare number counts replicates. A quantity that all names give in one
-    other unit keeps it (`pressure_psi`); names in several units come out in that of the sheet.
+    Only numbers with a letter or a unit are read: a bare number counts replicates. A quantity that all names give in
+    the same other unit keeps it (`pressure_psi`); a mixture of units is converted to that of the sheet.
 
     Parameters
     ----------
-    recordings : relative paths; their folders are read too, the file's own name counting more.
+    recordings : relative paths; names of folders are read too, but the file name has precedence.
 
     Returns
     -------
     one mapping each, column to cell.
 
-    >>> guess_columns(["videos/d12_24kPa_1.mp4", "d24-20g-2p5psi.mp4"])
+    >>> columns_from_names(["videos/d12_24kPa_1.mp4", "d24-20g-2p5psi.mp4"])
     [{'diameter_mm': '12', 'pressure_kPa': '24'}, {'diameter_mm': '24', 'payload_g': '20', 'pressure_kPa': '17.2369'}]
-    >>> guess_columns(["tuesday 12 mm 24 kPa 20 g a.mp4"])
+    >>> columns_from_names(["tuesday 12 mm 24 kPa 20 g a.mp4"])
     [{'diameter_mm': '12', 'pressure_kPa': '24', 'payload_g': '20'}]
     """
-    read = [_guess(recording) for recording in recordings]
+    rows = [_columns_from_name(recording) for recording in recordings]
     units: dict[str, set[str]] = {}
-    for cells in read:
+    for cells in rows:
         for name in cells:
             units.setdefault(split_unit(name)[0], set()).add(name)
     out = []
-    for cells in read:
+    for cells in rows:
         row = {}
         for name, cell in cells.items():
             column = _sheet_column(name)
-            several = len(units[split_unit(name)[0]]) > 1 and name != column
-            row[column if several else name] = _in_unit(cell, name, column) if several else cell
+            convert_unit = len(units[split_unit(name)[0]]) > 1 and name != column
+            row[column if convert_unit else name] = _converted(cell, name, column) if convert_unit else cell
         out.append(row)
     return out
 
 
-_UNITS = "|".join(sorted(_BY_UNIT, key=len, reverse=True))
-_APART = re.compile(rf"(?<![A-Za-z0-9])(\d+(?:[.p]\d+)?)[_\s]+({_UNITS})(?![A-Za-z0-9])", re.IGNORECASE)
-"""A number and its unit with a blank between, `24 kPa`."""
+_UNITS = "|".join(sorted(_COLUMN_BY_UNIT, key=len, reverse=True))
+_SPACED_UNIT = re.compile(rf"(?<![A-Za-z0-9])(\d+(?:[.p]\d+)?)[_\s]+({_UNITS})(?![A-Za-z0-9])", re.IGNORECASE)
+"""A number and its unit separated by a blank, `24 kPa`."""
 
 
-def _guess(recording: str) -> dict[str, str]:
-    """Cells by column, or by quantity in another unit."""
+def _columns_from_name(recording: str) -> dict[str, str]:
+    """Cells of one name, by column, whose name may be in another unit."""
     cells: dict[str, str] = {}
     parts = [*PurePosixPath(recording).parts[:-1], _stem(recording)]
     for part in parts:
         of_part: dict[str, str] = {}
-        for word in re.split(r"[_\s,;+-]+", _APART.sub(r"\1\2", part)):
+        for word in re.split(r"[_\s,;+-]+", _SPACED_UNIT.sub(r"\1\2", part)):
             match = _WORD.fullmatch(word)
             column = _column_of(match, of_part) if match else ""
             if match and column:
@@ -196,22 +196,22 @@ def _guess(recording: str) -> dict[str, str]:
 
 
 def _column_of(match: re.Match[str], earlier: dict[str, str]) -> str:
-    """The column that a word speaks of; blank where it speaks of none."""
+    """The column of a word; blank if there is none."""
     letter, unit = match["letter"].lower(), match["unit"].lower()
-    if letter in _BY_LETTER:
-        column = _BY_LETTER[letter]
+    if letter in _COLUMN_BY_LETTER:
+        column = _COLUMN_BY_LETTER[letter]
         quantity = split_unit(column)[0]
         if not unit:
             return column
-        same = [name for name in _BY_UNIT.values() if split_unit(name)[1].lower() == unit.replace("µ", "u")]
+        same = [name for name in _COLUMN_BY_UNIT.values() if split_unit(name)[1].lower() == unit.replace("µ", "u")]
         sizes = {"um", "mm", "cm", "in", "m"}
         if unit.replace("µ", "u") in sizes and split_unit(column)[1] in sizes:
             return f"{quantity}_{unit.replace('µ', 'u')}"
         return next((name for name in same if split_unit(name)[0] == quantity), "")
     if letter or not unit:
         return ""
-    column = _BY_UNIT.get(unit, "")
-    # As vines are named here, 12mm-100um-140mm: the second length is how long it grows.
+    column = _COLUMN_BY_UNIT.get(unit, "")
+    # In names of vines such as 12mm-100um-140mm the second length is that of the vine.
     if column == "diameter_mm" and column in earlier:
         return "length_mm"
     return column
@@ -223,17 +223,17 @@ def _is_number(name: str) -> bool:
 
 
 def _sheet_column(name: str) -> str:
-    """The sheet's own column of a quantity, whatever unit a name gives it in."""
+    """The sheet's column of a quantity, whatever the unit in the name."""
     quantity = split_unit(name)[0]
     return name if name in COLUMNS else next(column for column in COLUMNS if split_unit(column)[0] == quantity)
 
 
-def _in_unit(cell: str, name: str, column: str) -> str:
+def _converted(cell: str, name: str, column: str) -> str:
     return f"{convert(float(cell), split_unit(name)[1], split_unit(column)[1]):.6g}"
 
 
 def units_of(column: str) -> list[str]:
-    """Units in which a column may be written, its own first; none where it has no unit.
+    """Return the units in which a column may be written, its own first; none if it has no unit.
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ def _recordings(folder: Path, depth: int) -> Iterator[Path]:
             yield path
         elif path.is_dir() and not (path / PROVENANCE).exists() and not _is_calibration(path):
             inside = [entry for entry in _entries(path) if entry.suffix.lower() in kinds]
-            if len(inside) >= FEWEST_PICTURES:
+            if len(inside) >= MIN_PICTURES:
                 yield path
             elif depth > 0:
                 yield from _recordings(path, depth - 1)
@@ -287,13 +287,13 @@ def _is_stack(path: Path) -> bool:
         return False
     try:
         with Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= FEWEST_PICTURES
+            return getattr(image, "n_frames", 1) >= MIN_PICTURES
     except (OSError, UnidentifiedImageError):
         return False
 
 
 def _suffixes(which: str) -> frozenset[str]:
-    # The decoder is heavy: it is loaded where recordings are looked for, not with the command line.
+    # The decoder is slow to import: it is loaded only when recordings are searched.
     from vinetrack.video import frames
 
     return frozenset(getattr(frames, which))
@@ -308,6 +308,6 @@ def _clean(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "trial"
 
 
-def _natural(text: str) -> list[tuple[int, int, str]]:
-    """Numbers in a name by their size: 2 before 10."""
+def _natural_order(text: str) -> list[tuple[int, int, str]]:
+    """Sort key that orders numbers in a name by value: 2 before 10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.findall(r"\d+|\D+", text)]

@@ -1,4 +1,4 @@
-"""What the page shows of a recording: frames as JPEG, the axis that is proposed, and what the tracker makes of it."""
+"""Views of a recording for the page: frames as JPEG, the proposed axis, and the result of tracking."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from vinetrack.video.quick_look import proposed_axis
 from vinetrack.video.recording_facts import size_problems, tracked_facts
 from vinetrack.video.track import Tracking, track_recording
 
-QUALITY = 90
-"""Of JPEG, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks at the magnifier's scale; at 45 it does, and
-beyond 90 only the size grows."""
-KEPT_CLIPS = 2
-"""Recordings whose frames are kept; chosen: the one looked at and the one before. A thousand frames take about 100 MB;
+JPEG_QUALITY = 90
+"""JPEG quality, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks under the magnifier; at 45 it does, and above
+90 only the size grows."""
+CACHED_CLIPS = 2
+"""Recordings whose frames are cached; chosen: the current and the previous one. A thousand frames take about 100 MB;
 with one, going back decodes again, with four memory doubles."""
 THUMBNAIL_PX = 220
 """Width of the pictures in the list; chosen: as wide as its column."""
-BLANK = 128
-"""Grey level of the strip where no frame was decoded. Chosen between black and white; nothing depends on it."""
+BLANK_GREY = 128
+"""Grey level of the strip where no frame was decoded. Chosen: mid-grey; nothing depends on it."""
 PATH_STEP_PX = 4.0
-"""Distance of the places along a curve that the page gets, px. Chosen: between them it is drawn straight, off by less
-than 0.1 px at radii above 20 px; at half the page gets twice as many, at twice it is off by four times as much."""
+"""Spacing of the points of a curve sent to the page, px. Chosen: straight segments deviate by less than 0.1 px at radii
+above 20 px; at half there are twice as many points, at twice the deviation is four times as large."""
 STRIP_PX = 1600
 """Longest side of a strip; chosen: twice the page's width on a common screen."""
 
 
 @dataclass(frozen=True)
 class DecodedClip:
-    """A decoded recording: its frames as JPEG, and the axis found from the motion, or in words why there is none."""
+    """A decoded recording: its frames as JPEG, and the axis found from the motion, or the reason why there is none."""
 
     frames: tuple[bytes, ...]
     width: int
@@ -59,14 +59,14 @@ class DecodedClip:
     notes: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """What the page needs before it asks for a frame."""
+        """Return what the page needs before it requests a frame."""
         axis = None if self.axis is None else axis_json(self.axis)
         size = {"frames": len(self.frames), "width": self.width, "height": self.height}
         return {**size, "axis": axis, "no_axis": self.no_axis, "notes": list(self.notes)}
 
 
 class ClipStore:
-    """Decoded recordings of a folder, the latest kept. Safe to be asked from several threads."""
+    """Cache of decoded recordings of a folder. Thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -74,7 +74,7 @@ class ClipStore:
         self._lock = threading.Lock()
 
     def clip(self, recording: str) -> DecodedClip:
-        """A recording, decoded.
+        """Return a decoded recording, from the cache if possible.
 
         Parameters
         ----------
@@ -94,13 +94,13 @@ class ClipStore:
         with self._lock:
             if key not in self._clips:
                 self._clips[key] = _decoded(path)
-                while len(self._clips) > KEPT_CLIPS:
+                while len(self._clips) > CACHED_CLIPS:
                     self._clips.popitem(last=False)
             self._clips.move_to_end(key)
             return self._clips[key]
 
     def thumbnail(self, recording: str) -> bytes:
-        """The first frame, small, as JPEG; without decoding more.
+        """Return the first frame as a small JPEG, without decoding more.
 
         Parameters
         ----------
@@ -113,12 +113,12 @@ class ClipStore:
         Raises
         ------
         RecordingError
-            If not one frame can be decoded.
+            If no frame can be decoded.
         """
         return jpeg(_first_frame(safe_join(self.folder, recording)), THUMBNAIL_PX)
 
     def picture(self, name: str) -> NDArray[Any]:
-        """A single picture, or the first frame of a film, grey levels of shape (height, width).
+        """Return a single picture, or the first frame of a film, as grey levels.
 
         Parameters
         ----------
@@ -146,19 +146,19 @@ class ClipStore:
         -------
         mapping of JSON types; None where there is no board.
         """
-        seen = find_board(self.picture(name))
-        if seen is None:
+        target = find_board(self.picture(name))
+        if target is None:
             return None
-        board: dict[str, Any] = {"kind": seen.kind, "image": name, "squares": list(seen.squares)}
-        if seen.kind == "charuco":
-            board |= {"dictionary": seen.dictionary, "marker_share": round(seen.marker_share, 3)}
+        board: dict[str, Any] = {"kind": target.kind, "image": name, "squares": list(target.squares)}
+        if target.kind == "charuco":
+            board |= {"dictionary": target.dictionary, "marker_share": round(target.marker_share, 3)}
         return board
 
 
 def _first_frame(path: Path) -> NDArray[Any]:
     frame = next(iterate_frames(inspect_recording(path)), None)
     if frame is None:
-        raise RecordingError(f"{path.name}: not one frame can be decoded")
+        raise RecordingError(f"{path.name}: no frame can be decoded")
     return frame
 
 
@@ -175,13 +175,13 @@ def _decoded(path: Path) -> DecodedClip:
 
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:
-    """A grey picture as JPEG.
+    """Return a grey picture as JPEG.
 
     Parameters
     ----------
     picture : grey levels, shape (height, width).
-    widest : width that it is shrunk to, px.
-    white : grey level shown white; for 16 bits the brightest where None.
+    widest : maximum width, px.
+    white : grey level shown white; if None, for 16 bits the brightest.
 
     Returns
     -------
@@ -195,11 +195,11 @@ def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None =
     height, width = picture.shape
     if widest is not None and width > widest:
         picture = cv2.resize(picture, (widest, max(1, round(height * widest / width))), interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def axis_json(axis: Axis) -> dict[str, Any]:
-    """An axis for the page, px to a hundredth.
+    """Return an axis for the page, px to a hundredth.
 
     Parameters
     ----------
@@ -207,8 +207,8 @@ def axis_json(axis: Axis) -> dict[str, Any]:
 
     Returns
     -------
-    mapping of JSON types: `from_px`, `to_px`, of a curve `via_px` and places in equal steps along it, `path_px`; and
-        `width_px`, None where unknown.
+    mapping of JSON types: `from_px`, `to_px`, for a curve `via_px` and equally spaced points along it, `path_px`; and
+        `width_px`, None if unknown.
     """
     width = round(axis.width_px, 2) if math.isfinite(axis.width_px) else None
     ends: dict[str, Any] = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
@@ -220,17 +220,17 @@ def axis_json(axis: Axis) -> dict[str, Any]:
 
 
 def track_row(folder: Path, index: int) -> dict[str, Any]:
-    """Track the recording of one row, whatever else of it is still blank: strip, edge and what there is to say.
+    """Track the recording of one row, which may be incomplete: strip, edge and notes.
 
     Parameters
     ----------
-    folder : with the sheet and settings as drafted.
+    folder : with the sheet and settings of the draft.
     index : of the row.
 
     Returns
     -------
     mapping of JSON types
-        Without a scale positions are in pixels, without a rate times are in frames: `scaled` and `timed` tell. Flags
+        Without a scale positions are in pixels, without a rate times are in frames, see `scaled` and `timed`. Flags
         are those of the tracker alone: outliers and frames that only `tracks.frame_timing.correct_frames` finds,
         which needs the noise of positions, are marked where the trial is analysed.
 
@@ -239,7 +239,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
     ExperimentError
         If the settings cannot be read.
     RecordingError
-        If the recording holds no track.
+        If the recording cannot be tracked.
     """
     from vinetrack.core.tables import read_table
     from vinetrack.experiment.other_units import in_sheet_units
@@ -274,7 +274,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
 
 
 def warm_up() -> None:
-    """Track a rendered bar, so that the tracker is compiled before somebody waits for it."""
+    """Track a rendered bar, so that the tracker is compiled before the user needs it."""
     from vinetrack.video.frames import Frames, Recording
     from vinetrack.video.track import track_frames
 
@@ -287,12 +287,12 @@ def warm_up() -> None:
     try:
         track_frames(frames, Trial(name="warm-up", capture_fps=1000.0), 1000.0)
     except RecordingError:
-        # What matters is that it was compiled on the way.
+        # Only the compilation matters.
         return
 
 
 def _trial_of(values: dict[str, Any], folder: Path) -> Trial:
-    """A trial of the cells that can be read; nothing is asked of the others."""
+    """A trial made of the readable cells; the others keep their defaults."""
     fields: dict[str, Any] = {}
     for name, value in values.items():
         column = COLUMNS[name]
@@ -304,7 +304,7 @@ def _trial_of(values: dict[str, Any], folder: Path) -> Trial:
 
 
 def _axis_of(trial: Trial, settings: ExperimentSettings) -> Axis | None:
-    """The axis that is given, without a width: that is stated in millimetres, and there is no scale."""
+    """The given axis without its width, which is in millimetres, because there is no scale."""
     given = trial.axis or settings.axis
     if given is None:
         return None
@@ -314,7 +314,7 @@ def _axis_of(trial: Trial, settings: ExperimentSettings) -> Axis | None:
 def _track_json(tracking: Tracking) -> dict[str, Any]:
     track, strip = tracking.track, tracking.kymograph
     dark, light = np.nanpercentile(strip, [1, 99])
-    grey = np.full((len(track.time_s), strip.shape[1]), BLANK, np.uint8)
+    grey = np.full((len(track.time_s), strip.shape[1]), BLANK_GREY, np.uint8)
     grey[tracking.strip_rows] = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
     import cv2
 
@@ -348,7 +348,7 @@ def _scale_json(measurement: Measurement | None) -> dict[str, Any]:
 
 
 def _pressure_json(trial: Trial) -> dict[str, Any] | None:
-    """The measured pressure of a trial; in words why it cannot be read; None where no trace is named."""
+    """The pressure trace of a trial, or the reason why it cannot be read; None if there is none."""
     if trial.pressure_trace is None:
         return None
     try:
@@ -360,5 +360,5 @@ def _pressure_json(trial: Trial) -> dict[str, Any] | None:
 
 
 def _numbers(values: NDArray[Any], digits: int) -> list[float | None]:
-    """Numbers for JSON, which knows no NaN."""
+    """Rounded numbers for JSON, with None for NaN."""
     return [round(float(value), digits) if math.isfinite(value) else None for value in np.asarray(values, float)]

@@ -1,4 +1,4 @@
-"""The files of a draft: read, checked in a copy of the folder, and written whole."""
+"""The files of a draft: read, checked in a copy of the folder, and written atomically."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from vinetrack.setup_page.settings_draft import read_settings_text, shared_value
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
 
 FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)
-"""All that is ever written."""
+"""The only files that are written."""
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A sheet, settings and corrections not yet written; `stamp` tells whether the files have changed since."""
+    """A sheet, settings and corrections not yet written; `stamp` is the fingerprint of the files that were read."""
 
     sheet: SheetDraft
     settings: str
@@ -35,7 +35,7 @@ class Draft:
 
 
 def open_draft(folder: Path) -> Draft:
-    """What is there, with a row for every recording that has none.
+    """Read the files of a folder, and add a row for every recording that has none.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def open_draft(folder: Path) -> Draft:
     Raises
     ------
     ExperimentError
-        If the folder does not exist, holds no recording and no sheet, or a file in it cannot be read.
+        If the folder does not exist, has neither recordings nor a sheet, or a file in it cannot be read.
     """
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
@@ -69,7 +69,7 @@ def open_draft(folder: Path) -> Draft:
 
 
 def files_stamp(folder: Path) -> str:
-    """A fingerprint of the files as they are now.
+    """Return a fingerprint of the present files.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def files_stamp(folder: Path) -> str:
 
 
 def write_draft(folder: Path, draft: Draft) -> list[str]:
-    """Write what differs from the files that are there; nothing else in the folder is touched.
+    """Write the files that differ from the present ones; nothing else in the folder is changed.
 
     Parameters
     ----------
     folder : of the experiment.
-    draft : what the files are to hold, with the stamp of those that were read.
+    draft : new contents, with the fingerprint of the files that were read.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
     Raises
     ------
     ExperimentError
-        If somebody else has changed the files since.
+        If the files have been changed since.
     """
     if files_stamp(folder) != draft.stamp:
         message = "has changed since it was read, and is left as it is"
@@ -121,7 +121,7 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
 
 
 def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
-    """Whether two sheets hold the same columns and cells, however they are written.
+    """Return whether two sheets have the same columns and cells, whatever their format.
 
     Parameters
     ----------
@@ -141,8 +141,8 @@ def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
 
 
 @contextmanager
-def drafted(folder: Path, draft: Draft) -> Iterator[Path]:
-    """A folder as the experiment would be with this draft: links to everything else, for `check` and the tracker.
+def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
+    """Make a temporary folder with this draft and links to everything else, for `check` and the tracker.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The page served on this machine's own address: its files, what it asks for, and what it saves, until Ctrl-C."""
+"""HTTP server of the page, on the loopback address only: its files, its requests, and saving."""
 
 from __future__ import annotations
 
@@ -25,21 +25,23 @@ from vinetrack.core.local_page import (
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.experiment.corrections import corrections_text
 from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
-from vinetrack.setup_page.draft_files import drafted, files_stamp, write_draft
-from vinetrack.setup_page.page_state import draft_of, page_state, problems_json, problems_of
+from vinetrack.setup_page.draft_files import draft_folder, files_stamp, write_draft
+from vinetrack.setup_page.page_state import draft_from_json, draft_problems, page_state, problems_json
 from vinetrack.video.frames import RecordingError
 
 log = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).with_name("templates")
-LARGEST_REQUEST_BYTES = 20_000_000
-"""Chosen: a sheet of ten thousand rows takes a few megabytes; half would do, twice only wastes memory."""
+MAX_REQUEST_BYTES = 20_000_000
+"""Chosen: a sheet of ten thousand rows takes a few megabytes; half would suffice, twice only uses more memory."""
 
-ASKED_BY = "X-Vinetrack"
-"""Header of every request that changes or computes something: a page from elsewhere cannot send it unasked."""
+REQUEST_HEADER = "X-Vinetrack"
+"""Header required for requests that change or compute something: other web pages cannot send it (CSRF protection)."""
 
-KINDS = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
-POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+CONTENT_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+)
 
 
 class SetupServer(ThreadingHTTPServer):
@@ -57,7 +59,7 @@ class SetupServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """The address of the page."""
         return f"http://{LOOPBACK}:{self.server_port}{self.secret}/"
 
 
@@ -71,31 +73,31 @@ class _Handler(BaseHTTPRequestHandler):
         log.info(format, *args)
 
     def do_GET(self) -> None:
-        """Files of the page, frames and pictures."""
-        if not self._is_for_us():
+        """Serve files of the page, frames and pictures."""
+        if not self._is_authorised():
             return
         url = urlsplit(self.path.removeprefix(self.server.secret))
-        asked = {key: values[0] for key, values in parse_qs(url.query).items()}
+        query = {key: values[0] for key, values in parse_qs(url.query).items()}
         if url.path in ("/", "/setup.css") or url.path.endswith(".js"):
             self._send_file("setup.html" if url.path == "/" else url.path.lstrip("/"))
             return
         clips = self.server.clips
         answers: dict[str, Callable[[], bytes | dict[str, Any] | None]] = {
             "/api/state": lambda: page_state(self.server.folder),
-            "/api/clip": lambda: clips.clip(asked["recording"]).to_json(),
-            "/api/frame": lambda: _frame(clips, asked["recording"], int(asked["frame"])),
-            "/api/thumbnail": lambda: clips.thumbnail(asked["recording"]),
-            "/api/picture": lambda: jpeg(clips.picture(asked["picture"])),
-            "/api/board": lambda: clips.board(asked["picture"]),
+            "/api/clip": lambda: clips.clip(query["recording"]).to_json(),
+            "/api/frame": lambda: _frame(clips, query["recording"], int(query["frame"])),
+            "/api/thumbnail": lambda: clips.thumbnail(query["recording"]),
+            "/api/picture": lambda: jpeg(clips.picture(query["picture"])),
+            "/api/board": lambda: clips.board(query["picture"]),
         }
         self._answer(answers.get(url.path))
 
     def do_POST(self) -> None:
-        """Drafts to be checked, tracked or saved."""
-        if not self._is_for_us():
+        """Check, track or save a draft."""
+        if not self._is_authorised():
             return
         length = int(self.headers.get("Content-Length") or 0)
-        if self.headers.get(ASKED_BY) != "setup" or not 0 < length <= LARGEST_REQUEST_BYTES:
+        if self.headers.get(REQUEST_HEADER) != "setup" or not 0 < length <= MAX_REQUEST_BYTES:
             self.close_connection = True
             self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
             return
@@ -105,44 +107,50 @@ class _Handler(BaseHTTPRequestHandler):
             "/api/track": self._track,
             "/api/save": self._save,
         }
-        chosen = answers.get(self.path.removeprefix(self.server.secret))
-        self._answer(None if chosen is None else lambda: chosen(json.loads(body)))
+        handler = answers.get(self.path.removeprefix(self.server.secret))
+        self._answer(None if handler is None else lambda: handler(json.loads(body)))
 
     def _check(self, content: dict[str, Any]) -> dict[str, Any]:
-        draft = draft_of(self.server.folder, content)
-        judged = problems_of(self.server.folder, draft, thorough=bool(content.get("thorough")))
+        draft = draft_from_json(self.server.folder, content)
+        checked = draft_problems(self.server.folder, draft, thorough=bool(content.get("thorough")))
         texts = {"sheet_text": draft.sheet.text(), "settings_text": draft.settings}
-        return {**judged, **texts, "corrections_text": corrections_text(draft.corrections) if draft.corrections else ""}
+        return {
+            **checked,
+            **texts,
+            "corrections_text": corrections_text(draft.corrections) if draft.corrections else "",
+        }
 
     def _track(self, content: dict[str, Any]) -> dict[str, Any]:
-        draft = draft_of(self.server.folder, content)
-        with self.server.tracking, drafted(self.server.folder, draft) as copy:
+        draft = draft_from_json(self.server.folder, content)
+        with self.server.tracking, draft_folder(self.server.folder, draft) as copy:
             return track_row(copy, int(content["row"]))
 
     def _save(self, content: dict[str, Any]) -> dict[str, Any]:
         folder = self.server.folder
-        draft = draft_of(folder, content)
+        draft = draft_from_json(folder, content)
         written = write_draft(folder, draft)
         return {"written": written, "stamp": files_stamp(folder)}
 
-    def _is_for_us(self) -> bool:
-        """Whether the request names this server and its secret: a name elsewhere that leads here is refused."""
+    def _is_authorised(self) -> bool:
+        """Whether the request has the host name and the secret of this server (protects against DNS rebinding)."""
         hosts = allowed_hosts(self.server.server_port)
         origin = self.headers.get("Origin")
-        ours = self.headers.get("Host") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts})
-        if ours and self.path.startswith(f"{self.server.secret}/"):
+        is_ours = self.headers.get("Host") in hosts and (
+            origin is None or origin in {f"http://{host}" for host in hosts}
+        )
+        if is_ours and self.path.startswith(f"{self.server.secret}/"):
             return True
         self.close_connection = True
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
         return False
 
     def _answer(self, answer: Callable[[], bytes | dict[str, Any] | None] | None) -> None:
-        """Bytes are a JPEG, everything else JSON; what is wrong with the input is said in a sentence."""
+        """Send bytes as JPEG and everything else as JSON; errors of the input are sent as a sentence."""
         if answer is None:
             self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
             return
         try:
-            given = answer()
+            content = answer()
         except ExperimentError as error:
             self._send_json({"problems": problems_json(error), "words": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY)
         except (UserError, RecordingError) as error:
@@ -151,10 +159,10 @@ class _Handler(BaseHTTPRequestHandler):
             log.exception("%s", self.path)
             self._send_json({"words": f"{type(error).__name__}: {error}"}, HTTPStatus.BAD_REQUEST)
         else:
-            if isinstance(given, bytes):
-                self._send(HTTPStatus.OK, given, "image/jpeg")
+            if isinstance(content, bytes):
+                self._send(HTTPStatus.OK, content, "image/jpeg")
             else:
-                self._send_json(given, HTTPStatus.OK)
+                self._send_json(content, HTTPStatus.OK)
 
     def _send_json(self, content: Any, status: HTTPStatus) -> None:
         self._send(status, json.dumps(content, ensure_ascii=False).encode(), "application/json")
@@ -169,7 +177,7 @@ class _Handler(BaseHTTPRequestHandler):
             from vinetrack.figures.page_tokens import page_frame
 
             data = page_frame().encode() + data
-        self._send(HTTPStatus.OK, data, KINDS[path.suffix])
+        self._send(HTTPStatus.OK, data, CONTENT_TYPES[path.suffix])
 
     def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
@@ -178,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Type", kind + charset)
             self.send_header("Content-Length", str(len(data)))
             self.send_header("Cache-Control", "no-store")
-            self.send_header("Content-Security-Policy", POLICY)
+            self.send_header("Content-Security-Policy", CONTENT_SECURITY_POLICY)
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Referrer-Policy", "no-referrer")
             self.end_headers()
@@ -191,12 +199,12 @@ def _frame(clips: ClipStore, recording: str, number: int) -> bytes:
 
 
 def start_server(folder: Path, port: int | None = None) -> SetupServer:
-    """A server for a folder, not yet answering.
+    """Return a server for a folder that does not answer requests yet.
 
     Parameters
     ----------
     folder : of recordings.
-    port : to take, 0 for any that is free; None looks for one.
+    port : 0 for any free one; None for the first free one of a range.
 
     Returns
     -------
@@ -223,7 +231,7 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     Raises
     ------
     ExperimentError
-        If the folder holds no recording, or a file in it cannot be read.
+        If the folder has no recording, or a file in it cannot be read.
     PageError
         If the port is taken.
     """
@@ -231,10 +239,10 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     server = start_server(folder, port)
     threading.Thread(target=warm_up, daemon=True, name=f"{THREAD_PREFIX}warm-up").start()
     say(f"Set-up: {server.address}")
-    say("For this machine alone. Ctrl-C ends it.")
+    say("For this machine only. Ctrl-C ends it.")
     if browser:
         threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
-    # From the thread that serves, a shutdown would wait for itself.
+    # A shutdown from the serving thread would wait for itself.
     with stop_on_signals(lambda: threading.Thread(target=server.shutdown, daemon=True).start()):
         server.serve_forever(poll_interval=0.2)
     server.server_close()

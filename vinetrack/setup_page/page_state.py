@@ -1,4 +1,4 @@
-"""What passes between the page and the files: columns to choose from, cells, settings, and problems by their field."""
+"""Data exchanged between page and files: available columns, cells, settings, and problems with their fields."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vinetrack.experiment.folder import SETTINGS, check_experiment
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS
 from vinetrack.setup_page.clip_names import list_pictures, list_recordings, list_tables, units_of
-from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, same_cells
+from vinetrack.setup_page.draft_files import Draft, draft_folder, open_draft, same_cells
 from vinetrack.setup_page.settings_draft import shared_values, with_shared
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
 
-OFFERED = (
+OFFERED_COLUMNS = (
     "capture_fps",
     *REQUIRED_COLUMNS,
     "payload_g",
@@ -29,11 +29,11 @@ OFFERED = (
     "exposure_us",
     "pressure_trace",
 )
-"""Columns that the page shows from the start, whether or not the sheet has them."""
+"""Columns that the page always shows, whether or not the sheet has them."""
 
 
 def page_state(folder: Path) -> dict[str, Any]:
-    """Everything the page begins with.
+    """Return the initial state of the page.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         If the folder holds no recording, or a file in it cannot be read.
     """
     draft = open_draft(folder)
-    there = read_draft(folder)
+    present = read_draft(folder)
     content = parse_yaml(draft.settings, SETTINGS).content
     shared = {key: str(value) for key, value in shared_values(draft.settings).items()}
     return {
@@ -58,10 +58,10 @@ def page_state(folder: Path) -> dict[str, Any]:
         "stamp": draft.stamp,
         "known": {name: _column_json(name) for name in COLUMNS if name not in ("trial", "video")},
         "units": {key: unit.text for key, unit in UNITS.items()},
-        "offered": list(OFFERED),
+        "offered": list(OFFERED_COLUMNS),
         "sheet": _sheet_json(draft.sheet),
-        "kept": list(there.columns) if there.rows else ["trial", "video"],
-        "unsaved": not (folder / SETTINGS).exists() or not there.rows or not same_cells(there, draft.sheet),
+        "kept": list(present.columns) if present.rows else ["trial", "video"],
+        "unsaved": not (folder / SETTINGS).exists() or not present.rows or not same_cells(present, draft.sheet),
         "shared": shared,
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
@@ -95,7 +95,7 @@ def _sheet_json(sheet: SheetDraft) -> dict[str, Any]:
 
 
 def _place(correction: Correction) -> dict[str, Any]:
-    """To where a point is moved, for JSON, which knows no NaN."""
+    """New position of a moved point for JSON, with None for NaN."""
     return {"edge_px": correction.edge_px if math.isfinite(correction.edge_px) else None}
 
 
@@ -104,18 +104,18 @@ def _frame(point: Mapping[str, Any]) -> int:
 
 
 def _correction(point: Mapping[str, Any]) -> Correction:
-    """A correction as the page sends it."""
+    """A correction from the JSON of the page."""
     edge_px = math.nan if point["edge_px"] is None else float(point["edge_px"])
     return Correction(_frame(point), str(point["action"]), edge_px)
 
 
-def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
-    """The draft that the page has sent; comments and keys that it knows nothing of come from the files.
+def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
+    """Return the draft sent by the page; comments and keys unknown to the page come from the files.
 
     Parameters
     ----------
     folder : of the experiment.
-    content : `sheet`, `shared`, `calibration`, `axis`, `corrections` and `stamp` as the page has them.
+    content : `sheet`, `shared`, `calibration`, `axis`, `corrections` and `stamp` of the page.
 
     Returns
     -------
@@ -124,14 +124,14 @@ def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
     Raises
     ------
     ExperimentError
-        If a file cannot be read, or a key cannot be set without harm.
+        If a file cannot be read, or a key cannot be set without damaging the file.
     """
-    there = open_draft(folder)
+    from_files = open_draft(folder)
     sent = content["sheet"]
     columns = tuple(str(column) for column in sent["columns"])
     rows = tuple({name: str(row.get(name, "")) for name in columns} for row in sent["rows"])
-    sheet = SheetDraft(columns, rows, there.sheet.delimiter, there.sheet.decimal)
-    text = with_shared(there.settings, {str(key): str(cell) for key, cell in content["shared"].items()})
+    sheet = SheetDraft(columns, rows, from_files.sheet.delimiter, from_files.sheet.decimal)
+    text = with_shared(from_files.settings, {str(key): str(cell) for key, cell in content["shared"].items()})
     present = parse_yaml(text, SETTINGS).content
     for key in ("calibration", "axis"):
         value = content.get(key)
@@ -142,8 +142,8 @@ def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
     return Draft(sheet, text, str(content["stamp"]), corrections)
 
 
-def problems_of(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
-    """What `vinetrack check` would say of a draft, each problem with the field it concerns.
+def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
+    """Return the messages of `vinetrack check` for a draft, each problem with the field concerned.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def problems_of(folder: Path, draft: Draft, thorough: bool = False) -> dict[str,
     """
     notes: list[str] = []
     understood: list[str] = []
-    with drafted(folder, draft) as copy:
+    with draft_folder(folder, draft) as copy:
         if thorough:
             from vinetrack.pipeline.check_stage import check_folder
 
@@ -173,7 +173,7 @@ def problems_of(folder: Path, draft: Draft, thorough: bool = False) -> dict[str,
 
 
 def _scale_missing(draft: Draft) -> list[Problem]:
-    """What the recordings' own check would say of a scale that nobody gives."""
+    """The problem that the check of recordings would report for a missing scale."""
     content = parse_yaml(draft.settings, SETTINGS).content
     has_scale = content.get("calibration") is not None or content.get("mm_per_px") is not None
     without = [row for row in draft.sheet.rows if row.get("video") and not row.get("mm_per_px")]
@@ -184,21 +184,21 @@ def _scale_missing(draft: Draft) -> list[Problem]:
 
 
 def problems_json(error: ExperimentError) -> list[dict[str, Any]]:
-    """Problems that keep a draft from being read at all.
+    """Return the problems of a draft that cannot be read at all.
 
     Parameters
     ----------
-    error : what was raised.
+    error : the exception.
 
     Returns
     -------
-    list of mappings of JSON types, as of `problems_of`.
+    list of mappings of JSON types, as of `draft_problems`.
     """
     return [_problem_json(problem, None) for problem in error.problems]
 
 
 def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
-    """A problem with its field: a cell of the sheet, a value for all trials, the scale, the axis, or the whole."""
+    """A problem with its field: a cell of the sheet, a value for all trials, the scale, the axis, or `whole`."""
     column = problem.column
     field = "whole"
     if column.split(".")[0] in ("calibration", "axis") and not problem.trial:
@@ -222,6 +222,6 @@ def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
 
 
 def _as_drafted(column: str, draft: Draft) -> str:
-    """A column by the name it has in the draft, where it may stand in another unit."""
+    """The name of a column in the draft, which may have another unit."""
     quantity = split_unit(column)[0]
     return next((name for name in draft.sheet.columns if split_unit(name)[0] == quantity), column)

@@ -1,4 +1,4 @@
-"""`experiment.yaml` as it is being filled in: a text whose comments stay, and a first one whose comments explain it."""
+"""Editing of `experiment.yaml` as text with its comments preserved, and a commented template for a new one."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ FIRST_KEYS = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_
 """Keys of a new file: what all trials of most campaigns share."""
 
 _HEAD = """\
-# What all trials share; a column of the same name in trials.csv overrides it. Values keep the unit in their name;
+# What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
 # a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
 """
 _SCALE = """\
 # The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
 # (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
 calibration:
-# The growth axis in the picture (from_px, to_px, width_mm); found from the motion where blank.
+# The growth axis in the picture (from_px, to_px, width_mm); found from the motion if blank.
 axis:
 """
 
 
 def read_settings_text(folder: Path) -> str:
-    """The text of `experiment.yaml`; where there is none, that of a new one with blanks to fill.
+    """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def read_settings_text(folder: Path) -> str:
     Raises
     ------
     ExperimentError
-        If there is one that cannot be read, or is no YAML.
+        If it exists but cannot be read, or is not YAML.
     """
     path = folder / SETTINGS
     if not path.exists():
@@ -58,7 +58,7 @@ def read_settings_text(folder: Path) -> str:
 
 
 def first_settings() -> str:
-    """The text of a new `experiment.yaml`: keys without values, and behind each what it is and how it is measured."""
+    """Return a template of `experiment.yaml`: keys without values, each with its meaning and how to measure it."""
     width = max(len(key) for key in FIRST_KEYS) + 3
     lines = [f"{f'{key}:':{width}}# {_comment(key)}\n" for key in FIRST_KEYS]
     return _HEAD + "".join(lines) + _SCALE
@@ -73,7 +73,7 @@ def _comment(key: str) -> str:
 
 
 def shared_values(text: str) -> dict[str, Any]:
-    """Columns that the settings set for all trials, those in other units by the name they have there.
+    """Return the columns that the settings set for all trials, under the names (and units) used there.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def shared_values(text: str) -> dict[str, Any]:
 
     Returns
     -------
-    key to value as YAML has it; blank keys are left out.
+    dict of YAML values by key, without blank keys.
     """
     quantities = {split_unit(name)[0] for name in SHARED}
     content = parse_yaml(text, SETTINGS).content
@@ -93,12 +93,12 @@ def shared_values(text: str) -> dict[str, Any]:
 
 
 def with_shared(text: str, values: Mapping[str, str]) -> str:
-    """The settings with columns set for all trials, or left blank; other keys and all comments stay.
+    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept.
 
     Parameters
     ----------
     text : of `experiment.yaml`.
-    values : cells by column, which may be named in another unit; a blank cell clears the key.
+    values : cells by column, whose name may be in another unit; a blank cell clears the key.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def with_shared(text: str, values: Mapping[str, str]) -> str:
     Raises
     ------
     ExperimentError
-        If a key cannot be set without harm.
+        If a key cannot be set without damaging the file.
     """
     content = parse_yaml(text, SETTINGS).content
     for key, cell in values.items():
@@ -128,7 +128,7 @@ def _same_quantity(name: str, other: str) -> bool:
 
 
 def _value(cell: str) -> Any:
-    """A cell as YAML would read it, so that a number is not put in quotes; None where it is blank."""
+    """A cell as YAML would read it, so that a number is not quoted; None if it is blank."""
     cell = cell.strip()
     if not cell:
         return None

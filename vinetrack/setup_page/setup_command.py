@@ -1,4 +1,4 @@
-"""The command `vinetrack setup`: the page, or the two files with blanks to fill."""
+"""The command `vinetrack setup` without its page: the two files with blanks to fill."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from vinetrack.experiment.sheet import SHEET
 from vinetrack.setup_page.draft_files import open_draft, write_draft
 
 
-def write_blanks(folder: Path, say: Callable[[str], None]) -> None:
-    """Write the sheet and settings of a folder of recordings, with blanks to fill; what is there already stays.
+def write_templates(folder: Path, say: Callable[[str], None]) -> None:
+    """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ def write_blanks(folder: Path, say: Callable[[str], None]) -> None:
     Raises
     ------
     ExperimentError
-        If the folder holds no recording, or a file in it cannot be read.
+        If the folder has no recording, or a file in it cannot be read.
     """
     draft = open_draft(folder)
     written = write_draft(folder, draft)
@@ -31,16 +31,16 @@ def write_blanks(folder: Path, say: Callable[[str], None]) -> None:
     for name in written:
         say(f"Written: {folder / name}")
     if not written:
-        say(f"{SHEET} and {SETTINGS} of {folder} hold every recording already.")
+        say(f"{SHEET} and {SETTINGS} of {folder} already contain every recording.")
     say(f"{len(rows)} trials; from the names of recordings: {', '.join(filled) if filled else 'nothing'}.")
     blanks = sorted({problem.column for problem in _missing(folder) if problem.column}, key=_place)
     if blanks:
-        say(f"To fill in: {', '.join(blanks)}. A value that all trials share stands in {SETTINGS}.")
+        say(f"To fill in: {', '.join(blanks)}. A value that all trials share goes into {SETTINGS}.")
     say(f"Then: vinetrack check {folder}")
 
 
 def _missing(folder: Path) -> list[Problem]:
-    """What the files still lack."""
+    """What is still missing in the files."""
     problems = [problem for problem in check_experiment(folder) if problem.severity == "error"]
     missing = [problem for problem in problems if problem.message in ("is missing", "is blank")]
     try:

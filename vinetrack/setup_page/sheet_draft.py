@@ -1,4 +1,4 @@
-"""The trial sheet as it is being filled in: cells as text, those of a sheet that is there already kept as they are."""
+"""Editing of the trial sheet: cells as text, with those of an existing sheet preserved."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, read_table
 from vinetrack.core.units import split_unit
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.setup_page.clip_names import guess_columns, trial_names
+from vinetrack.setup_page.clip_names import columns_from_names, trial_names
 
 FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
-"""Columns of a new sheet: what names a trial and what differs between trials of most campaigns."""
+"""Columns of a new sheet: the names, and what differs between trials in most campaigns."""
 
 
 @dataclass(frozen=True)
 class SheetDraft:
-    """Rows of cells by column, as text; `delimiter` and `decimal` are those of the sheet that was there."""
+    """Rows of cells by column, as text; `delimiter` and `decimal` are those of the existing sheet."""
 
     columns: tuple[str, ...]
     rows: tuple[Mapping[str, str], ...]
@@ -28,7 +28,7 @@ class SheetDraft:
     decimal: str = "."
 
     def text(self) -> str:
-        """The sheet as it is written to a file."""
+        """Return the sheet as CSV text."""
         out = io.StringIO()
         writer = csv.writer(out, delimiter=self.delimiter, lineterminator="\n")
         writer.writerow(self.columns)
@@ -37,7 +37,7 @@ class SheetDraft:
 
 
 def read_draft(folder: Path) -> SheetDraft:
-    """The sheet of a folder as a draft; without rows where there is none.
+    """Read the sheet of a folder as a draft; without rows if there is none.
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ def read_draft(folder: Path) -> SheetDraft:
 
     Returns
     -------
-    SheetDraft : every column and cell that is there, known or not.
+    SheetDraft : every column and cell, known or not.
 
     Raises
     ------
     ExperimentError
-        If the sheet cannot be read, or holds cells without a column, which would be lost.
+        If the sheet cannot be read, or has cells without a column, which would be lost.
     """
     path = folder / SHEET
     if not path.exists():
@@ -68,13 +68,13 @@ def read_draft(folder: Path) -> SheetDraft:
 
 
 def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mapping[str, object]) -> SheetDraft:
-    """The draft with a row for each recording that has none, filled in as far as the recordings' names tell.
+    """Return the draft with a row added for each recording that has none, filled in from the recordings' names.
 
     Parameters
     ----------
-    draft : whose rows stay as they are.
+    draft : its rows are kept.
     recordings : relative paths.
-    shared : what `experiment.yaml` says of all trials; a guess that says the same is left out.
+    shared : values in `experiment.yaml`; an equal value from a name is left out.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mappin
     columns = list(draft.columns)
     rows: list[Mapping[str, str]] = list(draft.rows)
     present = {split_unit(column)[0]: column for column in columns}
-    for recording, name, guess in zip(new, names, guess_columns(new), strict=True):
+    for recording, name, guess in zip(new, names, columns_from_names(new), strict=True):
         row = {"trial": name, "video": recording}
         for column, cell in guess.items():
             quantity = split_unit(column)[0]
@@ -112,6 +112,6 @@ def _first_quantities() -> set[str]:
 
 
 def _path(text: str) -> str:
-    """A path so that the same file is the same text."""
+    """A normalised path."""
     parts = [part for part in text.strip().replace("\\", "/").split("/") if part not in ("", ".")]
     return "/".join(parts)
