@@ -44,7 +44,7 @@ def design() -> CampaignDesign:
 
 @pytest.fixture(scope="module")
 def power(design: CampaignDesign) -> Power:
-    return power_of(planned_tests(design)[0], curved=True)
+    return power_of(planned_tests(design)[0], nonlinear=True)
 
 
 @pytest.fixture(scope="module")

@@ -58,9 +58,9 @@ def test_one_name_with_enough_evidence_stops_the_campaign() -> None:
     [
         (diagnosis(rival=0.2), "air_drag is not excluded"),
         (diagnosis(log_bayes=2.0), "nothing missing is not excluded"),
-        (diagnosis(final=UNEXPLAINED), "in no list"),
-        (diagnosis(verdict=UNEXPLAINED), "in no list"),
-        (diagnosis(verdict=AMBIGUOUS), "several names are left"),
+        (diagnosis(final=UNEXPLAINED), "not among the candidates"),
+        (diagnosis(verdict=UNEXPLAINED), "not among the candidates"),
+        (diagnosis(verdict=AMBIGUOUS), "several effects are left"),
         (diagnosis(verdict=ADEQUATE), "nothing is found to be missing"),
         (diagnosis(log_bayes=math.nan), "not known"),
         (replace(diagnosis(), rounds=(), refused="no trial moves"), "no trial moves"),
@@ -125,7 +125,7 @@ def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_command_prints_looks_and_what_is_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    look = CampaignLook(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several names are left")
+    look = CampaignLook(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several effects are left")
     ledger = Ledger(0.03, (look,), ("x",), "Two trials at 30 kPa.")
     monkeypatch.setattr(sequence_stage, "look_at_folder", lambda *_: ledger)
     file = tmp_path / "ledger.json"

@@ -1,6 +1,6 @@
-"""The power of a campaign: of trials that were fitted, or of a design that nobody has filmed.
+"""Power of a campaign: of trials that were fitted, or of a planned design.
 
-The second is made in the computer without noise, and questioned with the noise and scatter that are expected of it.
+A planned campaign is simulated without noise, and tested with the noise and between-trial scatter expected of it.
 """
 
 from __future__ import annotations
@@ -24,38 +24,39 @@ from vinetrack.planning.campaign_information import FilmingPlan
 from vinetrack.planning.simulated_campaigns import make
 
 NOISELESS = 1e-3
-"""Part of the stated noise that the campaign without noise has. Chosen: the noise of a track is estimated, and must not
-be 0; a thousandth moves no number by more than a thousandth of its error."""
+"""Part of the stated noise that the noise-free campaign has. Chosen: the noise of a track is estimated and must not be
+0; a thousandth moves no parameter by more than a thousandth of its error."""
 
 
 def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequence[PowerInput] = ()) -> Power:
-    """Work out what the trials of a fit can see of the effects that are not in its model.
+    """Compute which effects outside its model the trials of a fit can detect.
 
     Parameters
     ----------
-    fitted : of the trials; from a host of the candidates, no kernel is compiled anew.
+    fitted : of the trials; from a host of the candidates, so that no kernel is compiled anew.
     candidates : sequence of str, optional
         Names of effects; the catalogue where None.
     inputs : sequence of PowerInput
-        What the power rests on, with its origin; noise and between-trial spreads of the fit where empty.
+        What the power is based on, with its origin; noise and between-trial scatter of the fit where empty.
 
     Returns
     -------
     Power
     """
-    questioned = candidates_of(fitted.model, candidates, fitted.model.user_effects)
-    effects, blind = testable(questioned, fitted.predictor.data)
-    return power_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), blind, inputs, curved=True)
+    candidates_to_test = candidates_of(fitted.model, candidates, fitted.model.user_effects)
+    effects, not_testable = testable(candidates_to_test, fitted.predictor.data)
+    tests = misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
+    return power_of(tests, not_testable, inputs, nonlinear=True)
 
 
 def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> Power:
-    """Work out what a campaign that nobody has filmed could see.
+    """Compute which effects a planned campaign could detect.
 
     Parameters
     ----------
     design : of the campaign.
     inputs : sequence of PowerInput
-        What its noise and scatter are, and where that is from.
+        Its noise and scatter, and where they come from.
 
     Returns
     -------
@@ -66,18 +67,18 @@ def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> P
     FitError
         If no trial of the design can be fitted.
     """
-    questions, blind = planned_tests(design)
-    return power_of(questions, blind, inputs, curved=True)
+    tests, not_testable = planned_tests(design)
+    return power_of(tests, not_testable, inputs, nonlinear=True)
 
 
 @dataclass(frozen=True)
 class CampaignDesign:
-    """What a campaign is simulated from: the true model with its values, trials, cameras, between-trial spreads.
+    """What a campaign is simulated from: the true model with its values, trials, cameras, between-trial scatter.
 
-    `cameras`, `slow_error_m` and `has_trace` are of each trial: how it is filmed, the slow error that its tracker
-    states (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names of
-    effects, the catalogue where None. `other_values` are those of the parameters of an effect behind its first, SI, by
-    its name, as `EffectPower` has them.
+    `cameras`, `slow_error_m` and `has_trace` are given for each trial: how it is filmed, the slow error that its
+    tracker states (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names
+    of effects, the catalogue where None. `other_values` are the values, SI, of the parameters of an effect after its
+    first, by its name, as in `EffectPower`.
     """
 
     model: Model
@@ -91,7 +92,7 @@ class CampaignDesign:
 
     @property
     def to_fit(self) -> Model:
-        """The model without the values that a fit finds."""
+        """The model without the values that a fit estimates."""
         held = [f"{effect.name}.{parameter.name}" for effect in self.model for parameter in effect.parameters
                 if parameter.held]  # fmt: skip
         return replace(self.model, values={key: self.model.values[key] for key in held if key in self.model.values})
@@ -107,7 +108,7 @@ class CampaignDesign:
         Returns
         -------
         CampaignDesign
-            Its further parameters stand at `other_values`, else at the middle of what is plausible.
+            Its further parameters are those of `other_values`, else in the middle of the plausible range.
         """
         model = self.model + name
         effect = next(effect for effect in model if effect.name == name)
@@ -120,13 +121,13 @@ class CampaignDesign:
 
 
 def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> CampaignDesign:
-    """The design that a fit's trials are an instance of: its model for the truth, noise and spreads as it found them.
+    """The design of a fitted campaign, with its model as the truth and its noise and scatter as estimated.
 
     Parameters
     ----------
     fitted : of a campaign.
     candidates : sequence of str, optional
-        Names of the effects that a diagnosis would ask about.
+        Names of the effects that a diagnosis would test.
 
     Returns
     -------
@@ -158,43 +159,43 @@ def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> Campa
 
 
 def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
-    """Hold a campaign without noise against all candidates, with the noise and spreads of its design.
+    """Misfit tests of a noise-free campaign with all candidates, under the noise and scatter of its design.
 
     Parameters
     ----------
-    design : of a campaign that nobody has filmed.
+    design : of a planned campaign.
 
     Returns
     -------
-    questions : MisfitTests
+    tests : MisfitTests
         Its scores are zero but for rounding; its information is what the campaign would have.
     not_testable : dict
-        Reasons by name of the candidates that the sheet does not let act.
+        Reasons by name of the candidates that cannot act with this sheet.
 
     Raises
     ------
     FitError
         If no trial of the design can be fitted.
     """
-    questioned = candidates_of(design.model, design.candidates, design.model.user_effects)
-    host = host_for(design.model, questioned)
-    quiet = [replace(camera, noise_m=NOISELESS * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
+    candidates_to_test = candidates_of(design.model, design.candidates, design.model.user_effects)
+    host = host_for(design.model, candidates_to_test)
+    cameras = [replace(camera, noise_m=NOISELESS * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
     exact = [replace(trial, yield_pressure_sigma_Pa=0.0) for trial in design.trials]
-    # Replicates without noise are the same track: what they do alike is then simulated once. Told by what is written
-    # of them, since from Python 3.13 on records that hold a NaN equal none.
-    kinds = [
+    # Noise-free replicates have the same track, which is simulated once. They are compared by their text, because from
+    # Python 3.13 on records that hold a NaN are not equal to themselves.
+    signatures = [
         repr((replace(trial, name="", specimen="", day="", order=0.0), camera))
-        for trial, camera in zip(exact, quiet, strict=True)
+        for trial, camera in zip(exact, cameras, strict=True)
     ]
-    first = [kinds.index(kind) for kind in kinds]
-    distinct = sorted(set(first))
-    made = make(
-        design.model, [exact[k] for k in distinct], [quiet[k] for k in distinct], (0.0, 0.0),
+    first = [signatures.index(signature) for signature in signatures]
+    unique = sorted(set(first))
+    simulated = make(
+        design.model, [exact[k] for k in unique], [cameras[k] for k in unique], (0.0, 0.0),
         np.random.default_rng(0), host,
     )  # fmt: skip
     pairs = []
     for planned, k in zip(design.trials, first, strict=True):
-        trial, track = made[distinct.index(k)]
+        trial, track = simulated[unique.index(k)]
         pairs.append((replace(planned, position_systematic_m=trial.position_systematic_m), track))
     noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
     noise = (noise_m, design.cameras[0].noise_correlation)
@@ -207,12 +208,12 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
         profile=False,
         thorough=False,
     )
-    effects, blind = testable(questioned, fitted.predictor.data)
-    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), blind
+    effects, not_testable = testable(candidates_to_test, fitted.predictor.data)
+    return misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND), not_testable
 
 
 def with_measurement_errors(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
-    """Give tracks the slow error that a tracker states, and the pressure where the campaign measures it.
+    """Give tracks the slow error that a tracker states, and the pressure trace where the campaign measures it.
 
     Parameters
     ----------

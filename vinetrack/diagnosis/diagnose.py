@@ -194,7 +194,7 @@ def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, s
     lacking = [name for name, why in blind.items() if "`" in why]
     if lacking and any(step.verdict == UNEXPLAINED for step in rounds):
         explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
-    power = power_of(findings[-1].tests, blind, first=findings[0].tests)
+    power = power_of(findings[-1].tests, blind, first_round=findings[0].tests)
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits), power=power)
 
 

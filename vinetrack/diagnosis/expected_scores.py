@@ -1,10 +1,10 @@
-"""Expected scores of effects of a finite size: the model without the effect, fitted to what the effect would show.
+"""Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
 
-Linear theory (`vinetrack.diagnosis.linear_power`) takes the free numbers to move in proportion to the size of an
-effect. An effect that they nearly imitate moves them by many standard errors before anything is left to be seen, and by
-then sensitivities have changed. So each effect is put into noise-free trajectories at the size in question, the model
-without it is fitted to them with noise and spreads held, and its score is read there: the data set of Asimov (Cowan,
-Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011).
+In linear theory (`vinetrack.diagnosis.linear_power`) the free parameters move in proportion to the size of an effect.
+An effect that they nearly imitate moves them by many standard errors before it becomes detectable, and by then the
+sensitivities have changed. So each effect is put into noise-free trajectories at the size in question, the model
+without it is fitted to them with noise and between-trial standard deviations held, and the score is computed there: the
+Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 """
 
 from __future__ import annotations
@@ -33,39 +33,39 @@ from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.trajectory_jobs import Jobs
 from vinetrack.inference.whitening import at_correlation
 
-ITERATIONS, SETTLED = 20, 0.2
-"""Gauss–Newton steps of the fit without the effect, after which it is not trusted; and the decrease of −2 ln L,
-promised by a step, below which it has settled. Chosen as a safeguard: of 62 fits of 24 trials of one vine 55 settle
-within four steps and all within fourteen (a pressure gauge 1.5 kPa off was the last); at half that is passed over.
-Derived: 0.2 of the 49 of seven standard errors moves a score by 0.2 %; at half or twice by 0.1 and 0.4 %."""
+MAX_ITERATIONS, CONVERGENCE_DECREASE = 20, 0.2
+"""Most Gauss–Newton steps of the fit without the effect, beyond which it is not used; and the predicted decrease of −2
+ln L below which it has converged. Chosen as a safeguard: of 62 fits of 24 trials of one vine 55 converge within four
+steps and all within fourteen (a pressure gauge 1.5 kPa off was the last); at half of it that one is not used. Derived:
+0.2 of the 49 of seven standard errors moves a score by 0.2 %; at half or twice by 0.1 and 0.4 %."""
 
 
-IN_PROPORTION = 0.02
-"""Relative deviation of an expected score from proportion to the size that is passed over. Chosen: 2 % of a size, where
-the draws leave 0.5 %; at half more effects are followed at two sizes, and at twice sizes err by as much as noise and
-scatter are known from 24 trials."""
+LINEARITY_TOLERANCE = 0.02
+"""Relative deviation of an expected score from linear theory that is neglected. Chosen: 2 % of a size, where the draws
+leave 0.5 %; at half more effects are computed at two sizes, and at twice sizes err by as much as noise and scatter are
+known from 24 trials."""
 
-BELIEVABLE = 2.0
-"""Ratio of an expected score to that in proportion to the size from which neither is trusted, as below 0. Chosen: a fit
-without the effect that ends in another minimum leaves too much; at half every convex effect is passed over, at twice
-some of those fits count. A small ratio is trusted: 0.11 and 0.20 of rolling shutter (tuning seed 21100), 0.43 of a slow
-valve (21110) were borne out by the independent simulator."""
+MAX_SCORE_RATIO = 2.0
+"""Ratio of an expected score to that of linear theory from which neither is used, as below 0. Chosen: a fit without the
+effect that ends in another minimum leaves too much; at half every convex effect is excluded, at twice some of those
+fits count. A small ratio is used: the independent simulator confirmed 0.11 and 0.20 of rolling shutter (tuning seed
+21100) and 0.43 of a slow valve (21110)."""
 
-ENOUGH = 7.0
-"""Expected score from which no larger size is tried. Chosen: thresholds are 3.6 to 4.6, and 90 % lie 1.3 above; at half
-sizes are worked out by proportion from below a threshold, at twice time is spent beyond all of them."""
+LARGEST_SCORE = 7.0
+"""Expected score from which no larger size is tried. Chosen: thresholds are 3.6 to 4.6, and a power of 90 % lies 1.3
+above; at half sizes are extrapolated from below a threshold, at twice time is spent beyond all of them."""
 
 LARGEST_MULTIPLE = 56.0
-"""Multiple of the size of one standard error beyond which no size is tried. Chosen: three doublings of 7; what is not
-seen there is fitted away by other numbers, and larger sizes take time only."""
+"""Multiple of the size of one standard error beyond which no size is tried. Chosen: three doublings of 7; an effect
+that is not detected there is absorbed by other parameters, and larger sizes only take time."""
 
 
 @dataclass(frozen=True)
 class NoiselessStart:
-    """Trajectories of a fit without deviations of its trials, where every fit without an effect begins.
+    """Trajectories of a fit with the deviations of its trials set to zero, where every fit without an effect starts.
 
-    `predictor` has the steps of differences that suit them, `columns` are their sensitivities at the fit's points, the
-    last the residual.
+    `predictor` has finite-difference steps that suit them; `columns` are their sensitivities at the fit's points, the
+    residual last.
     """
 
     state: FitState
@@ -75,7 +75,7 @@ class NoiselessStart:
 
 
 def noiseless_start(fit: Fit) -> NoiselessStart:
-    """Take the deviations of trials out of a fit and linearise there: the same for every effect and size.
+    """Set the trial deviations of a fit to zero and linearise there: the same start for every effect and size.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def noiseless_start(fit: Fit) -> NoiselessStart:
     Raises
     ------
     SimulationError
-        If the trajectories cannot be followed.
+        If the trajectories cannot be simulated.
     """
     trial_effects = fit.state.trial_effects.copy()
     trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
@@ -99,24 +99,25 @@ def noiseless_start(fit: Fit) -> NoiselessStart:
 
 
 def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
-    """A predictor of other positions of the same trials, which begins with the same steps of differences."""
+    """A predictor for other positions of the same trials, with the same initial finite-difference steps."""
     other = Predictor(predictor.layout, data, predictor.host)
     other.steps, other.pressure_step = predictor.steps.copy(), predictor.pressure_step.copy()
     return other
 
 
-def score_ratios(questions: MisfitTests, place: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
-    """Sizes that an effect is followed at, and by what its expected scores there differ from proportion to the size.
+def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
+    """Sizes of an effect, and the ratios of its expected scores there to those of linear theory.
 
-    Where the score at seven units, beyond any threshold, is in proportion, no other size is tried; else, and where it
-    cannot be followed (exactly 1), one about a threshold too, and ever larger ones as long as their scores are below
-    thresholds: what the release times of trials take up, such as a slow valve, is seen only where it is large. Beyond
-    what is believable of a ratio, proportion stands.
+    Where the score at seven units, above any threshold, agrees with linear theory, no other size is computed.
+    Otherwise, and where the effect cannot be simulated there (a ratio of exactly 1), one near a threshold is computed
+    as well, and ever larger ones while their scores stay below the thresholds: an effect that the release times of
+    trials absorb, such as a slow valve, is detected only where it is large. Where a ratio is implausible, linear theory
+    is used.
 
     Parameters
     ----------
-    questions : the fit, held against all candidates.
-    place : of the shape in which the effect is put in.
+    tests : the misfit tests of the fit with all candidates.
+    shape_index : of the shape in which the effect is added.
     unit : size whose score is one standard error, SI.
     start : NoiselessStart
         Of the fit.
@@ -126,28 +127,28 @@ def score_ratios(questions: MisfitTests, place: int, unit: float, start: Noisele
     sizes : array, shape (n_sizes,), SI
     ratios : array, shape (n_sizes,)
     """
-    large = score_ratio(questions, place, 7 * unit, start)
-    if 0 < abs(large - 1) < IN_PROPORTION:
+    large = score_ratio(tests, shape_index, 7 * unit, start)
+    if 0 < abs(large - 1) < LINEARITY_TOLERANCE:
         return np.array([7 * unit]), np.array([large])
-    multiples, ratios = [4.0, 7.0], [score_ratio(questions, place, 4 * unit, start), large]
-    if not all(0 < ratio < BELIEVABLE for ratio in ratios):
+    multiples, ratios = [4.0, 7.0], [score_ratio(tests, shape_index, 4 * unit, start), large]
+    if not all(0 < ratio < MAX_SCORE_RATIO for ratio in ratios):
         return unit * np.array(multiples), np.ones(2)
-    while ratios[-1] * multiples[-1] < ENOUGH and multiples[-1] < LARGEST_MULTIPLE:
-        ratio = score_ratio(questions, place, 2 * multiples[-1] * unit, start)
-        if ratio == 1 or not 0 < ratio < BELIEVABLE:
+    while ratios[-1] * multiples[-1] < LARGEST_SCORE and multiples[-1] < LARGEST_MULTIPLE:
+        ratio = score_ratio(tests, shape_index, 2 * multiples[-1] * unit, start)
+        if ratio == 1 or not 0 < ratio < MAX_SCORE_RATIO:
             break
         multiples.append(2 * multiples[-1])
         ratios.append(ratio)
     return unit * np.array(multiples), np.array(ratios)
 
 
-def score_ratio(questions: MisfitTests, place: int, size: float, start: NoiselessStart) -> float:
-    """Expected score of an effect at a size, over what linear theory gives.
+def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: NoiselessStart) -> float:
+    """Expected score of an effect at a size, divided by that of linear theory.
 
     Parameters
     ----------
-    questions : the fit, held against all candidates.
-    place : of the shape in which the effect is put in.
+    tests : the misfit tests of the fit with all candidates.
+    shape_index : of the shape in which the effect is added.
     size : deviation from absence, SI.
     start : NoiselessStart
         Of the fit.
@@ -155,87 +156,85 @@ def score_ratio(questions: MisfitTests, place: int, size: float, start: Noiseles
     Returns
     -------
     float
-        1 where the trajectories cannot be followed with the effect at that size, or the fit without it does not settle.
+        1 where the trajectories with the effect cannot be simulated, or the fit without it does not converge.
     """
-    fit, shape = questions.fit, questions.sensitivities.shapes[place]
-    sigma = float(questions.scores.plain_sigma[place])
+    fit, shape = tests.fit, tests.sensitivities.shapes[shape_index]
+    sigma = float(tests.scores.plain_sigma[shape_index])
     if shape.whole or not shape.effect.parameters:
         return 1.0
     try:
-        after = fitted_without(fit, shape, size, start)
-        if not after.solution.converged:
+        refit = fitted_without(fit, shape, size, start)
+        if not refit.solution.converged:
             return 1.0
-        answers = effect_sensitivities(after, [shape])
-        if shape.effect.name in answers.silent or not answers.shapes:
+        sensitivities = effect_sensitivities(refit, [shape])
+        if shape.effect.name in sensitivities.silent or not sensitivities.shapes:
             return 1.0
-        systematics = systematics_of(after.predictor, after.solution, after.trials)
+        systematics = systematics_of(refit.predictor, refit.solution, refit.trials)
         # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
         scores = scores_of(
-            after, products_of(after, systematics.at_zero_errors(after.solution.columns), answers, systematics)
+            refit, products_of(refit, systematics.at_zero_errors(refit.solution.columns), sensitivities, systematics)
         )
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
-def sizes_at_systematic_error(questions: MisfitTests) -> Floats:
+def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
     """Sizes at which an effect moves positions by as much as their systematic errors.
 
     Parameters
     ----------
-    questions : the fit, held against all candidates.
+    tests : the misfit tests of the fit with all candidates.
 
     Returns
     -------
     array, shape (n_shapes,)
         Deviations from absence, SI, positive; 0 where positions have no such errors.
     """
-    fit = questions.fit
+    fit = tests.fit
     systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
     if not systematic_m > 0:
-        return np.zeros(len(questions.sensitivities.shapes))
-    moved_m = residual_displacements(fit, questions.products)
-    return np.asarray(systematic_m / np.maximum(moved_m, 1e-300))
+        return np.zeros(len(tests.sensitivities.shapes))
+    displacement_m = residual_displacements(fit, tests.products)
+    return np.asarray(systematic_m / np.maximum(displacement_m, 1e-300))
 
 
-def residual_displacements(fit: Fit, sums: Products) -> Floats:
-    """How far a fit without an effect stays from trajectories with a unit of its size, to first order.
+def residual_displacements(fit: Fit, products: Products) -> Floats:
+    """Distance of a fit without an effect from trajectories with a unit of its size, to first order.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    sums : its columns and those of the candidates.
+    fit : the fit under test.
+    products : its columns and those of the candidates.
 
     Returns
     -------
     array, shape (n_shapes,), m per unit of each size
-        Root mean square over trials of the largest distance, all free numbers and those of each trial fitted.
+        Root mean square over trials of the largest distance, all parameters and trial effects re-estimated.
     """
-    problem, state, n_shapes = fit.solution.problem, fit.state, sums.n_shapes
-    levers = np.vstack([projected(fit, sums, state).lever[:, :n_shapes], np.zeros((1, n_shapes))])[problem.index]
+    problem, state, n_shapes = fit.solution.problem, fit.state, products.n_shapes
+    response = projected(fit, products, state).lever[:, :n_shapes]
+    of_keys = np.vstack([response, np.zeros((1, n_shapes))])[problem.index]
     precision = trial_effect_prior(problem, state)[1]
-    keys, shapes = (
-        slice(N_TRIAL_EFFECTS, N_TRIAL_EFFECTS + sums.n_keys),
-        slice(N_TRIAL_EFFECTS + sums.n_keys + 1, N_TRIAL_EFFECTS + sums.n_keys + 1 + n_shapes),
-    )
+    residual = N_TRIAL_EFFECTS + products.n_keys
+    effects, keys = slice(N_TRIAL_EFFECTS), slice(N_TRIAL_EFFECTS, residual)
+    shapes = slice(residual + 1, residual + 1 + n_shapes)
     largest = []
-    for part in sums.parts:
-        white = at_correlation(sums.cross_products(part), state.rho) / state.variance[part, None, None]
-        within_trial = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[part][:, :, None] * np.eye(
-            N_TRIAL_EFFECTS
-        )
-        deviations = solve_per_trial(
-            within_trial, white[:, :N_TRIAL_EFFECTS, shapes] - white[:, :N_TRIAL_EFFECTS, keys] @ levers[part]
+    for part in products.parts:
+        white = at_correlation(products.cross_products(part), state.rho) / state.variance[part, None, None]
+        of_effects = white[:, effects, effects] + precision[part][:, :, None] * np.eye(N_TRIAL_EFFECTS)
+        trial_response = solve_per_trial(
+            of_effects, white[:, effects, shapes] - white[:, effects, keys] @ of_keys[part]
         )
         largest += [
-            np.max(np.abs(columns[:, shapes] - columns[:, :N_TRIAL_EFFECTS] @ mine - columns[:, keys] @ shared), axis=0)
-            for columns, mine, shared in zip(sums.columns[part], deviations, levers[part], strict=True)
+            np.max(np.abs(columns[:, shapes] - columns[:, effects] @ by_effects - columns[:, keys] @ by_keys), axis=0)
+            for columns, by_effects, by_keys in zip(products.columns[part], trial_response, of_keys[part], strict=True)
         ]
     return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
 
 
 def half_power_below(least: float, sizes: Floats) -> Floats:
-    """Return sizes by probability where a finding below the least size counts half.
+    """Detectable sizes where a detection below the least size counts with probability one half.
 
     Parameters
     ----------
@@ -249,18 +248,18 @@ def half_power_below(least: float, sizes: Floats) -> Floats:
     array
         Of the same shape.
     """
-    away = np.abs(sizes)
-    half = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, away, right=math.inf)
-    return np.asarray(np.sign(sizes) * np.where(away >= least, away, np.minimum(half, least)))
+    deviation = np.abs(sizes)
+    at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, deviation, right=math.inf)
+    return np.asarray(np.sign(sizes) * np.where(deviation >= least, deviation, np.minimum(at_half_power, least)))
 
 
 def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: NoiselessStart) -> Fit:
-    """Fit the model of a fit to noise-free trajectories with an effect; noise and spreads stay as they are.
+    """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held.
 
     Parameters
     ----------
     fit : of the model without the effect.
-    shape : in which the effect is put in.
+    shape : in which the effect is added.
     size : float
         Deviation from absence, SI.
     start : NoiselessStart
@@ -269,7 +268,7 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     Returns
     -------
     Fit
-        What its solution's columns leave is what the model cannot follow.
+        The residual column of its solution is what the model cannot reproduce.
 
     Raises
     ------
@@ -278,15 +277,17 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     """
     state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
     moved = start.predictor.run_as(fit.model + shape.effect, jobs)
-    kept = [_kept(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)]
+    used = [
+        _used_points(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)
+    ]
     data = [
-        _recorded(trial_data, trajectory, state.trial_effects[i], keep)
-        for i, (trial_data, trajectory, keep) in enumerate(zip(fit.predictor.data, moved, kept, strict=True))
+        _with_positions(trial_data, trajectory, state.trial_effects[i], keep)
+        for i, (trial_data, trajectory, keep) in enumerate(zip(fit.predictor.data, moved, used, strict=True))
     ]
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
-    begin = [columns[keep] for columns, keep in zip(start.columns, kept, strict=True)]
-    for columns, trial_data, before, keep in zip(begin, data, fit.predictor.data, kept, strict=True):
+    initial = [columns[keep] for columns, keep in zip(start.columns, used, strict=True)]
+    for columns, trial_data, before, keep in zip(initial, data, fit.predictor.data, used, strict=True):
         columns[:, -1] += trial_data.lead_position_m - before.lead_position_m[keep]
     predictor = _predictor_of(start.predictor, data)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
@@ -296,9 +297,9 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
         state,
         held,
         warm=True,
-        most_iterations=ITERATIONS,
-        columns=begin,
-        least_decrease=SETTLED,
+        most_iterations=MAX_ITERATIONS,
+        columns=initial,
+        least_decrease=CONVERGENCE_DECREASE,
     )
     trials = [
         replace(
@@ -314,26 +315,28 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     return replace(fit, predictor=predictor, solution=solution, trials=tuple(trials), smooth=None)
 
 
-def _kept(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Points that a fit would use: not on the last of the growth, and not next to its end."""
+def _used_points(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Points that a fit uses: before the last part of the growth, and not next to its end."""
     behind_s = trajectory.end_time_s + (FRAMES_BEHIND_END + 1) * trial_data.frame_s
     ended = trajectory.status == "ended"
     grown = trajectory.lead_position_m < END_FRACTION * trial_data.trial.length_m
     return np.asarray(grown | (ended & (trajectory.time_s > behind_s)) | ~np.isfinite(trial_data.trial.length_m))
 
 
-def _recorded(trial_data: FitTrial, trajectory: Trajectory, trial_effects: Floats, keep: NDArray[np.bool_]) -> FitTrial:
-    """A trial with the positions of a trajectory, at the points that a fit would use."""
+def _with_positions(
+    trial_data: FitTrial, trajectory: Trajectory, trial_effects: Floats, keep: NDArray[np.bool_]
+) -> FitTrial:
+    """A trial with the positions of a trajectory, at the points that a fit uses."""
     return replace(
         trial_data,
         time_s=trial_data.time_s[keep],
         lead_position_m=(trial_effects[ORIGIN] + trajectory.observed_position_m)[keep],
-        first=_first(trial_data, keep),
+        first=_stretch_starts(trial_data, keep),
         relative_sd=None if trial_data.relative_sd is None else trial_data.relative_sd[keep],
     )
 
 
-def _first(trial_data: FitTrial, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the points that are kept begin a stretch without gaps."""
+def _stretch_starts(trial_data: FitTrial, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the used points begin a stretch without gaps."""
     stretch = np.cumsum(trial_data.first | np.concatenate([[False], ~keep[:-1]]))[keep]
     return np.concatenate([[True], np.diff(stretch) > 0])

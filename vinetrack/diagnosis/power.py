@@ -1,6 +1,6 @@
-"""What a campaign can see: detectable sizes of every candidate, what each is taken for, and the rate of false alarms.
+"""Power of a campaign: detectable sizes of every candidate, how often each is confused with others, false-alarm rates.
 
-Written by `vinetrack.diagnosis.linear_power`; read by the terminal, the report and `diagnosis.json`.
+Computed by `vinetrack.diagnosis.linear_power`; read by the terminal, the report and `diagnosis.json`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ to 1 %."""
 class EffectPower:
     """Detectable sizes of one effect.
 
-    `sizes` are values of the parameter, SI, at which the effect is found with `PROBABILITIES`; infinite where no size
-    is. `largest` is the end of its plausible range that lies farthest from absence, `least` the other where absence is
-    not plausible, else `zero`, the value at which the effect vanishes. `taken_for` maps other candidates to the
-    probability that theirs is the highest score, `named_alone` is the probability that no other candidate comes within
-    the answer set, both among campaigns that sound an alarm at the size found with 90 %. `other_values` are those of
-    the parameters behind the first at which it is followed, SI.
+    `sizes` are values of the parameter, SI, at which the effect is detected with `PROBABILITIES`; infinite where no
+    size is detectable. `zero` is the value at which the effect vanishes; `largest` is the end of the plausible range
+    farther from it, and `least` the nearer end where zero is not plausible, else `zero`. `taken_for` maps other
+    candidates to the probability that they score highest; `named_alone` is the probability that no other candidate is
+    in the answer set. Both are among campaigns with an alarm, at the size detected with 90 %. `other_values` are those
+    of the further parameters that were held, SI.
     """
 
     effect: str
@@ -56,7 +56,7 @@ class EffectPower:
     other_values: tuple[float, ...] = ()
 
     def size_at(self, probability: float) -> float:
-        """The value of the parameter at which the effect is found with this probability.
+        """The value of the parameter at which the effect is detected with this probability.
 
         Parameters
         ----------
@@ -66,19 +66,19 @@ class EffectPower:
         Returns
         -------
         float
-            SI; infinite where no size is.
+            SI; infinite where no size is detectable.
         """
         if not np.isfinite(self.sizes).all():
             return math.inf
         return float(np.interp(probability, PROBABILITIES, self.sizes))
 
     def probability_at(self, value: float) -> float:
-        """The probability with which the effect is found at a value of its parameter.
+        """The probability with which the effect is detected at a value of its parameter.
 
         Parameters
         ----------
         value : float
-            SI, on the side of `zero` that the sizes lie on.
+            SI, on the side of `zero` on which the sizes lie.
 
         Returns
         -------
@@ -92,7 +92,7 @@ class EffectPower:
 
     @property
     def is_visible(self) -> bool:
-        """Whether its largest plausible size is found at least every other time."""
+        """Whether its largest plausible size is detected at least half of the time."""
         return self.probability_at(self.largest) >= 0.5
 
     def to_json(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class EffectPower:
 
 @dataclass(frozen=True)
 class NumberWidth:
-    """Half the width of the 95 % interval of a fitted number: of B relative to it, of n absolute."""
+    """Half width of the 95 % interval of a fitted parameter: relative for B, absolute for n."""
 
     name: str
     vine: str
@@ -151,13 +151,13 @@ class NumberWidth:
 
     @property
     def is_relative(self) -> bool:
-        """Whether the half width is a part of the value."""
+        """Whether the half width is relative to the value."""
         return self.name == "B"
 
 
 @dataclass(frozen=True)
 class PowerInput:
-    """A number that the power was worked out with, in words, and where it is from: the fit, stated, or guessed."""
+    """A quantity that the power was computed with, in words, and where it comes from: the fit, the user, or a prior."""
 
     name: str
     value: str
@@ -166,7 +166,7 @@ class PowerInput:
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happened in simulated campaigns, with the exact binomial interval of 95 %.
+    """How often something happened in simulated campaigns, with the exact binomial 95 % interval.
 
     Clopper & Pearson, Biometrika 26, 404 (1934).
     """
@@ -181,7 +181,7 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Ends of the interval of 95 %; 0 and 1 where there is no campaign."""
+        """Ends of the 95 % interval; 0 and 1 where there is no campaign."""
         from scipy.stats import binomtest
 
         if not self.campaigns:
@@ -192,10 +192,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class SimulatedRates:
-    """What complete diagnoses of campaigns with one effect at one size said; a null where `effect` is blank.
+    """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank.
 
-    `detections` counts those in which the effect was found, `promised` is the probability of that by linear theory (of
-    a false alarm, where nothing is missing), `named` counts what was named, most frequent first.
+    `detections` counts those in which the effect was found; `promised` is its probability by linear theory (that of a
+    false alarm, where nothing is missing); `named` counts what was named, most frequent first.
     """
 
     effect: str
@@ -224,7 +224,7 @@ class SimulatedRates:
 
 @dataclass(frozen=True)
 class AddedTrial:
-    """A trial to make, what of the rig changes for it, and the probability once it is made too."""
+    """A trial to make, what changes on the rig for it, and the power once it is made as well."""
 
     trial: Trial
     changed: tuple[str, ...]
@@ -234,11 +234,11 @@ class AddedTrial:
 
 @dataclass(frozen=True)
 class FurtherTrials:
-    """Trials that bring an effect of one size to a wanted probability of being found.
+    """Further trials that bring the power for an effect of one size to a target.
 
-    `before` is the probability with the trials so far; `unlimited` that with the best of all trials within the limits,
-    made without end; `looked_at` counts the conditions. `trials` come in the order in which they help most; empty where
-    none is needed, or none helps. `needed` tells how many trials it takes by what they ask for: the rig so far, another
+    `before` is the power with the trials so far; `unlimited` that with unlimited replicates of all trials within the
+    limits; `n_conditions` counts the conditions considered. `trials` come in order of how much they help; empty where
+    none is needed or none helps. `needed` is the number of trials required, by what they need: the rig so far, another
     rig, a new vine. `power` is that of all trials together.
     """
 
@@ -257,12 +257,12 @@ class FurtherTrials:
 
     @property
     def after(self) -> float:
-        """Probability once all trials are made."""
+        """Power once all trials are made."""
         return self.trials[-1].probability if self.trials else self.before
 
     @property
     def is_reached(self) -> bool:
-        """Whether the wanted probability is reached."""
+        """Whether the target is reached."""
         return self.after >= self.target
 
     def to_json(self) -> dict[str, Any]:
@@ -293,7 +293,7 @@ class FurtherTrials:
 
 
 def sheet_cells(trial: Trial) -> dict[str, float]:
-    """Return the cells of the sheet that tell how a further trial is set, blank ones left out.
+    """Cells of the sheet that describe how to set up a further trial, without blank ones.
 
     Parameters
     ----------
@@ -312,14 +312,14 @@ def sheet_cells(trial: Trial) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Power:
-    """What the trials of a campaign can see of every candidate. Printed, it is what a person reads on the terminal.
+    """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
 
     `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
-    each test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
-    candidates to the reason why they cannot be seen. `wary` tells why the sizes are not to be trusted, blank where
-    they are. `simulated` are rates of complete diagnoses, where campaigns were simulated, and `further` the trials that
-    would find an effect more often, where they were asked for; `calibration` holds the tests of a first model against
-    null campaigns.
+    each test to its false-alarm rate; the total is at most their sum. `not_testable` maps other candidates to the
+    reason why they cannot be detected. `wary` is the reason why the sizes are not reliable, blank where they are.
+    `simulated` holds rates of complete diagnoses of simulated campaigns, `further` the trials that would raise the
+    power for an effect, where they were asked for; `calibration` compares the tests of a first model with null
+    campaigns.
     """
 
     n_trials: int
@@ -337,7 +337,7 @@ class Power:
 
     @property
     def false_alarm_rate(self) -> float:
-        """Upper bound of the chance that anything is said to be missing where nothing is: the sum over all tests."""
+        """Upper bound on the probability of any false alarm: the sum over all tests (Bonferroni)."""
         return float(sum(self.false_alarms.values()))
 
     def __getitem__(self, name: str) -> EffectPower:
@@ -351,7 +351,7 @@ class Power:
         return {entry.effect: entry for entry in self.effects}[name]
 
     def of_effects(self, names: Sequence[str]) -> Power:
-        """The same for some effects alone.
+        """The same for a selection of effects.
 
         Parameters
         ----------
@@ -420,7 +420,7 @@ class Power:
         )
 
     def plot(self, name: str = "power", **options: Any) -> Figure:
-        """Return the map of effects against size.
+        """Draw the map of effects against size.
 
         Parameters
         ----------

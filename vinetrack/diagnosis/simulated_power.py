@@ -1,4 +1,4 @@
-"""Simulated campaigns of a design, diagnosed from beginning to end as real ones are: the check on linear theory."""
+"""Simulated campaigns of a design, diagnosed in full as measured ones are: a check on linear theory."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from vinetrack.planning.simulated_campaigns import make
 
 @dataclass(frozen=True)
 class SimulatedDiagnosis:
-    """What the diagnosis of one simulated campaign said.
+    """Result of the diagnosis of one simulated campaign.
 
-    `effect` and `value` are what was in it, blank and NaN where nothing was; `failed` is the reason why there is no
-    verdict.
+    `effect` and `value` are those of the true model, blank and NaN where nothing was missing; `failed` is the reason
+    why there is no verdict.
     """
 
     effect: str
@@ -41,12 +41,12 @@ class SimulatedDiagnosis:
 
     @property
     def alarm(self) -> bool:
-        """Whether anything was said to be missing or at fault."""
+        """Whether anything was called missing or a fault of the measurement."""
         return bool(self.verdict) and self.verdict != ADEQUATE
 
     @property
     def is_found(self) -> bool:
-        """Whether the effect is in the answer set, or was added later on."""
+        """Whether the effect is in the answer set, or was added later."""
         return self.alarm and self.effect in (*self.answer_set, *self.effects)
 
     @property
@@ -56,7 +56,7 @@ class SimulatedDiagnosis:
 
 
 def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:
-    """Make one campaign of a design and diagnose it from beginning to end.
+    """Simulate one campaign of a design and diagnose it in full.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed:
     -------
     SimulatedDiagnosis
     """
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     try:
         truth = design.with_effect(effect, value) if effect else design
         draw = np.random.default_rng([seed, 77])
@@ -77,39 +77,39 @@ def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed:
         pairs = make(truth.model, truth.trials, truth.cameras, truth.spreads, draw, host)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            answer = diagnose(
+            diagnosis = diagnose(
                 with_measurement_errors(truth, pairs), model=design.to_fit, candidates=design.candidates, ladder=False,
                 advice=False, user_effects=design.model.user_effects,
             )  # fmt: skip
     except (FitError, SimulationError, EffectError, np.linalg.LinAlgError) as error:
         return SimulatedDiagnosis(effect, value, seed, failed=f"{type(error).__name__}: {error}")
     return SimulatedDiagnosis(
-        effect, value, seed, answer.verdict, answer.answer_set, answer.effects, time.perf_counter() - begun
+        effect, value, seed, diagnosis.verdict, diagnosis.answer_set, diagnosis.effects, time.perf_counter() - start_s
     )
 
 
-def rates_of(answers: Sequence[SimulatedDiagnosis], promised: float) -> SimulatedRates:
-    """Count the answers about campaigns with the same effect at the same size.
+def rates_of(diagnoses: Sequence[SimulatedDiagnosis], promised: float) -> SimulatedRates:
+    """Count the outcomes of campaigns with the same effect at the same size.
 
     Parameters
     ----------
-    answers : one at least.
+    diagnoses : at least one.
     promised : float
-        What linear theory gives.
+        Probability by linear theory.
 
     Returns
     -------
     SimulatedRates
-        Campaigns without a verdict are counted apart.
+        Campaigns without a verdict are counted separately.
     """
-    given = [answer for answer in answers if not answer.failed]
-    named = Counter(answer.named for answer in given if answer.alarm)
+    completed = [diagnosis for diagnosis in diagnoses if not diagnosis.failed]
+    named = Counter(diagnosis.named for diagnosis in completed if diagnosis.alarm)
     return SimulatedRates(
-        effect=answers[0].effect,
-        value=answers[0].value,
+        effect=diagnoses[0].effect,
+        value=diagnoses[0].value,
         promised=promised,
-        alarms=Rate(sum(answer.alarm for answer in given), len(given)),
-        detections=Rate(sum(answer.is_found for answer in given), len(given)),
+        alarms=Rate(sum(diagnosis.alarm for diagnosis in completed), len(completed)),
+        detections=Rate(sum(diagnosis.is_found for diagnosis in completed), len(completed)),
         named=tuple(named.most_common()),
-        failed=len(answers) - len(given),
+        failed=len(diagnoses) - len(completed),
     )

@@ -1,22 +1,22 @@
-"""When a campaign that is diagnosed again and again may stop: one name is left at a risk that was stated beforehand.
+"""Stopping rule for a campaign that is diagnosed repeatedly: one effect is left at a risk stated beforehand.
 
-Who looks after every few trials and stops when the verdict suits him errs more often than each verdict does. Evidence
-that may be looked at any number of times is a likelihood ratio. With a hypothesis T true, the ratio of the marginal
-likelihoods of any other fixed hypothesis Y and of T never exceeds 1/α at any time but with probability α (Ville, Étude
+An experimenter who looks after every few trials and stops when the verdict suits errs more often than a single verdict
+does. A likelihood ratio, however, may be monitored at any number of looks: if hypothesis T is true, the ratio of the
+marginal likelihoods of any other fixed hypothesis Y and of T ever exceeds 1/α with probability at most α (Ville, Étude
 critique de la notion de collectif, 1939; as e-values: Grünwald, de Heide & Koolen, J. R. Stat. Soc. B 86, 1091, 2024;
-Ramdas, Grünwald, Vovk & Shafer, Statistical Science 38, 576, 2023). That holds whatever trials are chosen in view of
-those before. With m hypotheses, of which "nothing is missing" is one, a name is left when its marginal likelihood
+Ramdas, Grünwald, Vovk & Shafer, Statistical Science 38, 576, 2023). This holds however each trial is chosen in view of
+those before. With m hypotheses, of which "nothing is missing" is one, an effect is named when its marginal likelihood
 exceeds that of every other by
 
     Z_Y / Z_T ≥ (m − 1)/risk,
 
-so that, whichever of them is true, another is named with at most that risk, by Bonferroni's inequality. Marginal
-likelihoods are those of `plausibility_prior`, with plausible ranges as priors, brought down by what trials scatter more
-than the noise model says. Numbers that all hypotheses share are at their best values in each, so the bound holds for
-campaigns that pin them, not to the letter for the first few trials: a campaign never stops before `FEWEST_TRIALS`.
+so that, whichever hypothesis is true, the risk of naming another is at most `risk`, by Bonferroni's inequality.
+Marginal likelihoods are those of `weighing`, with plausible ranges as priors, tempered by the excess of the scatter of
+trials over the noise model. Parameters shared by all hypotheses are at their optimum in each, so that the bound holds
+for campaigns that determine them, not exactly for the first few trials: a campaign never stops before `FEWEST_TRIALS`.
 
-A truth that is in no list breaks the bound's premise. Of that speaks the diagnosis: a name stops a campaign only where
-nothing is left beside it.
+The bound presumes that the truth is among the hypotheses. The diagnosis checks that: an effect stops a campaign only if
+no misfit is left with it in the model.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ from vinetrack.diagnosis.result import (
 
 FEWEST_TRIALS = 6
 """Trials before which no campaign stops. Chosen: with fewer, scatter between trials is not estimated
-(`fit_problem.estimable`), and nothing says whether trials agree."""
+(`fit_problem.estimable`), and nothing shows whether trials agree."""
 
-NOTHING = "nothing missing"
-"""Name of the hypothesis that the model lacks nothing."""
+NO_MISSING_EFFECT = "nothing missing"
+"""Name of the hypothesis that the model lacks no effect."""
 
 STOP, GO_ON = "stop", "go on"
 
 
 @dataclass(frozen=True)
 class CampaignLook:
-    """What one look at a campaign said.
+    """Result of one look at a campaign.
 
-    `names` are those found, in order; `log_ratio` the logarithm of the least ratio of the marginal likelihood of a
-    name to that of a rival, of all names, and `rival` which rival that is; `needed` is ln((m − 1)/risk). `decision` is
-    `stop` or `go on`, `why` a sentence.
+    `names` are the effects found, in order. `log_ratio` is the log of the smallest ratio of marginal likelihoods of one
+    of them to a rival, and `rival` that rival; `needed` is ln((m − 1)/risk). `decision` is `stop` or `go on`, `why` a
+    sentence.
     """
 
     trials: int
@@ -103,9 +103,9 @@ def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> CampaignLook:
     ----------
     diagnosis : of all trials so far.
     trials : int
-        How many they are.
+        Their number.
     risk : float
-        Chance, stated before the first look, that a wrong name stops the campaign.
+        Probability, stated before the first look, that the campaign stops with a wrong effect.
 
     Returns
     -------
@@ -116,32 +116,32 @@ def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> CampaignLook:
     verdict = diagnosis.verdict
     names = diagnosis.effects or diagnosis.answer_set
     log_ratio, rival = _least_ratio(diagnosis)
-    done = False
+    stops = False
     if diagnosis.refused or not verdict:
         why = f"there is no verdict: {diagnosis.refused}"
     elif verdict == ADEQUATE:
-        why = "nothing is found to be missing, and that is no name: what could still hide is in the power of the trials"
+        why = "nothing is found to be missing; the power of the trials states which effects could go undetected"
     elif UNEXPLAINED in (verdict, diagnosis.final_verdict):
-        why = "what is missing is in no list: no name is given"
+        why = "what is missing is not among the candidates, so no effect is named"
     elif AMBIGUOUS in (verdict, diagnosis.final_verdict):
-        why = "several names are left"
+        why = "several effects are left"
     elif verdict == MISSING and diagnosis.final_verdict != ADEQUATE:
-        why = "something is left beside the name"
+        why = "with the named effect in the model, a misfit remains"
     elif verdict == ARTEFACT and len(names) > 1:
         why = "several faults of the measurement are left"
     elif trials < FEWEST_TRIALS:
-        why = f"fewer than {FEWEST_TRIALS} trials do not show how trials scatter"
+        why = f"fewer than {FEWEST_TRIALS} trials do not determine the scatter between trials"
     elif not math.isfinite(log_ratio):
-        why = "the name came with others, and what it is worth alone is not known"
+        why = "the effect was added together with others, and its marginal likelihood alone is not known"
     elif log_ratio < needed:
-        why = f"{rival} is not excluded at the risk that was stated"
+        why = f"{rival} is not excluded at the stated risk"
     else:
-        done, why = True, f"every other of {len(testable)} candidates, and nothing missing, are excluded"
-    return CampaignLook(trials, verdict, tuple(names), log_ratio, rival, needed, STOP if done else GO_ON, why)
+        stops, why = True, f"all others of {len(testable)} candidates, and nothing missing, are excluded"
+    return CampaignLook(trials, verdict, tuple(names), log_ratio, rival, needed, STOP if stops else GO_ON, why)
 
 
 def trials_to_go(look: CampaignLook) -> int:
-    """How many further trials of the same kinds it takes, evidence growing with the number of trials.
+    """Number of further trials of the same kinds that are needed, if the log ratio grows in proportion to the trials.
 
     Parameters
     ----------
@@ -158,34 +158,34 @@ def trials_to_go(look: CampaignLook) -> int:
 
 
 def _least_ratio(diagnosis: Diagnosis) -> tuple[float, str]:
-    """The least ln(Z_name / Z_rival) over all names, and the rival; NaN where a name's own worth is not known."""
-    worth: list[tuple[float, str]] = []
+    """The smallest ln(Z_effect / Z_rival) over all effects named, and the rival; NaN where it is not known."""
+    log_ratios: list[tuple[float, str]] = []
     named = [step for step in diagnosis.rounds if step.verdict in (MISSING, ARTEFACT) and len(step.answer_set) == 1]
     for step in named:
         name = step.answer_set[0]
         best = next((candidate for candidate in step.ranking if candidate.effect == name), None)
         if best is None or not math.isfinite(best.log_bayes):
             return math.nan, ""
-        worth.append((best.log_bayes, NOTHING))
-        worth += _rivals(step, best)
-    return min(worth) if worth else (math.nan, "")
+        log_ratios.append((best.log_bayes, NO_MISSING_EFFECT))
+        log_ratios += _rivals(step, best)
+    return min(log_ratios) if log_ratios else (math.nan, "")
 
 
 def _rivals(step: Round, best: Candidate) -> list[tuple[float, str]]:
-    """ln(Z_best / Z_rival) of all candidates of a round.
+    """ln(Z_best / Z_rival) for all candidates of a round.
 
-    One that was not refitted counts by the fall of −2 ln L that the sensitivities promise it, without paying for its
-    numbers: its ratio is then no larger than it would be. Where they promise nothing, the search has passed it over.
-    One that holds the name as a limit, and is no better, is a richer form of the same name.
+    A rival that was not refitted counts with the fall of −2 ln L that its score test predicts, without a penalty for
+    its parameters: the ratio is then no larger than after a refit. One without a prediction was ruled out by the
+    search. One that contains the best as a limit, and is no better, is a richer form of the same effect.
     """
     ratios = []
     for rival in step.ranking:
-        richer = rival.reason.startswith(f"it contains {best.effect} as a limit")
-        if rival.effect == best.effect or rival.status == NOT_TESTABLE or richer:
+        contains_best = rival.reason.startswith(f"it contains {best.effect} as a limit")
+        if rival.effect == best.effect or rival.status == NOT_TESTABLE or contains_best:
             continue
         if rival.status == REFITTED and rival.posterior_weight > 0:
             ratios.append((math.log(best.posterior_weight / rival.posterior_weight), rival.effect))
         elif math.isfinite(rival.delta_chi2) and best.delta_chi2 > 0:
-            tempered = best.sigma**2 / best.delta_chi2
-            ratios.append((0.5 * tempered * (best.delta_chi2 - rival.delta_chi2), rival.effect))
+            tempering = best.sigma**2 / best.delta_chi2
+            ratios.append((0.5 * tempering * (best.delta_chi2 - rival.delta_chi2), rival.effect))
     return ratios
