@@ -169,7 +169,7 @@ def test_a_fit_without_an_effect_that_does_not_settle_is_not_trusted(
     start, k = noiseless_start(six.fit), place_of(six, "leak")
     size = 2 * power["leak"].size_at(0.5)
     assert score_ratio(six, k, size, start) != 1.0
-    monkeypatch.setattr(expected_scores, "ITERATIONS", 1)
+    monkeypatch.setattr(expected_scores, "MAX_ITERATIONS", 1)
     assert score_ratio(six, k, size, start) == 1.0
 
 
