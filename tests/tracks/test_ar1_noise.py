@@ -1,4 +1,4 @@
-"""Simulated noise has the standard deviation and the correlation that are asked for, from the first position on."""
+"""Simulated noise has the requested standard deviation and correlation, from the first position on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imported tracks of bodies end with a bounce or a dead stop, and nowhere else. Seeds 620 and up."""
+"""Imported tracks of bodies end with a bounce or an abrupt stop, and nowhere else. Seeds 620 and up."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def fall(floor_m: float = 1e3, restitution: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("restitution", [0.2, 0.6])
-def test_a_bounce_ends_the_way(restitution):
+def test_a_bounce_ends_the_motion(restitution):
     after, notes = ended(fall(0.7, restitution))
     impact = int(np.argmax(np.sqrt(2 * 0.7 / 9.81) < CLOCK_S))
     assert after[-1] == 119
@@ -40,7 +40,7 @@ def test_a_bounce_ends_the_way(restitution):
     assert "turns back" in notes[-1]
 
 
-def test_a_dead_stop_ends_the_way():
+def test_an_abrupt_stop_ends_the_motion():
     after, notes = ended(fall(0.7))
     impact = int(np.argmax(np.sqrt(2 * 0.7 / 9.81) < CLOCK_S))
     assert abs(after[0] - impact) <= 2
@@ -53,7 +53,7 @@ def test_a_dead_stop_ends_the_way():
     [fall(), np.maximum(CLOCK_S - 0.2, 0.0), 0.3 * (1 - np.exp(-CLOCK_S / 0.1)), np.zeros(120)],
     ids=["fall", "starts late", "slides to rest", "stands"],
 )
-def test_a_way_without_an_end_keeps_its_points(position_m, seed):
+def test_a_motion_without_an_end_keeps_its_points(position_m, seed):
     after, notes = ended(position_m, seed)
     assert after.size == 0
     assert notes == ()

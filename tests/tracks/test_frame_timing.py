@@ -56,15 +56,13 @@ def steady_track(noise_m: float = 2e-5, n: int = 120) -> Track:
 
 
 @pytest.mark.parametrize(("row", "noise_m", "sure"), [(70, 1e-4, True), (110, 1e-4, False), (110, 1e-5, True)])
-def test_a_jump_that_only_the_nearest_points_tell_is_sure_where_noise_is_far_below_it(
-    row: int, noise_m: float, sure: bool
-):
+def test_a_jump_of_only_the_nearest_points_is_sure_where_noise_is_far_below_it(row: int, noise_m: float, sure: bool):
     out = correct_frames(dropped(steady_track(noise_m), row))
     assert flags(out) == {row: "gap;retimed"}
     assert frames_surely_missing(out) is sure
 
 
-def test_nothing_is_lost_of_a_track_whose_times_nobody_moved():
+def test_a_track_with_unchanged_times_has_lost_no_frames():
     assert not frames_surely_missing(steady_track())
 
 
@@ -106,14 +104,14 @@ def test_a_long_step_between_points_that_are_stated_to_be_unsure_is_no_dropped_f
     assert bool(flags(corrected)) is told
 
 
-def test_several_faults_in_one_track_are_all_put_right():
+def test_several_faults_in_one_track_are_all_corrected():
     clean = steady_track()
     out = correct_frames(stale(inserted(dropped(clean, 60), 80), 100))
     assert flags(out) == {60: "gap;retimed", 80: "duplicate", 100: "duplicate"}
     np.testing.assert_allclose(out.time_s[-1], clean.time_s[-1], atol=1e-12)
 
 
-def test_a_gap_that_the_times_show_is_flagged_and_nothing_moved():
+def test_a_gap_that_the_times_show_is_flagged_and_times_stay():
     track = steady_track()
     rows = np.delete(np.arange(120), [70, 71])
     gapped = make_track(track.time_s[rows], track.lead_position_m[rows])
@@ -130,7 +128,7 @@ def seen_in_the_picture(track: Track, row: int) -> Track:
     return replace(track, flag=flag)
 
 
-def test_a_copy_that_the_picture_showed_moves_times_only_where_it_was_inserted():
+def test_a_copy_seen_in_the_picture_changes_times_only_where_it_was_inserted():
     clean = steady_track()
     late = correct_frames(seen_in_the_picture(inserted(clean, 70), 70))
     assert np.delete(late.time_s, 70) == pytest.approx(clean.time_s)
@@ -170,7 +168,7 @@ def test_nothing_is_found_in_clean_trials(noise_m, rho):
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5])
-def test_wild_points_of_heavy_tails_move_no_times(rho):
+def test_outliers_of_heavy_tails_change_no_times(rho):
     """Student's t with 3 degrees of freedom puts a point a whole step ahead or behind now and then."""
     moved = []
     for seed in range(1000, 1150):
@@ -194,7 +192,7 @@ def growing_noise(seed: int, far_m: float = 8e-4) -> Track:
     return make_track(np.arange(position_m.size) / CAPTURE_FPS, position_m)
 
 
-def test_noise_that_grows_along_the_way_moves_no_times():
+def test_noise_that_grows_along_the_way_changes_no_times():
     for seed in range(40):
         assert not any("retimed" in flag for flag in flags(correct_frames(growing_noise(seed))).values())
 
@@ -216,14 +214,14 @@ def test_the_end_of_growth_is_not_a_repeated_frame():
     assert correct_frames(make_track(time_s, y)).notes == ()
 
 
-def test_slow_motion_is_left_alone():
+def test_slow_motion_is_unchanged():
     time_s = np.arange(200) * FRAME_S
     y = 0.1 * time_s + ar1(200, 1e-4, 0.0, np.random.default_rng(1000))
     out = correct_frames(dropped(make_track(time_s, y), 100))
     assert flags(out) == {}
 
 
-def test_irregular_times_are_left_alone():
+def test_irregular_times_are_unchanged():
     rng = np.random.default_rng(1000)
     time_s = np.cumsum(rng.uniform(0.5, 2.5, 200)) * FRAME_S
     track = make_track(time_s, 1.0 * time_s + ar1(200, 3e-5, 0.0, rng))
@@ -237,7 +235,7 @@ def test_rows_without_position_do_not_pass_for_dropped_frames():
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 6])
-def test_very_short_tracks_are_left_alone(n):
+def test_very_short_tracks_are_unchanged(n):
     time_s = np.arange(n) * FRAME_S
     assert correct_frames(make_track(time_s, 1.0 * time_s)).notes == ()
 
@@ -271,7 +269,7 @@ def test_a_double_step_of_a_recording_moves_its_times_on():
     np.testing.assert_array_equal(out.slot, np.arange(20) + (np.arange(20) >= 10))
 
 
-def test_a_step_of_no_whole_number_is_told_and_moves_nothing():
+def test_a_step_of_no_whole_number_is_reported_and_changes_nothing():
     out = steps_with(17.0)
     assert list(np.flatnonzero(out.gap)) == [10]
     assert not out.retimed.any()
@@ -285,7 +283,7 @@ def test_frames_that_were_left_out_are_no_gap_and_are_counted_in_notes():
     assert "before frame 11 " in out.notes[0]
 
 
-def test_a_gap_that_is_marked_already_is_not_told_again():
+def test_a_gap_that_is_marked_already_is_not_reported_again():
     rows = np.delete(np.arange(120), [70, 71])
     track = steady_track()
     flag = np.full(118, "", dtype="<U80")

@@ -80,7 +80,7 @@ def test_blank_sigma_is_unknown_and_so_is_zero(tmp_path: Path) -> None:
     assert len(track.notes) == 1
 
 
-def test_blank_pressures_are_interpolated_and_it_is_said(tmp_path: Path) -> None:
+def test_blank_pressures_are_interpolated_with_a_note(tmp_path: Path) -> None:
     lines = [f"{t},{p},{x}" for t, p, x in zip(range(5), range(5), ["20", "", "24", "", "28"], strict=True)]
     track = read_track(write(tmp_path, "time_s,position_m,pressure_kPa\n" + "\n".join(lines)))
     assert track.pressure_Pa is not None
@@ -117,7 +117,7 @@ def test_a_track_that_runs_backwards_is_kept_and_noted(tmp_path: Path) -> None:
         ("time_s,position_m,pressure_kPa\n" + "".join(f"{i},{i},-200\n" for i in range(5)), "below vacuum"),
     ],
 )
-def test_what_is_no_track_is_refused_with_the_place(tmp_path: Path, text: str, words: str) -> None:
+def test_an_invalid_track_is_refused_with_the_place(tmp_path: Path, text: str, words: str) -> None:
     assert words in refused(write(tmp_path, text))
 
 
@@ -353,7 +353,7 @@ def test_a_trace_is_interpolated_on_the_times_of_the_track(tmp_path: Path) -> No
     assert track.notes == ()
 
 
-def test_a_trace_that_ends_early_is_held_and_it_is_said() -> None:
+def test_a_trace_that_ends_early_is_held_with_a_note() -> None:
     track = attach_pressure(flat_track(), np.array([0.0, 2.0]), np.array([2e4, 1e4]))
     assert track.pressure_Pa is not None
     np.testing.assert_allclose(track.pressure_Pa, [2e4, 1.5e4, 1e4, 1e4, 1e4])

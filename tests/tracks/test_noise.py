@@ -75,7 +75,7 @@ def test_exact_curve_leaves_next_to_nothing():
     assert 0 <= correlation <= 0.95
 
 
-def test_eight_points_tell_the_size_within_a_factor_of_two():
+def test_eight_points_estimate_the_noise_within_a_factor_of_two():
     short = [2 * FRAMES[:8] + ar1(8, 1e-4, 0.0, np.random.default_rng(seed)) for seed in range(1000, 1200)]
     noise_m, correlation = median_estimate(short)
     assert 0.5e-4 < noise_m < 2e-4

@@ -1,4 +1,4 @@
-"""Noise of known size and shape on motions that are known; seeds 20000 and up."""
+"""Noise of known size and shape on known motions; seeds 20000 and up."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_equal_noise_is_left_equal_however_fast_the_vine(rho):
         assert shape_of(times, positions) is None
 
 
-def test_heavy_tails_are_no_noise_that_varies():
+def test_heavy_tails_are_not_noise_that_varies():
     draw = np.random.default_rng(20200)
     times, positions, _ = experiment(0.0)
     heavy = [y + NOISE_M * draw.standard_t(4, y.size) for y in positions]

@@ -1,4 +1,4 @@
-"""Single points put off by known amounts on motions that are known; seeds 20000 and up."""
+"""Single points displaced by known amounts on known motions; seeds 20000 and up."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def displaced(track: Track, rows: np.ndarray, by_m: np.ndarray | float) -> Track
     return replace(track, lead_position_m=y)
 
 
-def test_no_point_of_an_undisturbed_motion_is_wild():
-    """A release, the growth and correlated noise, 24 tracks: 2.4 % chance of a single point by normal noise."""
+def test_an_undisturbed_motion_has_no_outlier():
+    """A release, growth and correlated noise, 24 tracks: 2.4 % probability of a single point with normal noise."""
     flagged = 0
     for seed in range(20000, 20006):
         for vine, noise_m, rho in VINES:
@@ -51,13 +51,13 @@ def test_one_in_a_hundred_points_is_named_and_no_other():
     assert f"{track.time_s[wild[0]]:.5g} s" in out.notes[0]
 
 
-def test_two_wild_points_beside_each_other_are_both_rejected():
+def test_two_adjacent_outliers_are_both_rejected():
     out = reject_outliers(displaced(steady_track(), np.array([150, 151]), np.array([3e-3, -3e-3])))
     assert np.flatnonzero(out.flag == "rejected").tolist() == [150, 151]
 
 
 @pytest.mark.parametrize("row", [0, 299])
-def test_a_wild_point_at_an_end_is_rejected(row):
+def test_an_outlier_at_an_end_is_rejected(row):
     out = reject_outliers(displaced(steady_track(), np.array([row]), 5e-3))
     assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
 
@@ -66,7 +66,7 @@ def test_a_wild_point_at_an_end_is_rejected(row):
 @pytest.mark.parametrize(
     "time_of", [lambda t: t, lambda t: t + 0.2 * FRAME_S * np.sin(700 * t)], ids=["even", "uneven"]
 )
-def test_a_wild_point_that_lies_near_the_one_before_is_no_copy_and_rejected(row, time_of):
+def test_an_outlier_near_the_point_before_is_rejected_and_not_a_copy(row, time_of):
     """A quarter of a step from the point before, and four times the noise of their difference."""
     time_s = time_of(np.arange(300) * FRAME_S)
     speed_m_s, noise_m = 6.0, 3e-5
@@ -91,7 +91,7 @@ def test_at_the_ends_a_motion_may_have_stopped_or_begun_and_not_the_other_way(ro
     )
 
 
-def test_a_wild_point_is_no_dropped_frame():
+def test_an_outlier_is_not_a_dropped_frame():
     """A point one step ahead, the size of a dropped frame's jump: the times stay as they are."""
     track = steady_track(noise_m=2e-5)
     step_m = 0.6 * FRAME_S
@@ -100,7 +100,7 @@ def test_a_wild_point_is_no_dropped_frame():
     assert not any("gap" in str(flag) for flag in out.flag)
 
 
-def test_points_behind_a_dropped_frame_are_not_wild():
+def test_points_behind_a_dropped_frame_are_not_outliers():
     track = steady_track(noise_m=2e-5)
     y = np.delete(track.lead_position_m, [150, 151])
     out = correct_frames(make_track(track.time_s[:-2], y))
@@ -115,7 +115,7 @@ def test_a_motion_that_starts_at_full_speed_keeps_its_points():
         assert not find_outliers(track.time_s, track.lead_position_m).any()
 
 
-def test_noise_that_grows_with_speed_is_not_wild():
+def test_noise_that_grows_with_speed_has_no_outliers():
     time_s = np.arange(300) * FRAME_S
     speed = 40.0 * time_s
     draw = np.random.default_rng(20002)
@@ -123,7 +123,7 @@ def test_noise_that_grows_with_speed_is_not_wild():
     assert not find_outliers(time_s, y).any()
 
 
-def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
+def test_a_point_placed_by_hand_is_not_an_outlier() -> None:
     time_s = np.arange(60) / 1000
     position_m = 0.2 * time_s + 1e-6 * np.random.default_rng(20100).standard_normal(60)
     position_m[30] += 2e-3
@@ -137,8 +137,8 @@ def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
     )
 
 
-def test_where_one_point_in_eight_is_wild_none_is_rejected() -> None:
-    """The test then does not describe the track: what it would leave is no measurement of that motion."""
+def test_where_one_point_in_eight_is_an_outlier_none_is_rejected() -> None:
+    """The test then does not describe the track: what remained would be no measurement of that motion."""
     rows = np.arange(10, 290, 8)
     draw = np.random.default_rng(20002)
     track = displaced(steady_track(seed=20002), rows, draw.choice([-1, 1], rows.size) * 5e-3)
@@ -147,7 +147,7 @@ def test_where_one_point_in_eight_is_wild_none_is_rejected() -> None:
 
 @pytest.mark.parametrize("step_m", [5e-4, 1e-3, 2e-3])
 @pytest.mark.parametrize("every", [1, 4])
-def test_rounded_positions_are_neither_wild_nor_miss_frames(step_m, every):
+def test_rounded_positions_have_no_outliers_or_missing_frames(step_m, every):
     """Clicked to the millimetre, or written with few decimals, and at rest mostly: the noise is that of rounding."""
     for seed in range(20020, 20026):
         for vine, noise_m, rho in VINES:
@@ -157,7 +157,7 @@ def test_rounded_positions_are_neither_wild_nor_miss_frames(step_m, every):
             assert not rounded.notes
 
 
-def test_a_wild_point_among_rounded_ones_is_rejected():
+def test_an_outlier_among_rounded_positions_is_rejected():
     track = steady_track(n=600)
     rounded = replace(track, lead_position_m=np.round(track.lead_position_m, 3))
     out = reject_outliers(displaced(rounded, np.array([20, 300]), np.array([5e-3, -6e-3])))

@@ -1,4 +1,4 @@
-"""Times of a file with too few digits are taken for the even series that they were."""
+"""Times of a file with too few digits are replaced by the even series that they were."""
 
 from __future__ import annotations
 

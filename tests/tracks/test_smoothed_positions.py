@@ -1,4 +1,4 @@
-"""Positions that somebody smoothed are told from those that nobody did; seeds 351 and up, which tuned nothing."""
+"""Smoothed positions are distinguished from others; seeds 351 and up, which tuned nothing."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
 
 
 @pytest.mark.parametrize("frames", [3, 5, 9])
-def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
+def test_a_moving_average_is_found_with_its_length(frames: int) -> None:
     found = detect_smoothing(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
     assert found is not None
     assert (found.window, found.degree, found.decimation) == (frames, 0, frames)
@@ -48,19 +48,19 @@ def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
 
 
 @pytest.mark.parametrize("frames", [7, 11])
-def test_a_polynomial_is_told_from_a_moving_average(frames: int) -> None:
+def test_a_polynomial_is_distinguished_from_a_moving_average(frames: int) -> None:
     found = detect_smoothing(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
     assert found is not None
     assert (found.window, found.degree) == (frames, 2)
     assert 1 < found.decimation < frames
 
 
-def test_digits_that_were_rounded_afterwards_hide_nothing() -> None:
+def test_smoothing_is_found_in_rounded_positions() -> None:
     found = detect_smoothing(tracks(354, smooth=lambda y: np.round(uniform_filter1d(y, 5), 5)))
     assert found == Smoothing(5, 0, 5)
 
 
-def test_nothing_is_said_of_frames_that_are_unevenly_apart_nor_of_recordings(tmp_path: Path) -> None:
+def test_uneven_frames_and_recordings_are_not_smoothed(tmp_path: Path) -> None:
     smoothed = tracks(355, smooth=lambda y: uniform_filter1d(y, 5))
     uneven_s = TIME_S + 3e-4 * np.sin(np.arange(TIME_S.size))
     assert detect_smoothing([(trial, as_track(uneven_s, track.lead_position_m)) for trial, track in smoothed]) is None

@@ -112,7 +112,7 @@ def test_segments_go_on_where_the_last_ended(tmp_path: Path) -> None:
         (segment([entry("/'g'/'pressure_kPa'", TIME_S)], TIME_S.tobytes(), flags=128), "DAQmx"),
     ],
 )
-def test_what_is_not_read_is_refused_in_a_sentence(tmp_path: Path, made: bytes, words: str) -> None:
+def test_unsupported_content_is_refused_in_one_sentence(tmp_path: Path, made: bytes, words: str) -> None:
     with pytest.raises(TrackError, match=words.replace("(", r"\(").replace(")", r"\)")):
         read(tmp_path, made)
 

@@ -62,7 +62,7 @@ def test_falling_disc(body, back):
 
 
 def test_a_neighbour_in_a_wide_strip_is_not_followed():
-    """Another disc, 60 px beside, that falls later: the wide axis drawn by hand along the first holds both."""
+    """Another disc, 60 px beside the first, falls later: the wide axis drawn by hand along the first holds both."""
     frames, row = falling_disc(305)
     other, _ = falling_disc(306, rest=40)
     both = np.concatenate([frames[:, :, 30:130], other[:, :, 50:110]], axis=2)
@@ -85,7 +85,7 @@ def test_a_bounce_ends_the_track():
     assert np.abs(track.edge_px[used] - row[used]).max() < 1
 
 
-def test_the_end_of_the_way_is_told_by_the_frame_of_the_recording():
+def test_the_note_on_a_body_end_names_the_frame_of_the_recording():
     frames, row = falling_disc(307, n=185)
     impact = int(np.argmax(row > 340))
     there_and_back = np.concatenate([frames[: impact + 1], frames[impact - 1 : 90 : -1]])
@@ -94,7 +94,7 @@ def test_the_end_of_the_way_is_told_by_the_frame_of_the_recording():
     assert any(f"turns back after frame {impact}:" in note for note in notes)
 
 
-def test_places_that_hop_between_bodies_are_no_motion():
+def test_places_that_hop_between_bodies_are_refused():
     number = np.arange(30.0)
     seen = np.ones(30, dtype=bool)
     fall = 0.3 * number**2
@@ -104,7 +104,7 @@ def test_places_that_hop_between_bodies_are_no_motion():
     assert hops_between_bodies(np.where(turns, neighbour, fall), seen)
 
 
-def test_a_bounce_or_a_stop_is_no_hop():
+def test_a_bounce_or_a_stop_is_not_a_hop():
     number = np.arange(40.0)
     seen = np.ones(40, dtype=bool)
     assert not hops_between_bodies(np.minimum(9 * number, 180), seen)
@@ -142,8 +142,8 @@ def test_a_block_that_tips_over_ends_its_motion():
     assert any("not recognised after frame" in note for note in track.notes)
 
 
-def test_a_body_that_is_gone_is_lost():
-    """Taken away in mid-fall: nothing that stays behind is followed in its place."""
+def test_a_body_that_disappears_is_lost():
+    """Taken away in mid-fall: nothing that remains is followed in its place."""
     frames, _ = falling_disc(308, n=185)
     empty = np.concatenate([frames[:60, 210:], frames[:60, 210:]], axis=1)[:, : SHAPE[0]]
     gone = np.concatenate([frames[:150], empty, empty])
@@ -171,7 +171,7 @@ def test_body_that_leaves_the_picture_ends_the_track():
     assert track.usable[(row > 90) & (row < 350)].all()
 
 
-def test_nothing_moving_is_said():
+def test_a_recording_without_motion_is_refused():
     frames, _ = falling_disc(304, n=12, rest=20)
     strip = cut_strip(np.repeat(frames[:1], 12, axis=0), Axis((80.0, 0.0), (80.0, 419.0), 48.0), 40)
     with pytest.raises(RecordingError, match="nothing moves"):

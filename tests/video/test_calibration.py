@@ -181,7 +181,7 @@ def test_board_printed_by_old_opencv_with_markers_in_the_other_squares():
     assert found.n_corners == 45
 
 
-def test_a_small_target_says_that_it_knows_less():
+def test_a_small_target_states_a_larger_error():
     small = replace(BOARD, squares=(6, 5), centre_m=(-0.09, 0))
     wide = calibrate_pictures([picture()], charuco())
     narrow = calibrate_pictures([picture(small)], charuco(small))
@@ -193,7 +193,7 @@ def test_a_small_target_says_that_it_knows_less():
     assert not wide.notes
 
 
-def test_scale_of_the_target_is_that_across_its_middle():
+def test_the_scale_of_a_target_holds_across_its_middle():
     found = calibrate_pictures([picture()], charuco())
     left, top, right, bottom = found.covered_px
     assert right - left == pytest.approx(14 * 0.02 * 2400, rel=0.1)
@@ -268,7 +268,7 @@ def test_two_points_and_a_length(tmp_path):
     assert axis.position_m(np.array([[10, 20], [200, 120], [10, 520]])) == pytest.approx([0, 0.05, 0.25])
 
 
-def test_scale_given_outright(tmp_path):
+def test_scale_given_as_mm_per_px(tmp_path):
     found = calibrate(MmPerPx(kind="mm_per_px", mm_per_px=0.27307), tmp_path, 384, 800)
     assert found.m_per_px == pytest.approx(0.27307e-3)
     assert math.isnan(found.scale_rel_sigma)

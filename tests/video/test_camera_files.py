@@ -63,7 +63,7 @@ def test_an_old_cine_states_its_exposure_in_microseconds(tmp_path):
     assert inspect_recording(path).exposure_s == pytest.approx(93e-6)
 
 
-def test_times_of_the_frames_tell_of_missing_ones(tmp_path):
+def test_time_stamps_show_missing_frames(tmp_path):
     times = np.delete(np.arange(10), 4) / 5000 + 0.7
     read = read_frames(write_cine(tmp_path / "a.cine", EIGHT, times_s=times, exposures_s=np.full(9, 40e-6)))
     assert read.slot.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
@@ -78,7 +78,7 @@ def test_frames_saved_one_in_four_have_their_own_rate(tmp_path):
     assert "set to 5000 frames a second, but its frames are 1250 a second" in recording.notes[0]
 
 
-def test_automatic_exposure_is_told(tmp_path):
+def test_automatic_exposure_is_reported(tmp_path):
     recording = inspect_recording(write_cine(tmp_path / "a.cine", EIGHT, exposures_s=np.linspace(2, 4, 9) * 1e-5))
     assert "exposure changes from frame to frame, 20 to 40 µs" in recording.notes[0]
 
@@ -101,21 +101,21 @@ def test_a_mosaic_of_colours_is_levelled(tmp_path):
         ({"bit_count": 24}, "24 bits a pixel, colours interleaved"),
     ],
 )
-def test_a_cine_that_is_not_read_is_refused_by_name(tmp_path, options, words):
+def test_an_unsupported_cine_is_refused_by_name(tmp_path, options, words):
     with pytest.raises(RecordingError, match=r"a\.cine: ") as error:
         inspect_recording(write_cine(tmp_path / "a.cine", EIGHT, **options))
     assert words in str(error.value)
 
 
 @pytest.mark.parametrize("keep", [30, 100, 900, 2000, 5900])
-def test_a_cine_cut_in_its_header_is_told_in_a_sentence(tmp_path, keep):
+def test_a_cine_truncated_in_its_header_is_refused_in_one_sentence(tmp_path, keep):
     whole = write_cine(tmp_path / "a.cine", EIGHT).read_bytes()
     (tmp_path / "a.cine").write_bytes(whole[:keep])
     with pytest.raises(RecordingError, match="copy it from the camera again"):
         read_frames(tmp_path / "a.cine")
 
 
-def test_a_cine_cut_short_gives_the_frames_that_are_there(tmp_path):
+def test_a_truncated_cine_gives_its_whole_frames(tmp_path):
     path = write_cine(tmp_path / "a.cine", EIGHT)
     path.write_bytes(path.read_bytes()[:-1500])
     read = read_frames(path)
@@ -139,7 +139,7 @@ def test_an_exposure_is_read_as_any_of_their_programs_writes_it(tmp_path, shutte
     assert inspect_recording(write_mraw(tmp_path / "a.mraw", DEEP, shutter=shutter)).exposure_s == pytest.approx(25e-6)
 
 
-def test_an_exposure_longer_than_a_frame_is_no_exposure(tmp_path):
+def test_an_exposure_longer_than_a_frame_is_ignored(tmp_path):
     assert inspect_recording(write_mraw(tmp_path / "a.mraw", DEEP, shutter="1.000000")).exposure_s is None
 
 
@@ -154,11 +154,11 @@ def test_frames_saved_one_in_five_have_a_fifth_of_the_rate(tmp_path):
     [
         ({"bits": 10}, "10 bits a pixel are not read"),
         ({"colour": "Color", "bits": 24}, "colour (Color) is not read"),
-        ({"form": "AVI"}, "tells of AVI pictures"),
+        ({"form": "AVI"}, "describes AVI pictures"),
         ({"total": 0}, "size or number of frames is missing"),
     ],
 )
-def test_an_mraw_that_is_not_read_is_refused_by_name(tmp_path, options, words):
+def test_an_unsupported_mraw_is_refused_by_name(tmp_path, options, words):
     path = write_mraw(tmp_path / "a.mraw", DEEP)
     write_side_file(path.with_suffix(".cih"), DEEP, **options)
     with pytest.raises(RecordingError) as error:
@@ -175,7 +175,7 @@ def test_an_mraw_and_its_side_file_need_each_other(tmp_path):
         inspect_recording(tmp_path / "b.cih")
 
 
-def test_an_mraw_cut_short_gives_the_frames_that_are_there(tmp_path):
+def test_a_truncated_mraw_gives_its_whole_frames(tmp_path):
     path = write_mraw(tmp_path / "a.mraw", DEEP)
     path.write_bytes(path.read_bytes()[:-10])
     read = read_frames(path)
@@ -199,7 +199,7 @@ def test_a_folder_of_pictures_has_rate_and_exposure_of_its_side_file(tmp_path):
 
 
 @pytest.mark.parametrize("other", [{"total": 8}, {"width": 30}, {"form": "MRaw"}])
-def test_a_side_file_of_other_pictures_is_not_believed(tmp_path, other):
+def test_a_side_file_of_other_pictures_is_ignored(tmp_path, other):
     folder = write_images(tmp_path / "shots", DEEP, ".tif")
     write_side_file(folder / "shots.cih", DEEP, **({"form": "Tiff"} | other))
     assert inspect_recording(folder).capture_fps is None
@@ -237,7 +237,7 @@ def test_a_packed_recording_is_tracked_as_well_as_it_is_filmed(tmp_path):
 @pytest.mark.parametrize(
     ("suffix", "words"), [(".raw", "Chronos"), (".r3d", "RED's"), (".braw", "Blackmagic's"), (".SEQ", "StreamPix")]
 )
-def test_formats_of_makers_that_are_not_read_are_refused_by_name(tmp_path, suffix, words):
+def test_unsupported_formats_are_refused_by_name(tmp_path, suffix, words):
     path = tmp_path / f"shot{suffix}"
     path.write_bytes(np.random.default_rng(972).integers(0, 256, 50_000, dtype=np.uint8).tobytes())
     with pytest.raises(

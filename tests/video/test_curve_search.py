@@ -81,7 +81,7 @@ def test_a_straight_vine_keeps_the_straight_axis_it_had(name: str) -> None:
 
 
 @pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])
-def test_what_is_hardly_longer_than_wide_has_no_curve_and_stops_nothing(length_px: int, width_px: int) -> None:
+def test_a_band_hardly_longer_than_wide_has_no_curve(length_px: int, width_px: int) -> None:
     rng = np.random.default_rng(2211)
     for _ in range(10):
         frames = rng.normal(60, 2, (20, 99, 134))

@@ -179,7 +179,7 @@ def test_a_curve_too_sharp_for_the_tube_is_refused_in_a_sentence(bent: BentScene
         followed(bent, sharp)
 
 
-def test_a_cameras_shake_is_taken_off_along_a_curve() -> None:
+def test_camera_shake_is_removed_along_a_curve() -> None:
     plan = BentPlan(seed=2, speed=22.0, shake=1.2, width=560, height=480, **(BENDS["quarter"] | SHORT))
     shaken = bent_scene(plan)
     tracking = followed(shaken, drawn(shaken))
@@ -191,7 +191,7 @@ def test_a_cameras_shake_is_taken_off_along_a_curve() -> None:
     assert np.nanmin(tracking.track.lead_position_systematic_m[used]) > 0.1e-3
 
 
-def test_ground_that_stands_still_is_not_moved(bent: BentScene) -> None:
+def test_a_still_background_is_not_shifted(bent: BentScene) -> None:
     axis = drawn(bent, off_px=0.0)
     assert isinstance(axis, CurvedAxis)
     assert picture_shake(bent.frames, axis, 24.0) is None

@@ -94,7 +94,7 @@ def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip
         track_recording(replace(clip.trial, video=path))
 
 
-def test_sound_frames_of_a_damaged_recording_are_tracked_right_and_no_others(clip: Clip, tmp_path: Path) -> None:
+def test_only_the_sound_frames_of_a_damaged_recording_are_tracked(clip: Clip, tmp_path: Path) -> None:
     track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, 62))).track
     assert np.isfinite(track.edge_px[20:62]).all()
     assert all("rejected" in flag for flag in track.flag[62:])
@@ -103,7 +103,7 @@ def test_sound_frames_of_a_damaged_recording_are_tracked_right_and_no_others(cli
     assert any("0 to 61: damaged frames" in note for note in track.notes)
 
 
-def test_sound_frames_beyond_the_damage_do_not_count(clip: Clip, tmp_path: Path) -> None:
+def test_sound_frames_beyond_the_damage_are_not_used(clip: Clip, tmp_path: Path) -> None:
     """The tracker would have to leap over the hole, and errs by centimetres when it does."""
     track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, 50))).track
     assert not track.usable[50:].any()
@@ -179,7 +179,7 @@ def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip: Clip
     assert np.flatnonzero(torn_frames(twice)).tolist() == [30, 31]
 
 
-def test_a_patch_that_moves_or_a_light_that_flickers_tears_nothing(clip: Clip) -> None:
+def test_moving_patches_and_flicker_are_not_torn_frames(clip: Clip) -> None:
     lit = clip.frames.luma.astype(float) * np.where(np.arange(len(clip.frames.luma)) % 2, 1.0, 0.96)[:, None, None]
     assert not torn_frames(np.rint(lit).astype(np.uint8)).any()
     crossed = clip.frames.luma.copy()
@@ -188,7 +188,7 @@ def test_a_patch_that_moves_or_a_light_that_flickers_tears_nothing(clip: Clip) -
     assert not torn_frames(crossed).any()
 
 
-def test_frames_that_decoders_know_nothing_of_are_damaged_where_they_are_torn(clip: Clip, tmp_path: Path) -> None:
+def test_torn_frames_are_damaged_though_the_decoder_reports_nothing(clip: Clip, tmp_path: Path) -> None:
     path = tmp_path / "a.mov"
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mjpeg", rate=60)
@@ -211,7 +211,7 @@ def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many() -> None:
     assert slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
 
 
-def test_what_lies_beyond_frames_that_were_lost_does_not_count(clip: Clip) -> None:
+def test_frames_beyond_lost_ones_are_not_used(clip: Clip) -> None:
     kept = np.delete(np.arange(len(clip.frames)), np.arange(48, 58))
     frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
     track = track_frames(frames, clip.trial, CAPTURE_FPS).track

@@ -124,7 +124,7 @@ def test_time_is_mid_exposure_and_flags_are_known():
     assert not any("before_release" in f or "after_end" in f for f in track.flag[scene.moving][3:])
 
 
-def test_growth_out_of_the_picture_is_said_and_ends_the_track():
+def test_growth_out_of_the_picture_ends_the_track_with_a_note():
     plan = Plan(**{**SHORT, "seed": 207, "end_px": 620.0})
     scene = plain_scene(plan)
     track = track_frames(in_memory(scene.frames), trial(plan), 1000.0).track
@@ -150,7 +150,7 @@ def test_a_recording_that_ends_in_motion_says_how_far_the_vine_had_grown(speed):
 
 
 @pytest.mark.parametrize("speed", [6.0, 20.0])
-def test_two_frames_of_rest_at_the_end_of_a_recording_are_no_growth(speed):
+def test_two_frames_of_rest_at_the_end_are_not_growth(speed):
     plan = Plan(**{**SHORT, "seed": 214, "speed": speed, "end_px": 330.0})
     scene = plain_scene(plan)
     count = int(np.flatnonzero(scene.moving)[-1]) + 3
@@ -160,19 +160,19 @@ def test_two_frames_of_rest_at_the_end_of_a_recording_are_no_growth(speed):
     assert not any("ends while" in note for note in track.notes)
 
 
-def test_a_pause_of_one_frame_in_slow_growth_is_no_stop():
+def test_a_pause_of_one_frame_in_slow_growth_is_not_a_stop():
     edge = np.concatenate([np.full(8, 50.0), 50 + 1.0 * np.arange(1, 30), [79.0]])
     assert moving_range(edge, np.full(edge.size, 0.05)) == (8, edge.size - 1)
 
 
-def test_still_recording_is_said():
+def test_a_still_recording_is_refused():
     plan = Plan(seed=208, **SHORT)
     still = np.repeat(plain_scene(plan).frames[:1], 20, axis=0)
     with pytest.raises(RecordingError, match="nothing moves"):
         track_frames(in_memory(still), trial(plan), 1000.0)
 
 
-def test_too_few_frames_are_said():
+def test_too_few_frames_are_refused():
     plan = Plan(seed=209, **SHORT)
     with pytest.raises(RecordingError, match="only 4 frames"):
         track_frames(in_memory(plain_scene(plan).frames[:4]), trial(plan), 1000.0)
@@ -207,7 +207,7 @@ def test_a_repeated_frame_is_dropped_and_the_times_stay():
     assert track.time_s[26] - track.time_s[24] == pytest.approx(2e-3)
 
 
-def test_a_missing_frame_is_flagged_and_the_times_are_mended():
+def test_a_missing_frame_is_flagged_and_the_times_are_corrected():
     plan = Plan(seed=212, **SHORT)
     scene = plain_scene(plan)
     track = track_frames(in_memory(np.delete(scene.frames, 26, axis=0)), trial(plan), 1000.0).track

@@ -1,4 +1,4 @@
-"""The disagreement of bands against jitter put in; seeds 311 and up, which tuned nothing."""
+"""The disagreement of bands against known jitter; seeds 311 and up, which tuned nothing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_disagreement_is_the_error_of_the_mean(sd_px):
     assert slow_px < 0.35 * true
 
 
-def test_a_band_that_always_lags_is_no_error():
+def test_a_band_that_always_lags_adds_no_error():
     strip, state, _ = jittered(0.0)
     lagging = np.repeat([0.0, 0.0, 1.5, 0.0], ROWS // BANDS)
     tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.pictures, state.inflation)

@@ -59,8 +59,8 @@ def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: 
         {"door": True},
     ],
 )
-def test_stated_errors_are_those_that_are_made(changes: dict[str, float]) -> None:
-    """What a point errs by on its own account shows in second differences of the errors: Σ(1, −2, 1)² = 6."""
+def test_stated_errors_match_the_true_errors(changes: dict[str, float]) -> None:
+    """Random errors show in second differences of the errors: Σ(1, −2, 1)² = 6."""
     pulls = []
     for seed in (331, 332):
         plan = Plan(**{**SHORT, **changes, "seed": seed})
@@ -75,7 +75,7 @@ def test_stated_errors_are_those_that_are_made(changes: dict[str, float]) -> Non
 
 
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
-def test_what_misleads_bands_of_rows_slowly_is_an_error_though_the_track_is_smooth(periods: tuple[int, int]) -> None:
+def test_slow_errors_of_bands_are_stated_though_the_track_is_smooth(periods: tuple[int, int]) -> None:
     """By root mean squares over three draws: that of one, with four bands of which two mirror two, is known to half.
 
     Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
@@ -117,7 +117,7 @@ def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure:
     assert abs(error.mean()) < 0.05
 
 
-def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows() -> None:
+def test_an_edge_that_stops_within_an_exposure_has_the_error_of_its_dwell() -> None:
     """Half of an exposure at 20 px a frame, half at rest: seen on average vτ/8 behind where it is in the middle."""
     frames, exposure, stop = np.arange(36.0), 0.5, 380.0
     instants = frames[:, None] + exposure * (np.arange(SUB_INSTANTS) + 0.5 - SUB_INSTANTS / 2) / SUB_INSTANTS
@@ -134,7 +134,7 @@ def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows
     assert sigma[16 : last - 4].max() < 0.5
 
 
-def test_a_picture_unlike_the_others_has_an_error_of_its_own() -> None:
+def test_a_noisier_picture_has_a_larger_error() -> None:
     """Every fourth picture has five times the noise, as where a coder spares bits."""
     frames = np.arange(95.0)
     true = grown_px(frames)
@@ -157,7 +157,7 @@ def test_a_picture_unlike_the_others_has_an_error_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("door_grey", [30, 60, 90])
-def test_an_edge_behind_something_that_moves_is_lost(door_grey: int) -> None:
+def test_an_edge_behind_a_sliding_door_is_lost(door_grey: int) -> None:
     """A striped door slides by in front of the first 80 px of growth; the tip comes out from behind it and is seen."""
     frames, columns = np.arange(80.0), np.arange(COLUMNS)
     true = grown_px(frames)
@@ -186,7 +186,7 @@ def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float,
     assert dwell_error_px(edge, exposure)[2:-2] == pytest.approx(np.hypot(edge - place, unsure_px)[2:-2], abs=0.01)
 
 
-def test_an_even_motion_has_no_error_of_dwell_and_one_that_speeds_up_hardly_any() -> None:
+def test_uniform_motion_has_no_dwell_error_and_acceleration_hardly_any() -> None:
     frames = np.arange(40.0)
     assert dwell_error_px(7.0 * frames, 0.5)[2:-2].max() < 1e-9
     assert dwell_error_px(0.5 * (frames + 3) ** 2, 0.5)[2:-2].max() < 0.04

@@ -174,7 +174,7 @@ def test_video_whose_index_was_never_written_is_cut_short(tmp_path):
         read_frames(path)
 
 
-def test_fewer_frames_than_declared_is_said(tmp_path):
+def test_fewer_frames_than_declared_are_reported(tmp_path):
     path = write_video(tmp_path / "a.mp4", NOISE, options={"g": "5"}, container_options={"movflags": "+faststart"})
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames = read_frames(path)
@@ -182,7 +182,7 @@ def test_fewer_frames_than_declared_is_said(tmp_path):
     assert any(f"{len(frames)} frames decoded where the file declares 60" in note for note in frames.notes)
 
 
-def test_avi_cut_short_is_said(tmp_path):
+def test_a_truncated_avi_is_reported(tmp_path):
     path = write_video(tmp_path / "a.avi", NOISE, codec="ffv1", pix_fmt="gray")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames = read_frames(path)
@@ -190,7 +190,7 @@ def test_avi_cut_short_is_said(tmp_path):
     assert any("where the file declares 60" in note for note in frames.notes)
 
 
-def test_damaged_bytes_are_said_and_marked(tmp_path):
+def test_damaged_bytes_are_reported_and_marked(tmp_path):
     path = write_video(tmp_path / "a.mp4", NOISE)
     data = bytearray(path.read_bytes())
     for at in RNG.integers(len(data) // 4, len(data) // 2, 60):
@@ -201,7 +201,7 @@ def test_damaged_bytes_are_said_and_marked(tmp_path):
     assert frames.damaged.any()
 
 
-def test_empty_file_is_said(tmp_path):
+def test_an_empty_file_is_refused(tmp_path):
     path = tmp_path / "a.mp4"
     path.touch()
     with pytest.raises(RecordingError, match="the file is empty"):
@@ -215,12 +215,12 @@ def test_text_is_not_a_video(tmp_path):
         inspect_recording(path)
 
 
-def test_missing_file_is_said(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="no such file"):
         inspect_recording(tmp_path / "none.mp4")
 
 
-def test_folder_without_images_is_said(tmp_path):
+def test_a_folder_without_images_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="holds no images"):
         inspect_recording(tmp_path)
 

@@ -113,7 +113,7 @@ def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
     np.testing.assert_allclose(off - np.median(off), 0.0, atol=0.4)
 
 
-def test_a_body_that_passes_is_sought_in_all_that_changes() -> None:
+def test_the_axis_of_a_passing_body_is_found_from_all_change() -> None:
     rng = np.random.default_rng(43)
     frames = rng.normal(60, 2, (40, 120, 320))
     for t in range(40):
@@ -123,7 +123,7 @@ def test_a_body_that_passes_is_sought_in_all_that_changes() -> None:
     assert abs(slope_deg(find_axis(small, grows=False))) < 1
 
 
-def test_a_door_that_stands_bright_beside_the_tube_changes_no_brightness() -> None:
+def test_a_bright_door_beside_the_tube_is_not_flicker() -> None:
     frames = beside_a_door(44, growth_px=140, door_px=100, speed_px=4.0)
     # The door comes to rest, and stood at first, in the bands that tell of flicker; nothing here flickers.
     strip = cut_strip(frames, Axis((5.0, float(MOUTH[1])), (470.0, float(MOUTH[1]))), 12)
@@ -131,7 +131,7 @@ def test_a_door_that_stands_bright_beside_the_tube_changes_no_brightness() -> No
     assert np.ptp(still) < 2.0
 
 
-def test_a_found_axis_is_as_narrow_with_a_calibration_as_without(tmp_path: Path) -> None:
+def test_a_calibration_does_not_widen_a_found_axis(tmp_path: Path) -> None:
     video = write_images(tmp_path / "clip", beside_a_door(45, growth_px=220, door_px=60, speed_px=4.0))
     trial = Trial(name="clip", video=video, capture_fps=1000.0, exposure_s=1e-4)
     settings = ExperimentSettings(calibration=MmPerPx(kind="mm_per_px", mm_per_px=0.5))

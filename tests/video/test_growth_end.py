@@ -60,7 +60,7 @@ def test_film_that_stays_ends_where_the_path_does():
     assert growth_end(strip, path, (20, END_PX)) == END_PX
 
 
-def test_growth_that_quickens_is_no_flight():
+def test_accelerating_growth_is_not_a_flying_payload():
     strip, path = grown(flies=False)
     time = np.arange(len(path), dtype=float)
     quick = np.minimum(20 + 0.0513 * time**2, END_PX)

@@ -1,4 +1,4 @@
-"""Points moved, dropped and confirmed by hand come out of the tracker so, and the tracker's own stay beside."""
+"""Points moved, dropped and confirmed by hand reach the track, next to the tracker's own."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def test_a_dropped_point_is_rejected_and_a_confirmed_one_no_longer_doubtful() ->
     assert "1 dropped, 1 confirmed, 1 moved" in out.notes[-1]
 
 
-def test_what_cannot_be_done_is_told_and_changes_nothing() -> None:
+def test_impossible_corrections_are_reported_and_change_nothing() -> None:
     out = corrected_by_hand(px_track(), [Correction(99, "drop"), Correction(2, "confirm")])
     assert list(out.flag) == list(px_track().flag)
     assert len(out.notes) == 2
 
 
-def test_the_input_stays_as_it_is() -> None:
+def test_the_given_track_is_unchanged() -> None:
     track = px_track()
     corrected_by_hand(track, [Correction(0, "drop")])
     assert track.edge_px[0] == 0.0

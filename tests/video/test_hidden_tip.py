@@ -1,4 +1,4 @@
-"""A tip behind a door or in the mouth of a launcher is doubtful or lost, never ok; one in sight keeps its points."""
+"""A tip behind a door or in the mouth of a launcher is doubtful or lost, never ok; a visible one keeps its points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def tracked(scene: Scene) -> Track:
 
 
 def ok(track: Track) -> np.ndarray:
-    """Points that carry no doubt."""
+    """Points without any flag."""
     return track.usable & ~with_flag(track.flag, "doubtful")
 
 

@@ -17,18 +17,18 @@ def released(frame: float, acceleration: float = 3.0) -> np.ndarray:
 
 @pytest.mark.parametrize("frame", [8.0, 8.3, 8.7, 8.99])
 @pytest.mark.parametrize("seed", [351, 352])
-def test_a_tip_that_was_followed_from_rest_makes_no_leap(frame: float, seed: int) -> None:
+def test_a_tip_followed_from_rest_has_no_leap(frame: float, seed: int) -> None:
     edge = released(frame) + np.random.default_rng(seed).normal(0, 0.1, FRAMES.size)
     assert leap_error_px(edge, FRAMES < 14).max() == 0.0
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_vine_whose_speed_settles_within_a_frame_makes_no_leap(share: float) -> None:
+def test_a_vine_whose_speed_settles_within_a_frame_has_no_leap(share: float) -> None:
     edge = 100.0 + 20.0 * np.clip(FRAMES - 8.0 - share, 0.0, None)
     assert leap_error_px(edge, FRAMES < 14).max() == 0.0
 
 
-def test_a_door_followed_in_place_of_the_tip_is_off_by_how_far_it_is_from_the_way_back() -> None:
+def test_a_followed_door_is_off_by_its_distance_from_the_extrapolated_motion() -> None:
     true = released(8.3)
     edge = true.copy()
     edge[:14] = 130.0 + 0.8 * FRAMES[:14]  # the tip comes out at frame 14, at 149 px
@@ -38,7 +38,7 @@ def test_a_door_followed_in_place_of_the_tip_is_off_by_how_far_it_is_from_the_wa
     assert error[:10].min() > 20.0
 
 
-def test_frames_that_nothing_hides_are_not_judged() -> None:
+def test_visible_frames_have_no_leap_error() -> None:
     edge = released(8.3)
     edge[:14] = 130.0
     assert leap_error_px(edge, np.zeros(40, dtype=bool)).max() == 0.0

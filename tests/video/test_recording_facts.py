@@ -1,4 +1,4 @@
-"""Sizes in the picture against the sheet: each slip is caught, right campaigns are not."""
+"""Sizes in the picture against the sheet: each mistake is caught, correct campaigns are not reported."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FACTS = RecordingFacts(
 )  # fmt: skip
 
 
-def test_sizes_that_agree_bring_nothing() -> None:
+def test_matching_sizes_give_no_problem() -> None:
     assert size_problems(VINE, FACTS) == []
 
 
@@ -51,7 +51,7 @@ def test_a_wrong_scale_is_named_once_with_numbers_and_factor(scale: float, sever
     assert "check the scale" in problem.remedy
 
 
-def test_diameter_and_length_in_each_others_place_are_named() -> None:
+def test_swapped_diameter_and_length_are_named() -> None:
     swapped = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
     problems = size_problems(swapped, FACTS)
     assert [problem.column for problem in problems] == ["diameter_mm", "length_mm"]
@@ -59,16 +59,16 @@ def test_diameter_and_length_in_each_others_place_are_named() -> None:
     assert all("are swapped" in problem.remedy for problem in problems)
 
 
-def test_a_vine_that_stops_early_is_no_slip() -> None:
+def test_a_vine_that_stops_early_is_not_a_mistake() -> None:
     assert size_problems(VINE, replace(FACTS, growth_mm=60.0)) == []
 
 
-def test_a_vine_that_grows_beyond_its_length_is_one() -> None:
+def test_a_vine_that_grows_beyond_its_length_is_a_mistake() -> None:
     (problem,) = size_problems(VINE, replace(FACTS, growth_mm=168.0))
     assert (problem.column, problem.severity) == ("length_mm", "warning")
 
 
-def test_a_body_and_a_sheet_that_declines_are_not_compared() -> None:
+def test_sizes_of_a_body_or_with_compare_sizes_no_are_not_compared() -> None:
     wrong = replace(FACTS, tube_width_mm=120.0)
     assert size_problems(replace(VINE, travel_ratio=1), wrong) == []
     assert size_problems(replace(VINE, compare_sizes=False), wrong) == []
@@ -92,7 +92,7 @@ ALONG = {"level": Axis((10.0, 60.0), (300.0, 40.0)), "down": Axis((60.0, 10.0), 
         ("level", 0.0, True, "growth runs level in the picture (2 recordings, a first) and a blank growth_angle_deg"),
     ],
 )
-def test_growth_that_looks_otherwise_than_stated_is_noted(
+def test_growth_in_another_direction_than_stated_is_noted(
     picture: str, angle_deg: float, blank: bool, words: str | None
 ) -> None:
     trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
@@ -179,7 +179,7 @@ def tracked(clip: Path, exposure_frames: float) -> tuple[Trial, object]:
     return trial, track_recording(trial)
 
 
-def test_an_exposure_that_the_blur_bears_out_brings_nothing(clip: Path) -> None:
+def test_an_exposure_that_agrees_with_the_blur_gives_no_problem(clip: Path) -> None:
     trial, tracking = tracked(clip, 0.5)
     assert exposure_problems(trial, tracking) == []
     assert tracking.tube_width_px * SCALE_MM == pytest.approx(12, rel=0.05)
@@ -205,7 +205,7 @@ def surveyed(clip: Path, folder: Path, row: str, settings: str) -> tuple[list[st
     return [f"{p.severity} {p.column}" for p in check_experiment(folder, surveyor)], surveyor
 
 
-def test_check_understands_a_right_recording(clip: Path, tmp_path: Path) -> None:
+def test_check_reports_the_facts_of_a_correct_recording(clip: Path, tmp_path: Path) -> None:
     problems, surveyor = surveyed(clip, tmp_path / "v", "a,a.mp4,12,100,140,36,3\n", SETTINGS)
     assert problems == []
     (facts,) = surveyor.facts.values()
@@ -226,7 +226,7 @@ def test_check_understands_a_right_recording(clip: Path, tmp_path: Path) -> None
     ],
     ids=["rate", "scale ×10", "scale 20 %", "sizes swapped", "ms as µs", "µs as ms"],
 )
-def test_check_catches_a_slip(clip: Path, tmp_path: Path, row: str, settings: str, expected: list[str]) -> None:
+def test_check_catches_a_mistake(clip: Path, tmp_path: Path, row: str, settings: str, expected: list[str]) -> None:
     assert surveyed(clip, tmp_path / "v", row, settings)[0] == expected
 
 

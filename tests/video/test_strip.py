@@ -70,7 +70,7 @@ def test_shake_is_measured_to_a_twentieth_of_a_pixel():
     assert np.std(strip.shift_px[:, 0] - waves @ fit) < 0.05
 
 
-def test_a_still_camera_is_left_alone():
+def test_a_still_camera_is_not_stabilised():
     scene = plain_scene(Plan(seed=13, end_px=300, width=420, rest_frames=6, end_frames=4))
     strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
     assert not strip.steadied
@@ -92,7 +92,7 @@ def test_axis_is_found_in_any_direction_of_growth(angle):
     assert front_share(scene.frames, axis) >= LEAST_FRONT_SHARE
 
 
-def test_nothing_moves_is_said():
+def test_pictures_without_motion_are_refused():
     still = np.repeat(plain_scene(Plan(seed=15, width=300, end_px=200, end_frames=1)).frames[:1], 20, axis=0)
     with pytest.raises(RecordingError, match="nothing moves"):
         find_axis(still)
@@ -104,7 +104,7 @@ def test_an_axis_needs_length():
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_black_ground_beside_the_tube_tells_of_no_light(kind: type) -> None:
+def test_black_background_is_not_used_for_flicker(kind: type) -> None:
     luma = np.zeros((12, 120, 200), kind)
     luma[:, 55:65] = 180
     strip = cut_strip(luma, Axis((5.0, 60.0), (195.0, 60.0)), 8)

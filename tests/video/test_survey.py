@@ -1,4 +1,4 @@
-"""Recordings and calibration looked at before any work: what is wrong is said, and fast."""
+"""Checks of recordings and calibration before any work: every problem is reported, and fast."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def check(folder: Path, *videos: str, settings: str = SCALE) -> list[Problem]:
     return check_experiment(folder, survey)
 
 
-def test_a_sound_recording_and_scale_bring_no_complaint(folder: Path) -> None:
+def test_a_sound_recording_and_scale_give_no_problem(folder: Path) -> None:
     write_clip(folder / "a.mp4")
     assert check(folder, "a.mp4") == []
 
@@ -84,13 +84,13 @@ def test_fewer_frames_than_declared_are_counted_without_decoding(folder: Path, n
     assert 25 <= count <= 40
 
 
-def test_a_recording_of_three_frames_is_none(folder: Path) -> None:
+def test_a_recording_of_three_frames_is_refused(folder: Path) -> None:
     write_clip(folder / "a.mp4", 3)
     (problem,) = check(folder, "a.mp4")
     assert (problem.severity, problem.message, problem.remedy) == ("error", "has 3 frames", "at least 5 are needed")
 
 
-def test_an_empty_folder_a_missing_file_and_an_empty_file_are_told_apart(folder: Path) -> None:
+def test_an_empty_folder_a_missing_file_and_an_empty_file_have_different_messages(folder: Path) -> None:
     (folder / "frames").mkdir()
     (folder / "b.mp4").write_bytes(b"")
     found = check(folder, "frames", "b.mp4", "c.mp4")
@@ -150,7 +150,7 @@ def test_a_picture_that_shows_no_board_is_refused(folder: Path) -> None:
     assert problem.severity == "error"
 
 
-def test_a_missing_picture_is_said_once(folder: Path) -> None:
+def test_a_missing_picture_is_reported_once(folder: Path) -> None:
     write_clip(folder / "a.mp4")
     (problem,) = check(folder, "a.mp4", settings=board_settings("board.png"))
     assert (problem.column, problem.message) == ("calibration.image", "does not exist")

@@ -91,7 +91,7 @@ def test_dark_and_light_squares_may_change_places():
     assert found[0] == pytest.approx((20.2, 19.7), abs=0.01)
 
 
-def test_what_is_printed_beside_the_edges_is_left_out():
+def test_prints_beside_the_edges_are_left_out():
     picture = crossing((20.3, 19.6), (2, 91))
     y, x = np.mgrid[:41, :41]
     picture[(np.abs(x - 20.3) > 5) & (np.abs(y - 19.6) > 5)] = 120  # a grey marker in each corner of the window
@@ -109,7 +109,7 @@ def test_corner_at_the_border_of_the_picture_is_found_from_what_is_left():
     assert found[0] == pytest.approx((4.2, 19.7), abs=0.02)
 
 
-def test_corner_that_is_none_is_not_held():
+def test_a_false_corner_is_discarded():
     flat = np.full((41, 41), 90, dtype=np.uint8)
     noise = np.random.default_rng(3004).integers(88, 93, (41, 41)).astype(np.uint8)
     for picture in (flat, noise):
@@ -117,7 +117,7 @@ def test_corner_that_is_none_is_not_held():
         assert not held.any()
 
 
-def test_inputs_stay_as_they_were():
+def test_inputs_are_unchanged():
     picture = render_target(CHECKER, SCENE, seed=3005)
     before = picture.copy()
     checkerboard_corners(picture, CHECKERBOARD)

@@ -1,4 +1,4 @@
-"""A tip that is lit otherwise than the tube behind it, followed across the place where film looks like background."""
+"""A tip that is lit differently from the tube behind it, tracked where film looks like background."""
 
 from __future__ import annotations
 

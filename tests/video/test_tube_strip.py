@@ -1,4 +1,4 @@
-"""What a front leaves behind is a tube where one front passes along the middle of it; else only arrival is followed."""
+"""A front leaves a tube where one front passes along its middle; elsewhere only the arrival is followed."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def tube() -> np.ndarray:
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def order_is(share_beside: float, share_on_axis: float = 1.0):
-    """Order along the axis given, and along any other."""
+def front_share_is(share_beside: float, share_on_axis: float = 1.0):
+    """A front share along the axis given, and another along any other axis."""
     return lambda axis: share_on_axis if axis is AXIS else share_beside
 
 
@@ -41,16 +41,16 @@ def test_the_strip_is_centred_on_the_tube():
     assert order(strip.axis) > 0.9
 
 
-def test_it_is_a_tube_though_hardly_most_of_the_change_is_its_front():
-    assert tube_strip(tube(), AXIS, order_is(LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)) is not None
+def test_a_front_share_at_the_limit_is_a_tube():
+    assert tube_strip(tube(), AXIS, front_share_is(LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)) is not None
 
 
 @pytest.mark.parametrize(
     "order",
-    [order_is(1.0, LEAST_FRONT_SHARE - 0.01), order_is(LEAST_FRONT_SHARE - 0.01)],
+    [front_share_is(1.0, LEAST_FRONT_SHARE - 0.01), front_share_is(LEAST_FRONT_SHARE - 0.01)],
     ids=["along the axis", "along the middle"],
 )
-def test_where_no_front_passes_only_the_arrival_is_followed(order):
+def test_without_a_front_only_the_arrival_is_followed(order):
     luma = tube()
     assert tube_strip(luma, AXIS, order) is None
     _, positions = follow(luma, TRIAL, AXIS, 0.1, order)
@@ -61,6 +61,6 @@ def test_where_no_front_passes_only_the_arrival_is_followed(order):
 
 def test_the_edge_of_a_tube_is_followed():
     luma = tube()
-    _, positions = follow(luma, TRIAL, AXIS, 0.1, order_is(1.0))
+    _, positions = follow(luma, TRIAL, AXIS, 0.1, front_share_is(1.0))
     assert positions.is_edge
     assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[14:60].max() < 3

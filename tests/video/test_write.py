@@ -62,7 +62,7 @@ def broken():  # type: ignore[no-untyped-def]
     [([], ValueError), ([np.zeros((63, 96, 3), np.uint8)], ValueError), (broken(), RuntimeError)],
     ids=["nothing", "odd", "broken"],
 )
-def test_what_fails_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given, error) -> None:  # type: ignore[no-untyped-def]
+def test_a_failed_write_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given, error) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "a.mp4"
     path.write_bytes(b"the old one")
     with pytest.raises(error):

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +103,15 @@ _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
 """Frame numbers and positions before and after."""
 
 
+class _Jump(NamedTuple):
+    """Jump of position between two sides of a smooth motion, its standard error and the step of one frame, m."""
+
+    size: float
+    sigma: float
+    step: float
+    sides: _Sides
+
+
 @dataclass(frozen=True)
 class _Fault:
     """A fault on the way to row `row`: a frame repeated (stale or inserted) or `missing` frames dropped."""
@@ -170,7 +180,7 @@ def frames_surely_missing(track: Track) -> bool:
         jump = _jump(*near, slice(0, i + 1), slice(i + 1, None), noise_m[rows[i]], rho) if i >= 0 else None
         if jump is None or math.isfinite(_wide_jump(*near, i, noise_m[rows[i]])):
             return True
-        if jump[0] > SURE_FACTOR * JUMP_SIGMAS * jump[1]:
+        if jump.size > SURE_FACTOR * JUMP_SIGMAS * jump.sigma:
             return True
     return False
 
@@ -247,9 +257,8 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
     for i in _suspect_steps(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
         if rows[i + 1] <= after:
             continue
-        fault = _dropped_frames(frame, y, i, noise_m[i], rho, rows) or _repeated_frame(
-            frame, y, i, noise_m[i], rho, rows
-        )
+        around = frame, y, i, noise_m[i], rho, rows
+        fault = _dropped_frames(*around) or _repeated_frame(*around)
         if fault is not None:
             return fault
     return None
@@ -315,10 +324,8 @@ def _repeated_frame(
     size, sigma, step, _ = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
     short_step = y[i + 1] - y[i]
-    if (
-        abs(short_step) > min(STILL_PART * step, 4 * step_sigma + 0.02 * step)
-        or step - short_step < STILL_SIGMAS * step_sigma
-    ):
+    moves = abs(short_step) > min(STILL_PART * step, 4 * step_sigma + 0.02 * step)
+    if moves or step - short_step < STILL_SIGMAS * step_sigma:
         return None
     if 0 < i < y.size - 3 and 2 * step_sigma < sigma:
         # Where the motion is curved, the two steps minus their two neighbours are the better measure.
@@ -335,10 +342,8 @@ def _repeated_frame(
     return None
 
 
-def _jump(
-    frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float
-) -> tuple[float, float, float, _Sides] | None:
-    """Jump of position between two sides of a smooth motion, its standard error, the step of one frame, the sides.
+def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float) -> _Jump | None:
+    """Jump of position between two sides of a smooth motion.
 
     The widest sides that follow one parabola are used. None where there are no such sides, where either moves slowly
     compared with the noise, or where their speeds differ so much that a jump cannot be told from acceleration.
@@ -347,9 +352,9 @@ def _jump(
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
         if min(t.size for t, _ in sides) < SIDE_POINTS[-1]:
             return None
-        fit = _parabola_with_step(sides, noise_m, rho)
-        if fit is not None:
-            return *fit, sides
+        jump = _parabola_with_step(sides, noise_m, rho)
+        if jump is not None:
+            return jump
     return None
 
 
@@ -391,8 +396,8 @@ def _residual_squares(basis: Floats, y: Floats) -> float:
     return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
 
 
-def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[float, float, float] | None:
-    """Jump, its error and the step of one frame, if both sides follow a parabola at a clear and similar speed."""
+def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | None:
+    """Fit a parabola with a step, if both sides follow it at a clear and similar speed."""
     (t_left, y_left), (t_right, y_right) = sides
     near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
     near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
@@ -412,7 +417,7 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[floa
     lag = np.abs(np.subtract.outer(t, t))
     correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
     sigma = max(noise_m, misfit_m) * math.sqrt(float(weights[3] @ correlation @ weights[3]))
-    return float(fit[3]), sigma, step
+    return _Jump(float(fit[3]), sigma, step, sides)
 
 
 def _correct_fault(track: Track, fault: _Fault, step_s: float) -> Track:

@@ -128,12 +128,12 @@ def ar1_difference_gain(rho: float) -> float:
     """
     steps = np.arange(FOURTH_DIFFERENCE.size)
     covariance = rho ** np.abs(np.subtract.outer(steps, steps))
-    return math.sqrt(
-        float(FOURTH_DIFFERENCE @ covariance @ FOURTH_DIFFERENCE) / float(FOURTH_DIFFERENCE @ FOURTH_DIFFERENCE)
-    )
+    correlated, white = FOURTH_DIFFERENCE @ covariance @ FOURTH_DIFFERENCE, FOURTH_DIFFERENCE @ FOURTH_DIFFERENCE
+    return math.sqrt(float(correlated) / float(white))
 
 
 def _differences(time_s: Floats, position_m: Floats) -> _Differences:
+    """Fourth differences of a trial, winsorised, without those over uneven spacings or at corners of the motion."""
     noise_m, _ = robust_position_noise(time_s, position_m)
     fit = local_fit(time_s, position_m, noise_m)
     distance_m = np.zeros(time_s.size)
@@ -142,11 +142,9 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     even = np.zeros(time_s.size, dtype=bool)
     even[2:-2] = np.lib.stride_tricks.sliding_window_view(np.abs(spacing - 1) < UNEVEN_PART, 4).all(axis=1)
     around_m = local_noise(distance_m)
-    # At a corner of the motion the difference is not noise.
     use = even & (fit.share >= LEAST_SHARE) & (around_m > 0)
-    return _Differences(
-        np.minimum(distance_m, WINSORISING_SIGMAS * around_m), use, _running_median(np.abs(fit.speed_m_s))
-    )
+    winsorised_m = np.minimum(distance_m, WINSORISING_SIGMAS * around_m)
+    return _Differences(winsorised_m, use, _running_median(np.abs(fit.speed_m_s)))
 
 
 def _running_median(values: Floats) -> Floats:
@@ -204,9 +202,9 @@ def _as_stated(
             return None
         sigma = np.where(is_stated, stated, np.median(stated[is_stated]))
         # Expected size of a fourth difference, from the noise of its five points.
-        expected_m = np.sqrt(
-            np.convolve(np.pad(sigma**2, 2, mode="edge"), FOURTH_DIFFERENCE**2, "valid") / np.sum(FOURTH_DIFFERENCE**2)
-        )[part.use]
+        weights = FOURTH_DIFFERENCE**2
+        variance = np.convolve(np.pad(sigma**2, 2, mode="edge"), weights, "valid") / np.sum(weights)
+        expected_m = np.sqrt(variance)[part.use]
         scale = math.sqrt(float(np.mean((part.distance_m[part.use] / expected_m) ** 2)))
         if not scale > 0:
             return None

@@ -124,20 +124,17 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     for turn in range(10):
         coefficients = _normal_solution(_moments(powers, weight), _moments(powers[..., :4], weight * y))
         residuals = np.abs(y - _cubic(relative_time, coefficients))
-        if turn < 6:
+        if turn < 6:  # least absolute residuals
             weight = 1 / np.maximum(residuals, 0.1 * smallest_scale)
-        else:
-            # The scale of a window from its median: of 12 residuals about 4 fitted numbers it is 0.55 sd.
-            scale = np.maximum(
-                np.sort(residuals, axis=1)[:, HALF_WIDTH - 1 : HALF_WIDTH + 1].mean(axis=1) / 0.55, smallest_scale
-            )
+        else:  # Tukey's biweight; the median of 12 residuals about 4 fitted numbers is 0.55 of their sd
+            median = np.sort(residuals, axis=1)[:, HALF_WIDTH - 1 : HALF_WIDTH + 1].mean(axis=1)
+            scale = np.maximum(median / 0.55, smallest_scale)
             weight = np.maximum(1 - (residuals / (BIWEIGHT_CUTOFF * scale[:, None])) ** 2, 0.0) ** 2 + 1e-9
     on_cubic = weight > 0.1
     used = np.maximum(on_cubic.sum(axis=1), 5)
     # The point itself lies at 0, where the cubic is its first coefficient.
-    leverage = weight * _cubic(
-        relative_time, _normal_solution(_moments(powers, weight), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)))
-    )
+    first_coefficient = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    leverage = weight * _cubic(relative_time, _normal_solution(_moments(powers, weight), first_coefficient))
     nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :NEAREST]
     return LocalFit(
         residual_m=-coefficients[:, 0],

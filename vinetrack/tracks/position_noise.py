@@ -265,15 +265,12 @@ def _corner(position_m: Floats) -> int:
     index = np.arange(n, dtype=float)
     y = position_m - position_m[0]
     corners = np.arange(0, n - 1) if n <= 400 else np.arange(n - 400, n - 1)
-    best, best_cost = 0, math.inf
     ramps = np.maximum(index[None, :] - corners[:, None], 0.0)
     mean_ramp, mean_y = ramps.mean(axis=1), float(y.mean())
     centred = ramps - mean_ramp[:, None]
     slope = centred @ (y - mean_y) / np.sum(centred**2, axis=1)
     cost = np.sum((y - mean_y) ** 2) - slope**2 * np.sum(centred**2, axis=1)
-    where = int(np.argmin(cost))
-    if cost[where] < best_cost:
-        best = int(corners[where])
+    best = int(corners[int(np.argmin(cost))])
     return best + 1 if best > 0 else 0
 
 

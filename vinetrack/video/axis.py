@@ -131,31 +131,34 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
     RecordingError
         Where nothing moves, or what moves follows no line.
     """
-    small_pictures = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
-    small = small_pictures.frames
-    if len(small) < 3:
+    small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    if len(small.frames) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
-    best = _line_through(small, small_pictures.grown) if grows else _NO_LINE
+    best = _line_through(small, small.grown) if grows else _NO_LINE
     if best.collected <= 0:
-        best = _line_through(small, small_pictures.changed, insist=True)
+        best = _line_through(small, small.changed, insist=True)
     if best.front_share < LEAST_FRONT_SHARE:
         # The vine meets a wall, bends or sweeps: the axis is that of the longest orderly beginning.
-        use_lasting = grows and small_pictures.grown is not small_pictures.changed
-        for fraction in BEGINNINGS:
-            count = max(3, int(fraction * len(small)))
-            shorter = _line_through(
-                small,
-                _pixels_until(fraction, small_pictures.grown) if use_lasting else changed_pixels(small, count),
-                early_first=True,
-            )
-            collected_in_order = shorter.front_share * shorter.collected
-            if shorter.front_share >= LEAST_FRONT_SHARE and (
-                best.front_share < LEAST_FRONT_SHARE or collected_in_order > best.front_share * best.collected
-            ):
-                best = shorter
+        best = _line_of_beginning(small, best, grows)
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
-    return _to_picture(best, small_pictures.factor, small_pictures.shape)
+    return _to_picture(best, small.factor, small.shape)
+
+
+def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line:
+    """The line of the beginning of a recording that collects most change in order; else that of the whole."""
+    best = whole
+    use_lasting = grows and small.grown is not small.changed
+    for fraction in BEGINNINGS:
+        count = max(3, int(fraction * len(small.frames)))
+        pixels = _pixels_until(fraction, small.grown) if use_lasting else changed_pixels(small.frames, count)
+        line = _line_through(small, pixels, early_first=True)
+        in_order = line.front_share * line.collected
+        if line.front_share >= LEAST_FRONT_SHARE and (
+            best.front_share < LEAST_FRONT_SHARE or in_order > best.front_share * best.collected
+        ):
+            best = line
+    return best
 
 
 def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
@@ -188,8 +191,8 @@ def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
         raise RecordingError("nothing moves along the axis")
     if len(near_lasting[0]) >= max(12, LEAST_GROWN * len(near[0])):
         near = near_lasting
-    agree, _, _ = pixels_on_front(*near, n_times, angle, np.array(scaled.from_px), band)
-    return float(near[3][agree].sum() / near[3].sum())
+    on_front, _, _ = pixels_on_front(*near, n_times, angle, np.array(scaled.from_px), band)
+    return float(near[3][on_front].sum() / near[3].sum())
 
 
 def _pixels_near(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -225,9 +228,8 @@ def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
     reach = max(0.5 * scaled.width_px, 3.0)
     from_start = np.column_stack([x, y]) - scaled.from_px
     across = from_start @ scaled.normal
-    inside = (np.abs(across) < reach) & (
-        np.abs(from_start @ scaled.direction - scaled.length_px / 2) < 0.6 * scaled.length_px
-    )
+    from_middle = from_start @ scaled.direction - scaled.length_px / 2
+    inside = (np.abs(across) < reach) & (np.abs(from_middle) < 0.6 * scaled.length_px)
     if inside.sum() < 12:
         raise RecordingError("nothing moves along the axis")
     pixels = x[inside], y[inside], time[inside], weight[inside], n_times
@@ -266,21 +268,19 @@ def _in_small_pictures(axis: Axis, factor: float) -> Axis:
     return Axis(ends[0], ends[1], axis.width_px / factor)
 
 
-def _pixels_until(part: float, pixels: Pixels) -> Pixels:
+def _pixels_until(fraction: float, pixels: Pixels) -> Pixels:
     """Those pixels that change within a fraction of the recording, from its start."""
     x, y, time, weight, n_times = pixels
-    early = time < part * n_times
+    early = time < fraction * n_times
     return x[early], y[early], time[early], weight[early], n_times
 
 
-def _line_through(
-    small: NDArray[np.float32], changed: Pixels, early_first: bool = False, insist: bool = False
-) -> _Line:
+def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = False, insist: bool = False) -> _Line:
     """The best line through pixels that change; without one an empty line, or an error where `insist`."""
     x, y, time, weight, n_times = changed
     if len(x) < 12:
         return _NO_LINE
-    diagonal = float(np.hypot(*small.shape[1:]))
+    diagonal = float(np.hypot(*small.frames.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
     # Of a vine that bends and sweeps, early change counts most; elsewhere a door, which swings first, would too.
     discounted = weight * (1 - 0.8 * time / n_times) if early_first else weight

@@ -46,8 +46,8 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
     """
     straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
     agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
-    usual = straight[int(np.argmax(agreeing))] if straight else 0.0
-    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, usual) < ASKEW_DEG]
+    common = straight[int(np.argmax(agreeing))] if straight else 0.0
+    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, common) < ASKEW_DEG]
     agreed = len(slopes_deg) - len(names)
     return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
 

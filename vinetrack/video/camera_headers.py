@@ -226,12 +226,14 @@ def inspect_mraw(path: Path) -> Recording:
     data = next((at for at in _siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
-        raise RecordingError(f"{path.name}: its .cih or .cihx is missing, which says what is in it; put it beside")
+        raise RecordingError(
+            f"{path.name}: its .cih or .cihx, which describes it, is missing; put it in the same folder"
+        )
     facts = read_side_file(side)
     if data is None:
-        raise RecordingError(f"{path.name}: its .mraw is missing, which holds the pictures; put it beside")
+        raise RecordingError(f"{path.name}: its .mraw, which holds the pictures, is missing; put it in the same folder")
     if facts.file_format.lower() != "mraw":
-        raise RecordingError(f"{side.name}: tells of {facts.file_format or 'unknown'} pictures, not of {data.name}")
+        raise RecordingError(f"{side.name}: describes {facts.file_format or 'unknown'} pictures, not {data.name}")
     if not facts.colour.lower().startswith("mono") and facts.colour:
         raise RecordingError(f"{data.name}: colour ({facts.colour}) is not read; save it as AVI or TIFF")
     if facts.stored_bits not in (8, 12, 16):

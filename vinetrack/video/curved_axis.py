@@ -66,10 +66,10 @@ class CurvedAxis(Axis):
         from scipy.interpolate import CubicSpline
 
         points = np.array(self.through_px)
-        apart = np.hypot(*np.diff(points, axis=0).T)
-        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(apart))])
+        spacing = np.hypot(*np.diff(points, axis=0).T)
+        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(spacing))])
         spline = CubicSpline(knots, points, bc_type="natural")
-        counts = np.ceil(SAMPLES_PER_PX * apart).astype(int) + 1
+        counts = np.ceil(SAMPLES_PER_PX * spacing).astype(int) + 1
         parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
         parameter = np.concatenate([*parts, knots[-1:]])
         steps = np.hypot(*np.diff(spline(parameter), axis=0).T)
@@ -140,10 +140,10 @@ class CurvedAxis(Axis):
         along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
         spline, parameter, arc = self._table
         unit = self.direction_at(along)
-        beyond = along - np.clip(along, 0.0, self.length_px)
+        past_end = along - np.clip(along, 0.0, self.length_px)
         normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1)
         on_curve = spline(np.interp(along, arc, parameter))
-        return np.asarray(on_curve + beyond[..., None] * unit + across[..., None] * normal)
+        return np.asarray(on_curve + past_end[..., None] * unit + across[..., None] * normal)
 
     def nearest_px(self, picture_px: Floats) -> Floats:
         """Find the arc length of the places on the curve nearest to points of the picture.

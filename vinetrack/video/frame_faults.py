@@ -60,16 +60,16 @@ def torn_frames(luma: NDArray[Any]) -> Bools:
     grid = (rows, TORN_BLOCK_PX, columns, TORN_BLOCK_PX)
     block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cropped])
     block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
-    beyond = np.zeros_like(block)
+    excess = np.zeros_like(block)
     place = np.arange(n)
     for gap in (1, 2):  # two torn frames in a row are compared with those around both
         before = np.where(place >= gap, place - gap, place + 2 * gap)
         after = np.where(place + gap < n, place + gap, place - 2 * gap)
         low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
-        beyond = np.maximum(beyond, np.maximum(block - high, low - block))
+        excess = np.maximum(excess, np.maximum(block - high, low - block))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
-    limit = TORN_GREY * unit + TORN_RATIO * np.quantile(beyond, 0.75, axis=0)
-    return np.asarray((beyond > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
+    limit = TORN_GREY * unit + TORN_RATIO * np.quantile(excess, 0.75, axis=0)
+    return np.asarray((excess > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
@@ -88,14 +88,14 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
         return odd
     small = luma[:8, ::4, ::4].astype(np.float32)
 
-    def apart(a: int, b: int) -> float:
+    def difference(a: int, b: int) -> float:
         return float(np.mean(np.abs(small[a] - small[b])))
 
-    median_difference = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
+    median_difference = float(np.median([difference(i, i + 1) for i in range(3, 7)]))
     unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
     limit = max(ODD_RATIO * median_difference, ODD_GREY * unit)
     for i in range(ODD_FRAMES_WITHIN):
-        odd[i] = apart(i, 3) > limit and apart(i, 4) > limit
+        odd[i] = difference(i, 3) > limit and difference(i, 4) > limit
     return odd
 
 

@@ -56,8 +56,8 @@ BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
 """Columns left out on either side of a border, for its blur, and columns averaged beyond them. Chosen: blurs reach 3
 px; six columns average film's grain. At half, grain decides; at twice, a mouth near the strip's start is not seen."""
 FILM_RANGE_PX = (20, 150)
-"""Distances beyond the border between which the film's own steps are taken. Chosen: clear of what is about the start,
-and a few diameters of film. Half or twice changes the largest of them by its scatter."""
+"""Distances beyond the border between which the film's own steps are taken. Chosen: clear of the surroundings of the
+start, and a few diameters of film. Half or twice changes the largest of them by its scatter."""
 SEARCH_PX = 3
 """Distance from the resting place within which a border is looked for. Chosen: the edge at rest errs by less."""
 STRAIGHT_PART = 0.95
@@ -131,15 +131,13 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in later)
     contrast = np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
-    if straight < STRAIGHT_PART or abs(border_step) < max(
-        BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast))
-    ):
+    least_step = max(BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast)))
+    if straight < STRAIGHT_PART or abs(border_step) < least_step:
         return none
     clear_px = rest_px + 3 * state.blur + 1
     exit_frame = first + int(np.argmax(edge[first:] > clear_px))
-    return Mouth(
-        np.arange(len(edge)) < exit_frame, _moved_behind(edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT], rest_px)
-    )
+    after_exit = edge[exit_frame : exit_frame + FRAMES_AFTER_EXIT]
+    return Mouth(np.arange(len(edge)) < exit_frame, _moved_behind(after_exit, rest_px))
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
@@ -166,14 +164,13 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
     for column in column_range:
         arrival = int(np.searchsorted(rising, column - 5.0))
         brightness = strip.values[first : max(arrival - 1, first + 1), :, column].mean(axis=1)
-        change = np.ptp(
-            brightness * strip.scale[first : first + len(brightness)] + strip.offset[first : first + len(brightness)]
-        )
+        frames = slice(first, first + len(brightness))
+        change = np.ptp(brightness * strip.scale[frames] + strip.offset[frames])
         changed += change > max(DOOR_PART * contrast, DOOR_GREY)
     return changed / len(column_range)
 
 
-def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, apart: Floats) -> Floats:
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
     """Enlarge the errors of frames in which a door still hides the tip.
 
     There the edge is a guess; where the picture differs entirely from the model, or hardly any contrast is left, there
@@ -184,30 +181,26 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, apart: Floats
     fit : from `edge_state.fit_edges`, shape (n_frames, 6).
     misfit_ratio : misfit over the median, shape (n_frames,).
     edge : shape (n_frames,), px.
-    apart : error that is added to the likelihood's in quadrature, shape (n_frames,), px.
+    added_px : error that is added to the likelihood's in quadrature, shape (n_frames,), px.
 
     Returns
     -------
-    `apart`, larger where the tip is hidden, shape (n_frames,), px.
+    `added_px`, larger where the tip is hidden, shape (n_frames,), px.
     """
     near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
-    covered = (
-        near
-        & (misfit_ratio > UNUSUAL_MISFIT_RATIO)
-        & ((misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE))
-    )
+    no_edge = (misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)
+    covered = near & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & no_edge
     if covered.sum() > 1:
         # A door leaves and does not come: in earlier frames the tip was hidden too.
         earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
         covered |= earlier & moving_frames(edge)
-        apart = np.where(earlier, np.hypot(apart, ASTRAY_PX), apart)
-    guessed = near & (
-        large & (misfit_ratio > HIDDEN_MISFIT)
-        | raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
-    )
-    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(apart, GUESSED_PX), apart))
+        added_px = np.where(earlier, np.hypot(added_px, ASTRAY_PX), added_px)
+    unlike_model = large & (misfit_ratio > HIDDEN_MISFIT)
+    partly_hidden = raised & (misfit_ratio > UNUSUAL_MISFIT_RATIO) & (amplitude < REDUCED_AMPLITUDE)
+    guessed = near & (unlike_model | partly_hidden)
+    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
 def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float32]:

@@ -114,9 +114,9 @@ def truncation_notes(edge_px: Floats, quality: PointQuality, length_px: float, n
     -------
     a sentence, or none.
     """
-    seen = np.flatnonzero(np.isfinite(edge_px))
-    if quality.last_moving < seen[-1] or quality.left_picture is not None:
+    followed = np.flatnonzero(np.isfinite(edge_px))
+    if quality.last_moving < followed[-1] or quality.left_picture is not None:
         return []
-    grown = edge_px[seen[-1]] - float(np.median(edge_px[seen][: max(quality.first_moving, 1)]))
-    part = f", after {grown / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
-    return [f"{name}: the recording ends while the leading edge moves{part}"]
+    travel_px = edge_px[followed[-1]] - float(np.median(edge_px[followed][: max(quality.first_moving, 1)]))
+    share = f", after {travel_px / length_px:.0%} of the vine's length" if np.isfinite(length_px) else ""
+    return [f"{name}: the recording ends while the leading edge moves{share}"]

@@ -131,9 +131,9 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     if high - low < max(2 * REST_SIGMAS * noise, LEAST_TRAVEL_PX):
         return n, -1
     first = _first_moving_point(y, max(REST_SIGMAS * noise, REST_PX))
-    stands = max(REST_SIGMAS * noise, END_REST_PX)
-    last = len(y) - 1 - _first_moving_point(-y[::-1], stands)
-    if last == len(y) - 1 and _stops_abruptly(y, stands):
+    tolerance = max(REST_SIGMAS * noise, END_REST_PX)
+    last = len(y) - 1 - _first_moving_point(-y[::-1], tolerance)
+    if last == len(y) - 1 and _stops_abruptly(y, tolerance):
         last -= 2
     return int(good[first]), int(good[max(last, first)])
 

@@ -143,7 +143,9 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """Report a stated exposure that the blur of the moving edge contradicts: a warning, or an error beyond many pixels.
+    """Report a stated exposure that the blur of the moving edge contradicts.
+
+    It is a warning beyond EXPOSURE_TOLERANCE_PX, and an error beyond twice that.
 
     Parameters
     ----------
@@ -267,7 +269,7 @@ def _named(names: list[str]) -> str:
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Lay out a table for the terminal, a line a recording, with sizes of the picture beside those of the sheet.
+    """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
 
     `down` is the growth angle from straight down as the sheet states it: no picture shows it.
 
@@ -308,7 +310,7 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
 
     Returns
     -------
-    units stand in the keys.
+    mapping; units are in the keys.
     """
     entry = {key: value for key, value in vars(facts).items() if key != "axis"}
     axis = None if facts.axis is None else axis_entry(facts.axis)

@@ -175,7 +175,7 @@ def _recording_problems(trial: Trial, recording: Recording) -> list[Problem]:
 
 
 def _frames_present(recording: Recording) -> int | None:
-    """Number of frames in the file as far as it is known without decoding; None where it is not."""
+    """Number of frames in the file, if it can be known without decoding; None otherwise."""
     if recording.raw is not None:
         return _raw_frames_present(recording.path.stat().st_size, recording.raw)
     if recording.kind != "container":

@@ -26,7 +26,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
     """Cut the strip about the tube that grows along an axis.
 
     An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
-    passes along its middle: the front share is asked again there.
+    passes along its middle, which the front share along the middle shows.
 
     Parameters
     ----------
