@@ -227,11 +227,11 @@ def inspect_mraw(path: Path) -> Recording:
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
         raise RecordingError(
-            f"{path.name}: its .cih or .cihx, which describes it, is missing; put it in the same folder"
+            f"{path.name}: its .cih or .cihx is missing, which describes the pictures; put it in the same folder"
         )
     facts = read_side_file(side)
     if data is None:
-        raise RecordingError(f"{path.name}: its .mraw, which holds the pictures, is missing; put it in the same folder")
+        raise RecordingError(f"{path.name}: its .mraw is missing, which holds the pictures; put it in the same folder")
     if facts.file_format.lower() != "mraw":
         raise RecordingError(f"{side.name}: describes {facts.file_format or 'unknown'} pictures, not {data.name}")
     if not facts.colour.lower().startswith("mono") and facts.colour:
