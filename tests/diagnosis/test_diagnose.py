@@ -194,7 +194,7 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diag
     result = with_lost_frames(depleted, missing)
     assert (result.verdict, result.effects) == (depleted.verdict, depleted.effects)
     assert "missing from 2 recordings (a and b)" in result.notes[-1]
-    assert with_lost_frames(depleted, replace(missing, sure=("b",))).answer_set == (DROPPED_FRAMES,)
+    assert with_lost_frames(depleted, replace(missing, certain=("b",))).answer_set == (DROPPED_FRAMES,)
     assert with_lost_frames(depleted, LostFrames()) is depleted
 
 

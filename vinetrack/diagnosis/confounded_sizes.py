@@ -1,12 +1,12 @@
-"""What of a fitted size may belong to another effect that nobody can exclude: "this K includes up to … of drag".
+"""How much of a fitted size may belong to another, undetected effect: "this K includes up to … of drag".
 
-Once an effect is in the model, what the other candidates could add on top is too weak to be named, but not zero: air is
-never absent. Were another effect there with size s, the size θ of the added one would fall by L s, with
-L = I_θθ⁻¹ I_θs the lever of the linear fit (`score_test.levers_of`). For s, what the trajectories say, N(ŝ, σ_s²), is
-combined with what is plausible: a normal prior centred on absence, scaled so that 95 % of it lies within the farther
-end of the plausible range, cut off where physics allows one sign only. L is the coefficient of omitted-variable bias;
-with a prior for the omitted size it is Bayesian bias analysis. Effects are looked at one at a time and to first order,
-and the interval stated is the hull of the fit's own and of the one with the other effect left open: at least 95 %.
+Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent. If
+another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
+coefficient of omitted-variable bias of the linear fit (`score_test.levers_of`). The estimate of s from the
+trajectories, N(ŝ, σ_s²), is combined with a normal prior centred on zero, scaled so that 95 % of it lies within the
+farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis). Effects
+are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the one with
+the other effect left free: at least 95 %.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Number
 
 MIN_SHIFT_SIGMAS = 1.0
-"""Shift, in standard errors of the size, from which it is said. Chosen: a shift of one error leaves a 95 %
-interval 83 %; at half (92 %) every correlated pair is listed, at twice (48 %) an interval misses the truth without a
-word."""
+"""Shift, in standard errors of the size, from which a confounder is reported. Chosen: a shift of one standard error
+leaves a 95 % interval a coverage of 83 %; at half (92 %) every correlated pair is listed, at twice (48 %) an interval
+misses the truth without warning."""
 
 MAX_LISTED = 3
-"""Effects listed for each size. Chosen: a sentence that can be read; further ones are weaker."""
+"""Confounders listed for each size. Chosen: more make a sentence unreadable; further ones are weaker."""
 
 TWO_SIDED_95 = 1.959964
 """Derived: quantile of the normal distribution."""
 
 
 def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
-    """Find, for each size of the added effects, the physical effects that a part of it may belong to.
+    """Find, for each size of the added effects, the physical effects that it may include.
 
     Parameters
     ----------
-    after : the fit with the effects in, held against all other candidates.
-    added : names of the effects whose sizes are asked about.
+    after : tests of the fit with the effects added, for all other candidates.
+    added : names of the effects whose sizes are examined.
 
     Returns
     -------
     tuple of Confounder
-        For each size those that could move it by more than its own standard error, the largest first.
+        For each size, those that could shift it by more than its standard error, the largest first.
     """
     if after.poorly_fitted or not after.sensitivities.shapes:
         return ()
@@ -53,39 +53,39 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     chosen = []
     for k, number in enumerate(after.fit.numbers):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
-            likely = [confounder for confounder in _of_number(after, number, levers[k]) if _is_worth_saying(confounder)]
-            chosen += sorted(likely, key=lambda confounder: -abs(confounder.value - number.value))[:MAX_LISTED]
+            relevant = [confounder for confounder in _of_number(after, number, levers[k]) if _is_relevant(confounder)]
+            chosen += sorted(relevant, key=lambda confounder: -abs(confounder.value - number.value))[:MAX_LISTED]
     return tuple(chosen)
 
 
-def _is_worth_saying(confounder: Confounder) -> bool:
+def _is_relevant(confounder: Confounder) -> bool:
     return abs(confounder.value - confounder.number.value) > MIN_SHIFT_SIGMAS * confounder.number.sigma
 
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
-    """Every physical effect as a confounder of one number, in the shape that moves the number most."""
+    """Every physical effect as a confounder of one size, in the shape that shifts the size most."""
     physical = {effect.name: effect for effect in after.effects if effect.kind == "physical"}
     confounders = []
     for name in dict.fromkeys(after.sensitivities.effects):
-        # An effect that holds the added one as a limit stands in its place, not beside it.
+        # An effect that contains the added one as a limit is an alternative to it, no confounder.
         if name not in physical or number.key.split(".")[0] in physical[name].replaces:
             continue
-        each = [_in_shape(after, number, place, float(lever[place])) for place in after.ranked_shapes(name)]
-        known = [confounder for confounder in each if confounder is not None]
-        if known:
-            confounders.append(max(known, key=lambda confounder: abs(confounder.value - number.value)))
+        by_shape = [_in_shape(after, number, k, float(lever[k])) for k in after.ranked_shapes(name)]
+        informative = [confounder for confounder in by_shape if confounder is not None]
+        if informative:
+            confounders.append(max(informative, key=lambda confounder: abs(confounder.value - number.value)))
     return confounders
 
 
-def _in_shape(after: MisfitTests, number: Number, place: int, lever: float) -> Confounder | None:
-    """One shape of an effect as a confounder; None where the data say nothing about its size."""
-    shape = after.sensitivities.shapes[place]
-    sigma = float(after.scores.sigma[place])
+def _in_shape(after: MisfitTests, number: Number, index: int, lever: float) -> Confounder | None:
+    """One shape of an effect as a confounder; None where the data hold no information about its size."""
+    shape = after.sensitivities.shapes[index]
+    sigma = float(after.scores.sigma[index])
     if not shape.effect.parameters or shape.whole or not math.isfinite(sigma):
         return None
-    mean, sd, limit = size_not_excluded(float(after.scores.size[place]), sigma, shape.size)
+    mean, sd, limit = size_not_excluded(float(after.scores.size[index]), sigma, shape.size)
     expected = number.value - lever * mean
-    half = _quantile(number) * math.hypot(number.sigma, lever * sd)
+    half_width = _quantile(number) * math.hypot(number.sigma, lever * sd)
     lower, upper = _bounds(after, number)
     return Confounder(
         number=number,
@@ -94,13 +94,13 @@ def _in_shape(after: MisfitTests, number: Number, place: int, lever: float) -> C
         unit=shape.size.unit,
         limit=shape.size.zero + limit,
         value=min(max(number.value - lever * limit, lower), upper),
-        low_95=max(min(number.low, expected - half), lower),
-        high_95=min(max(number.high, expected + half), upper),
+        low_95=max(min(number.low, expected - half_width), lower),
+        high_95=min(max(number.high, expected + half_width), upper),
     )
 
 
 def _bounds(after: MisfitTests, number: Number) -> tuple[float, float]:
-    """What physics allows of a number, SI."""
+    """Bounds of a parameter, SI."""
     effect, _, name = number.key.partition(".")
     parameters = next(
         effect_of_model for effect_of_model in after.fit.model if effect_of_model.name == effect
@@ -109,24 +109,24 @@ def _bounds(after: MisfitTests, number: Number) -> tuple[float, float]:
 
 
 def _quantile(number: Number) -> float:
-    """How many standard errors half of the number's own 95 % interval holds."""
-    half = 0.5 * (number.high - number.low) / number.sigma
-    return max(half, TWO_SIDED_95) if math.isfinite(half) else TWO_SIDED_95
+    """Half width of the 95 % interval of a fitted size, in standard errors."""
+    quantile = 0.5 * (number.high - number.low) / number.sigma
+    return max(quantile, TWO_SIDED_95) if math.isfinite(quantile) else TWO_SIDED_95
 
 
 def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
-    """Combine what trajectories say of a size with what is plausible.
+    """Combine the estimate of a size with its plausible range (truncated normal posterior).
 
     Parameters
     ----------
-    estimate, sigma : one-step estimate of the size, from the value without effect, and its standard error, SI.
-    parameter : the size: plausible range and sign.
+    estimate, sigma : one-step estimate of the size, from its value without effect, and its standard error, SI.
+    parameter : the size, with its plausible range and sign.
 
     Returns
     -------
     mean, sd, limit : float
-        Of the truncated normal posterior, from the value without effect; the limit is its 5 % or 95 % quantile,
-        whichever is farther from absence and allowed.
+        Of the posterior, from the value without effect; the limit is its 5 % or 95 % quantile, whichever is farther
+        from zero.
     """
     from scipy.stats import truncnorm
 

@@ -1,4 +1,4 @@
-"""What else a fitted size may be: an effect that does nearly the same, as a diagnosis and its file hold it."""
+"""Record of an undetected effect that a fitted size may include, as stored in a diagnosis and its file."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Confounder:
     effect, symbol, unit
         The other effect and its size.
     limit
-        Its largest size that neither data nor plausibility exclude, one-sided 95 %, SI.
+        Upper limit of its size from data and plausible range, one-sided 95 %, SI.
     value
-        What the fitted size would be with the other effect at its limit, SI.
+        The fitted size if the other effect were at its limit, SI.
     low_95, high_95
-        Interval of the fitted size with the other effect's size left open, SI; never narrower than `number`'s.
+        Interval of the fitted size with the other effect's size left free, SI; never narrower than that of `number`.
     """
 
     number: Number
@@ -53,7 +53,7 @@ class Confounder:
 
 
 def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
-    """The 95 % interval of a size with every one of these effects left open.
+    """The 95 % interval of a size with each of these effects left free (hull).
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
 
 
 def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
-    """What a file says of confounders, each with the size that it is about.
+    """Read confounders from a file, each with the size that it concerns.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Num
     Returns
     -------
     tuple of Confounder
-        Without those whose size is not there.
+        Without those whose size is missing from `numbers`.
     """
     of = {(number.key, number.vine): number for number in numbers}
     return tuple(

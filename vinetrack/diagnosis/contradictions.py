@@ -1,8 +1,8 @@
-"""What speaks against a verdict among the other results of the same diagnosis: ladder of errors, drift of parameters.
+"""Results of a diagnosis that contradict its verdict: errors on left-out conditions, and drifting parameters.
 
-A verdict rests on likelihoods. Two results are worked out independently of it: how well conditions are predicted that
-a model had not seen, and whether single trials ask for the same numbers under every condition. Where they disagree with
-the verdict a reader must see that beside it.
+The verdict rests on likelihoods. Two results are independent of it: how well left-out conditions are predicted, and
+whether the best parameter values of single trials are the same under every condition. Where they disagree with the
+verdict, notes report it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CONTRADICTING_DRIFT_SIGMAS = 4.0
-"""Standard deviations of a drift that contradicts an adequate model. Chosen: `drift` calls any at 1 % a campaign, which
-is too often for a sentence that doubts the verdict; 4 is 0.006 % a test, a quarter of a per cent for 40 tests. At half
-one campaign in two would carry a doubt, at twice n that differs by 7 σ between vines would go unmentioned."""
+"""Significance of a drift from which it contradicts an adequate model. Chosen: `drift` has a false-alarm probability of
+1 % a campaign, which is too high for a sentence that contradicts the verdict; 4 σ is 0.006 % a test, a quarter of a per
+cent for 40 tests. At half one campaign in two would carry such a sentence, at twice n that differs by 7 σ between vines
+would not be mentioned."""
 
 
 def displacement_m(before: Fit, after: Fit) -> float:
-    """Find how far an added effect moves the predicted positions.
+    """Root mean square displacement of the predicted positions by an added effect.
 
     Parameters
     ----------
@@ -38,8 +39,7 @@ def displacement_m(before: Fit, after: Fit) -> float:
     Returns
     -------
     float
-        Root mean square over trials of the largest difference of predicted positions, release and origin of each fit
-        its own, m.
+        Over trials, of the largest difference of predicted positions, each fit with its own release and origin, m.
     """
     moved = [
         float(np.max(np.abs(trial.predicted_position_m - later.predicted_position_m)))
@@ -49,9 +49,9 @@ def displacement_m(before: Fit, after: Fit) -> float:
 
 
 def is_within_position_errors(before: Fit, after: Fit) -> bool:
-    """Whether an effect moves positions by less than their systematic errors and predicts no new condition better.
+    """Whether an effect moves positions by less than their systematic error and does not improve left-out predictions.
 
-    Such a gain in likelihood may be a lens. Only where the displacement is that small is the left-out error worked out.
+    Such a gain in likelihood may be lens distortion. The left-out error is computed only for so small a displacement.
 
     Parameters
     ----------
@@ -72,18 +72,18 @@ def is_within_position_errors(before: Fit, after: Fit) -> bool:
 
 
 def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[str, ...]:
-    """Say what speaks against the model that a diagnosis ended with, where it calls that adequate.
+    """List the results that contradict the final model of a diagnosis where the verdict calls it adequate.
 
     Parameters
     ----------
     fits : the first model and every one after it.
     added : the effects added, in order.
-    ladder : table of errors with a row a model, see `vinetrack.diagnosis.ladder`; None where it was not made.
+    ladder : table of errors, one row a model, see `vinetrack.diagnosis.ladder`; None where it was not computed.
 
     Returns
     -------
     tuple of str
-        Sentences; empty where everything agrees.
+        Sentences; empty where nothing contradicts the verdict.
     """
     return (*_not_better(added, ladder), *_still_drifts(fits[-1]))
 

@@ -1,4 +1,4 @@
-"""The diagnosis of an experiment: what its model lacks, how sure that is, what it brings to add it, what to do next.
+"""Diagnose an experiment: what its model lacks, how certain that is, how far the error falls, and what to do next.
 
 diagnosis = vinetrack.diagnose("my_experiment")
 print(diagnosis)
@@ -22,7 +22,7 @@ from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.lost_frames import correct_dropped_frames, lost_in_fit, with_lost_frames
+from vinetrack.diagnosis.lost_frames import correct_dropped_frames, dropped_frames_in, with_lost_frames
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.odd_trials import odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import (
@@ -57,8 +57,8 @@ log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
 
-NO_RESPONSE = "no trial answers to it at any plausible size"
-TOO_WEAK = "in these conditions the largest plausible size would not show"
+NO_RESPONSE = "no trial responds to it at any plausible size"
+TOO_WEAK = "in these conditions the largest plausible size would not be detected"
 
 
 def _quiet(_: str) -> None:
@@ -77,25 +77,25 @@ def diagnose(
     advice: bool = True,
     report: Report = _quiet,
 ) -> Diagnosis:
-    """Ask of a model what is missing from it.
+    """Find what is missing from a model.
 
     Parameters
     ----------
     source
-        A fit, whose model is questioned; or an experiment, its folder, or pairs of trial and track, to which the model
-        is fitted first.
+        A fit of the model; or an experiment, its folder, or pairs of trial and track, to which the model is fitted
+        first.
     model : Model, optional
-        The model to question, by default the one the experiment names, else the base model.
+        The model to diagnose, by default the one that the experiment names, else the base model.
     tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
     candidates : iterable of str, optional
-        Names of the effects to question, by default those the experiment names, else the whole catalogue.
+        Names of candidate effects, by default those that the experiment names, else the whole catalogue.
     user_effects : mapping, optional
         Effects of the user by name.
     limits : Limits, optional
-        Within which limits further trials can be made.
+        Limits within which further trials can be made.
     ladder, advice : bool
-        Whether errors before and after are worked out, and what to do next.
+        Whether to compute the ladder of errors, and what to do next.
     report : callable
         Called with a few words at each step.
 
@@ -112,62 +112,57 @@ def diagnose(
     ExperimentError
         If the experiment cannot be read.
     """
-    wild = ""
+    outliers_note = ""
     if isinstance(source, Fit):
-        questioned = candidates_of(source.model, candidates, user_effects)
-        fit, missing = with_host(source, host_for(source.model, questioned)), lost_in_fit(source)
+        effects = candidates_of(source.model, candidates, user_effects)
+        fit, dropped = with_host(source, host_for(source.model, effects)), dropped_frames_in(source)
     else:
         settings = _settings(source)
         if settings is not None:
-            source, named, listed_candidates, brought, stated = settings
-            model, user_effects = model or named, {**brought, **(user_effects or {})}
-            candidates = listed_candidates if candidates is None else candidates
-            limits = limits or stated
+            source, stated_model, stated_candidates, experiment_effects, stated_limits = settings
+            model, user_effects = model or stated_model, {**experiment_effects, **(user_effects or {})}
+            candidates = stated_candidates if candidates is None else candidates
+            limits = limits or stated_limits
         model = model or base_model()
-        questioned = candidates_of(model, candidates, user_effects)
+        effects = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
-        pairs, missing = correct_dropped_frames(pairs)
-        wild = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
+        pairs, dropped = correct_dropped_frames(pairs)
+        outliers_note = rejected_points_note({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
-        fit = initial_fit(model, pairs, questioned, profile=False)
+        fit = initial_fit(model, pairs, effects, profile=False)
         fit = replace(fit, left_out={**left_out, **fit.left_out})
-    result = _questioned(fit, questioned, report)
+    result = _diagnosis_of(fit, effects, report)
     if not isinstance(source, Fit):
-        result = with_odd_trials(
-            result,
-            odd_trials(fit.predictor.data),
-            lambda names: _questioned(
-                initial_fit(
-                    fit.model, [pair for pair in pairs if pair[0].name not in names], questioned, profile=False
-                ),
-                questioned,
-                report,
-            ),
-        )
-    result = with_lost_frames(result, missing)
-    if wild:
-        result = replace(result, notes=(*result.notes, wild))
+
+        def without(names: Sequence[str]) -> Diagnosis:
+            remaining = [pair for pair in pairs if pair[0].name not in names]
+            return _diagnosis_of(initial_fit(fit.model, remaining, effects, profile=False), effects, report)
+
+        result = with_odd_trials(result, odd_trials(fit.predictor.data), without)
+    result = with_lost_frames(result, dropped)
+    if outliers_note:
+        result = replace(result, notes=(*result.notes, outliers_note))
     if ladder:
         result = _with_ladder(result, report)
     if ladder and result.final_verdict == ADEQUATE:
-        report("what speaks against it")
-        objections = contradictions(result.fits, result.effects, result.ladder)
-        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {doubt}" for doubt in objections)))
+        report("looking for contradictions")
+        sentences = contradictions(result.fits, result.effects, result.ladder)
+        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {line}" for line in sentences)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
 
 
-def _questioned(fit: Fit, questioned: Sequence[Effect], report: Report) -> Diagnosis:
-    """What a fit lacks of these effects, in words and tables."""
-    effects, blind = testable(questioned, fit.predictor.data)
-    return _conclude(fit, select_effects(fit, effects, report), blind)
+def _diagnosis_of(fit: Fit, candidates: Sequence[Effect], report: Report) -> Diagnosis:
+    """Select the effects that a fit lacks among these candidates, and report the rounds."""
+    effects, not_testable = testable(candidates, fit.predictor.data)
+    return _to_diagnosis(fit, select_effects(fit, effects, report), not_testable)
 
 
 def _settings(
     source: Experiment | Path | str | Pairs,
 ) -> tuple[Experiment, Model, tuple[str, ...] | None, dict[str, Effect], Limits] | None:
-    """An experiment with what it says of model, candidates, own effects and limits; None for bare pairs."""
+    """An experiment with the model, candidates, own effects and limits that it states; None for bare pairs."""
     from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import Experiment, read_experiment
 
@@ -180,86 +175,85 @@ def _settings(
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
-def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, str]) -> Diagnosis:
-    """Findings in words and tables."""
-    rounds = tuple(_round(finding, blind) for finding in findings)
-    added: list[str] = []
-    fits = [fit]
-    for finding in findings[:-1]:
-        effect = finding.answer_names[0]
-        added.append(effect)
-    for after in findings[1:]:
-        fits.append(after.tests.fit)
-    explanation = " ".join(step.explanation for step in rounds)
-    lacking = [name for name, why in blind.items() if "`" in why]
-    if lacking and any(step.verdict == UNEXPLAINED for step in rounds):
-        explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
-    power = power_of(findings[-1].tests, blind, first_round=findings[0].tests)
-    return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits), power=power)
+def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mapping[str, str]) -> Diagnosis:
+    """Selection steps in words and tables."""
+    rounds = tuple(_to_round(step, not_testable) for step in steps)
+    added = tuple(step.answer_names[0] for step in steps[:-1])
+    fits = (fit, *(step.tests.fit for step in steps[1:]))
+    explanation = " ".join(finished.explanation for finished in rounds)
+    # Reasons that name a column of the sheet quote it.
+    lacking_columns = [name for name, reason in not_testable.items() if "`" in reason]
+    if lacking_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
+        explanation += f" Not tried, because the sheet does not state what they need: {joined(lacking_columns)}."
+    power = power_of(steps[-1].tests, not_testable, first_round=steps[0].tests)
+    return Diagnosis(rounds=rounds, effects=added, explanation=explanation, fits=fits, power=power)
 
 
-def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
-    questions = finding.tests
-    names, cosines = _cosines(questions)
+def _to_round(step: SelectionStep, not_testable: Mapping[str, str]) -> Round:
+    tests = step.tests
+    names, cosines = _cosines(tests)
     return Round(
-        model=questions.fit.model.names,
-        verdict=finding.verdict,
-        answer_set=finding.answer_names,
-        ranking=tuple(_ranking(finding, blind)),
-        explanation=explain(finding),
+        model=tests.fit.model.names,
+        verdict=step.verdict,
+        answer_set=step.answer_names,
+        ranking=tuple(_ranking(step, not_testable)),
+        explanation=explain(step),
         cosine_names=names,
         cosines=cosines,
-        fit=questions.fit,
+        fit=tests.fit,
         fits={
             hypothesis.names[-1]: hypothesis.fit
-            for hypothesis in finding.answer_set
+            for hypothesis in step.answer_set
             if hypothesis.effects[-1].kind != BETWEEN_TRIALS
         },
-        sets=_sets(finding),
-        partial=_partial(finding),
-        partial_fits=tuple(hypothesis.fit for hypothesis in finding.partial),
+        sets=_sets(step),
+        partial=_partial_candidates(step),
+        partial_fits=tuple(hypothesis.fit for hypothesis in step.partial),
     )
 
 
-def _sets(finding: SelectionStep) -> tuple[tuple[str, ...], ...]:
-    """The hypotheses of an answer set, each with all its effects, where one has several."""
-    sets = tuple(hypothesis.names for hypothesis in finding.answer_set)
+def _sets(step: SelectionStep) -> tuple[tuple[str, ...], ...]:
+    """Effects of each hypothesis of the answer set; empty where every hypothesis has one effect."""
+    sets = tuple(hypothesis.names for hypothesis in step.answer_set)
     return sets if any(len(names) > 1 for names in sets) else ()
 
 
-def _partial(finding: SelectionStep) -> tuple[Candidate, ...]:
-    """The steps that mend a part, each against the one before it."""
-    steps, before = [], finding.tests.fit
-    for hypothesis in finding.partial:
+def _partial_candidates(step: SelectionStep) -> tuple[Candidate, ...]:
+    """The partial steps, each compared with the one before it."""
+    candidates, before = [], step.tests.fit
+    for hypothesis in step.partial:
         effect = hypothesis.effects[-1]
-        step = likelihood_ratio(before, (effect,), hypothesis.fit)
-        steps.append(
-            Candidate(effect.name, effect.kind, REFITTED, step.delta_chi2, step.sigma, step.numbers, step.plausible)
+        ratio = likelihood_ratio(before, (effect,), hypothesis.fit)
+        candidates.append(
+            Candidate(effect.name, effect.kind, REFITTED, ratio.delta_chi2, ratio.sigma, ratio.numbers, ratio.plausible)
         )
         before = hypothesis.fit
-    return tuple(steps)
+    return tuple(candidates)
 
 
-def _cosines(questions: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
-    """Cosines between effects, each in the shape that promises most."""
-    names = tuple(dict.fromkeys(questions.sensitivities.effects))
-    places = [questions.ranked_shapes(name)[0] for name in names]
-    matrix = questions.scores.cosines[np.ix_(places, places)] if places else np.zeros((0, 0))
+def _cosines(tests: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Cosines between effects, each in the shape of the largest predicted gain."""
+    names = tuple(dict.fromkeys(tests.sensitivities.effects))
+    best_shapes = [tests.ranked_shapes(name)[0] for name in names]
+    matrix = tests.scores.cosines[np.ix_(best_shapes, best_shapes)] if best_shapes else np.zeros((0, 0))
     return names, matrix.tolist()
 
 
-def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate]:
-    questions = finding.tests
-    aside = dict(finding.rejected)
-    singles = {hypothesis.names[0]: hypothesis for hypothesis in finding.fitted if len(hypothesis.names) == 1}
+def _ranking(step: SelectionStep, not_testable: Mapping[str, str]) -> list[Candidate]:
+    tests = step.tests
+    rejected = dict(step.rejected)
+    singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
     weights = weights_of(list(singles.values()))
-    rows = [_rule(hypothesis, finding) for hypothesis in finding.answer_set if hypothesis.effects[-1] is TAIL_SLACK]
-    for effect in questions.effects:
-        largest, shows = questions.upper_limits(effect)
-        if effect.name in questions.sensitivities.silent:
+    rows = [
+        _slack_candidate(hypothesis, step) for hypothesis in step.answer_set if hypothesis.effects[-1] is TAIL_SLACK
+    ]
+    for effect in tests.effects:
+        upper_limits, is_detectable = tests.upper_limits(effect)
+        if effect.name in tests.sensitivities.silent:
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=NO_RESPONSE))
             continue
-        z, place = questions.best_z(effect.name)
+        z, shape = tests.best_z(effect.name)
+        in_answer_set = effect.name in step.answer_names
         if effect.name in singles:
             single = singles[effect.name]
             rows.append(
@@ -271,16 +265,20 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     single.sigma,
                     single.numbers,
                     single.plausible,
-                    effect.name in finding.answer_names,
-                    aside.get(effect.name, single.reason),
-                    largest,
-                    single.others if effect.name in finding.answer_names else (),
-                    weights[effect.name],
-                    tuple(single for single in finding.confounded if single.number.key.split(".")[0] == effect.name),
-                    single.log_bayes,
+                    in_answer_set,
+                    reason=rejected.get(effect.name, single.reason),
+                    largest=upper_limits,
+                    along=single.others if in_answer_set else (),
+                    posterior_weight=weights[effect.name],
+                    confounded_by=tuple(
+                        confounder
+                        for confounder in step.confounded
+                        if confounder.number.key.split(".")[0] == effect.name
+                    ),
+                    log_bayes=single.log_bayes,
                 )
             )
-        elif finding.verdict == ADEQUATE and not shows and z < questions.family.threshold(effect.name):
+        elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=TOO_WEAK))
         else:
             rows.append(
@@ -288,72 +286,74 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     effect.name,
                     effect.kind,
                     SCREENED,
-                    _promised(finding, effect.name, z),
+                    _predicted_gain(step, effect.name, z),
                     z,
-                    questions.predicted_size(effect, place),
-                    in_answer_set=effect.name in finding.answer_names,
-                    reason=_holds(effect, finding) or _behind(finding, effect.name),
-                    largest={} if questions.poorly_fitted else largest,
+                    tests.predicted_size(effect, shape),
+                    in_answer_set=in_answer_set,
+                    reason=_contains_answer(effect, step) or _subset_fit_behind(step, effect.name),
+                    largest={} if tests.poorly_fitted else upper_limits,
                 )
             )
-    rows += between_candidates(finding.fitted, finding.answer_names, aside)
+    rows += between_candidates(step.fitted, step.answer_names, rejected)
     rows += [
-        Candidate(name, "", NOT_TESTABLE, reason=why) for name, why in blind.items() if name not in questions.fit.model
+        Candidate(name, "", NOT_TESTABLE, reason=reason)
+        for name, reason in not_testable.items()
+        if name not in tests.fit.model
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
-    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
+    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_finite_or_lowest(row.delta_chi2)))
 
 
-def _rule(hypothesis: LikelihoodRatio, finding: SelectionStep) -> Candidate:
+def _slack_candidate(hypothesis: LikelihoodRatio, step: SelectionStep) -> Candidate:
     """The rule that a tail cannot push, as a candidate without a size."""
     name = hypothesis.names[-1]
     return Candidate(
-        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in finding.answer_names
+        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in step.answer_names
     )
 
 
-def _promised(finding: SelectionStep, name: str, z: float) -> float:
-    """Fall of −2 ln L that the sensitivities promise; of an adequate model, what the score says."""
-    if finding.verdict == ADEQUATE:
+def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:
+    """Predicted fall of −2 ln L (linear); of an adequate model, the squared score."""
+    if step.verdict == ADEQUATE:
         return z**2
-    return math.nan if finding.tests.poorly_fitted else finding.tests.predicted_gain(name)
+    return math.nan if step.tests.poorly_fitted else step.tests.predicted_gain(name)
 
 
-def _holds(effect: Effect, finding: SelectionStep) -> str:
-    """That an effect contains one that was found, where it does: it can be no worse, and need not be tried."""
-    held = [name for name in effect.replaces if name in finding.answer_names]
-    return f"it contains {held[0]} as a limit" if held else ""
+def _contains_answer(effect: Effect, step: SelectionStep) -> str:
+    """Say that an effect contains one of the answer set: it can fit no worse, and need not be fitted."""
+    contained = [name for name in effect.replaces if name in step.answer_names]
+    return f"it contains {contained[0]} as a limit" if contained else ""
 
 
-def _behind(finding: SelectionStep, name: str) -> str:
-    """How far a candidate stayed behind the best where only one trial of every condition was fitted."""
-    climbs = finding.search.subset_fits if finding.search else {}
-    if name not in climbs:
+def _subset_fit_behind(step: SelectionStep, name: str) -> str:
+    """Say how far a candidate is behind the best, where it was fitted to one trial of every condition only."""
+    subset_fits = step.search.subset_fits if step.search else {}
+    if name not in subset_fits:
         return ""
-    behind = climbs[name].deviance - min(climb.deviance for climb in climbs.values())
+    behind = subset_fits[name].deviance - min(subset_fit.deviance for subset_fit in subset_fits.values())
     return f"fitted to one trial of every condition, worse by Δχ² = {behind:.0f}" if behind > 0 else ""
 
 
-def _known(value: float) -> float:
+def _finite_or_lowest(value: float) -> float:
     return value if math.isfinite(value) else -math.inf
 
 
 def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
-    """Errors of every model, and how the numbers moved."""
+    """Add the ladder: the errors of every model."""
     from vinetrack.diagnosis.ladder import ladder
 
     report("errors before and after")
     try:
-        steps = [step.effect for last in result.rounds[-1:] for step in last.partial]
-        further = [fit for last in result.rounds[-1:] for fit in last.partial_fits]
-        table = ladder((*result.fits, *further), ("", *result.effects, *steps), len(steps))
+        partial_effects = [step.effect for last in result.rounds[-1:] for step in last.partial]
+        partial_fits = [fit for last in result.rounds[-1:] for fit in last.partial_fits]
+        table = ladder((*result.fits, *partial_fits), ("", *result.effects, *partial_effects), len(partial_effects))
         return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))
+        return replace(result, notes=(*result.notes, f"The ladder of errors could not be computed: {error}"))
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
-    """Where the first model fails, the force it lacks if nothing known mends it, and what to do where effects tie."""
+    """Add where the first model fails, the force it lacks if no effect explains it, and the next experiment."""
     result = _located(result, report) if result.verdict != ADEQUATE else result
     if UNEXPLAINED in (result.verdict, result.final_verdict):
         result = _with_missing_force(result, report)
@@ -361,12 +361,12 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Di
 
 
 def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report: Report = _quiet) -> Diagnosis:
-    """A diagnosis with the trials that would tell apart the names that it leaves.
+    """Add the trials that would discriminate between the hypotheses that remain.
 
     Parameters
     ----------
-    result : with fewer than two names left it stays as it is.
-    limits, report : within which further trials can be made; called with a few words at each step.
+    result : returned unchanged where fewer than two hypotheses remain.
+    limits, report : limits of further trials; called with a few words at each step.
 
     Returns
     -------
@@ -384,31 +384,31 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     try:
         return replace(result, next_experiment=next_experiment(tied, limits).to_json())
     except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"No next experiment could be worked out: {error}"))
+        return replace(result, notes=(*result.notes, f"No next experiment could be computed: {error}"))
 
 
 def _located(result: Diagnosis, report: Report) -> Diagnosis:
-    """Where the first model fails, and which of its numbers drift."""
+    """Add where the first model fails, and which of its parameters drift."""
     from vinetrack.diagnosis.locate import locate
 
     report("where it fails")
     try:
         failure = locate(result.fits[0])
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"Where the model fails could not be worked out: {error}"))
+        return replace(result, notes=(*result.notes, f"Where the model fails could not be computed: {error}"))
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
     return replace(result, failure=failure, where=failure.sentences(), drift=drift)
 
 
 def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:
-    """The force that the first model lacks, and what simple law it looks like."""
+    """Add the force that the first model lacks, and the simple law that it resembles."""
     from vinetrack.diagnosis.missing_force import missing_force
 
-    report("drawing the missing force")
+    report("computing the missing force")
     try:
         force = missing_force(result.fits[0])
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"The missing force could not be drawn: {error}"))
+        return replace(result, notes=(*result.notes, f"The missing force could not be computed: {error}"))
     explanation = f"{result.explanation} {force.sentence}"
     learned = None if force.learned is None else force.learned.table
     return replace(

@@ -1,9 +1,8 @@
-"""The fit of the initial model, which `fit.json` holds and the diagnosis questions: both make it alike.
+"""The fit of the initial model, made identically for `fit.json` and for the diagnosis.
 
-It is compiled with all that the diagnosis may ask about, so what is asked about (`candidates_of`) stands here.
-
-A model far off its data has several minima a little apart. Begun, compiled or iterated differently, two fits of it
-would end at numbers that differ in the third digit, and every page would show both.
+A model that is far off has several minima close together. Started, compiled or iterated differently, two fits of it
+would end at parameters that differ in the third digit, and every page would show both. The model is therefore compiled
+together with all candidates of the diagnosis (`candidates_of`) in either case.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 def candidates_of(
     model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
 ) -> tuple[Effect, ...]:
-    """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
+    """Candidates of a diagnosis: the `wanted` effects and the user's own, less those in the model.
 
     Parameters
     ----------
     model
-        The model that is questioned.
+        The model to diagnose.
     wanted : iterable of str or None
         Names of effects; the catalogue where None.
     user_effects : mapping, optional
@@ -55,17 +54,17 @@ def candidates_of(
 
 @lru_cache(maxsize=1)
 def probe() -> Effect:
-    """The probe force, see its file."""
+    """The probe force (`probes/probe_force.py`)."""
     return load_effect(PROBE_FILE)
 
 
 def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
-    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis.
+    """Return one model with all candidates, whose compiled form serves every hypothesis.
 
     Parameters
     ----------
     model
-        The model that is questioned.
+        The model to diagnose.
     candidates : iterable of Effect
 
     Returns
@@ -77,14 +76,14 @@ def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
 
 
 def with_host(fit: Fit, host: Model | None) -> Fit:
-    """A fit whose trajectories come from the kernel of a larger model from here on.
+    """Return a fit whose trajectories are simulated by the compiled form of a larger model.
 
     Parameters
     ----------
     fit
         A fitted model.
     host : Model or None
-        Holds the effects of the model, and others that may be asked for.
+        Contains the effects of the model and all candidates.
 
     Returns
     -------
@@ -100,7 +99,7 @@ def with_host(fit: Fit, host: Model | None) -> Fit:
 def initial_fit(
     model: Model, pairs: Pairs, candidates: Iterable[Effect], *, profile: bool = True, free: Iterable[str] = ()
 ) -> Fit:
-    """Fit the model in use as the diagnosis does.
+    """Fit the model in use, as the diagnosis does.
 
     Parameters
     ----------
@@ -109,11 +108,11 @@ def initial_fit(
     pairs
         Trials with their tracks.
     candidates
-        Effects that the diagnosis asks about: their compiled form serves this fit too.
+        Candidates of the diagnosis: they are compiled with the model.
     profile
         Whether intervals near a bound are found by profile; values and standard errors do not depend on it.
     free
-        Parameters to fit although known beforehand.
+        Parameters to fit although their values are known.
 
     Returns
     -------
@@ -122,6 +121,6 @@ def initial_fit(
     Raises
     ------
     FitError
-        If there is nothing to fit, or the model cannot be followed.
+        If there is nothing to fit, or the simulation of the model fails.
     """
     return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile, thorough=False)

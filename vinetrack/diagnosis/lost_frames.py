@@ -1,4 +1,4 @@
-"""Recordings from which frames are missing: their times put right, and said first where that is beyond doubt."""
+"""Recordings with dropped frames: their times are corrected, and dropped frames beyond doubt become the verdict."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 
 @dataclass(frozen=True)
 class LostFrames:
-    """Trials from which frames are missing, and those among them of which that is sure."""
+    """Trials that may have dropped frames, and those among them that have for certain."""
 
     trials: tuple[str, ...] = ()
     certain: tuple[str, ...] = ()
 
-    def beside(self, trial: str, track: Track) -> LostFrames:
-        """With a trial whose track, its times put right, may have lost frames.
+    def including(self, trial: str, track: Track) -> LostFrames:
+        """Add a trial if its times were corrected for dropped frames.
 
         Parameters
         ----------
@@ -38,7 +38,7 @@ class LostFrames:
 
 
 def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], LostFrames]:
-    """Tracks with dropped and repeated frames put right, and the trials from which frames are missing.
+    """Correct the times of tracks with dropped and repeated frames.
 
     Parameters
     ----------
@@ -47,56 +47,56 @@ def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], Los
     Returns
     -------
     pairs : list of (Trial, Track)
-    missing : LostFrames
+    dropped : LostFrames
     """
-    right: list[tuple[Trial, Track]] = []
-    missing = LostFrames()
+    corrected: list[tuple[Trial, Track]] = []
+    dropped = LostFrames()
     for trial, track in pairs:
         if trial.video is None and not with_flag(track.flag, "retimed").any():
             track = correct_frames(track)
-        missing = missing.beside(trial.name, track)
-        right.append((trial, track))
-    return right, missing
+        dropped = dropped.including(trial.name, track)
+        corrected.append((trial, track))
+    return corrected, dropped
 
 
-def lost_in_fit(fit: Fit) -> LostFrames:
-    """Trials of a fit from which frames are missing that nobody has put right.
+def dropped_frames_in(fit: Fit) -> LostFrames:
+    """Find trials of a fit whose dropped frames were not corrected.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit of the model.
 
     Returns
     -------
     LostFrames
     """
-    missing = LostFrames()
+    dropped = LostFrames()
     for trial_data in fit.predictor.data:
         track = correct_frames(plain_track(trial_data.time_s, trial_data.lead_position_m))
-        missing = missing.beside(trial_data.trial.name, track)
-    return missing
+        dropped = dropped.including(trial_data.trial.name, track)
+    return dropped
 
 
-def with_lost_frames(result: Diagnosis, missing: LostFrames) -> Diagnosis:
-    """Missing frames said first where they are sure, with what follows from the times put right as a note.
+def with_lost_frames(result: Diagnosis, dropped: LostFrames) -> Diagnosis:
+    """Put certain dropped frames first in a diagnosis, and its verdict with corrected times into a note.
 
-    A jump that a few points with heavy tails may have made is a note itself.
+    A jump that a few outlying points may have caused becomes a note only.
 
     Parameters
     ----------
-    result : what the trials say with their times put right.
-    missing : LostFrames
+    result : the diagnosis with corrected times.
+    dropped : LostFrames
 
     Returns
     -------
     Diagnosis
     """
-    if not missing.trials:
+    if not dropped.trials:
         return result
-    if not missing.certain:
-        return replace(result, notes=(*result.notes, perhaps_dropped_in_words(missing.trials)))
+    if not dropped.certain:
+        return replace(result, notes=(*result.notes, perhaps_dropped_in_words(dropped.trials)))
     first = result.rounds[0]
-    words = dropped_in_words(missing.trials)
+    words = dropped_in_words(dropped.trials)
     artefact = Round(
         model=first.model,
         verdict=ARTEFACT,
@@ -107,7 +107,7 @@ def with_lost_frames(result: Diagnosis, missing: LostFrames) -> Diagnosis:
         cosines=first.cosines,
         fit=first.fit,
     )
-    note = f"With the times put right: {result.verdict}. {result.explanation}"
+    note = f"With corrected times: {result.verdict}. {result.explanation}"
     return Diagnosis(
         rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,), power=result.power
     )

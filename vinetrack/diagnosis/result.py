@@ -1,7 +1,7 @@
-"""What a diagnosis says, in the shape of `diagnosis.json`.
+"""Results of a diagnosis, in the structure of `diagnosis.json`.
 
-A diagnosis is a list of rounds. Each takes a model, asks of every candidate whether it is missing, and gives one of
-five verdicts; while the verdict is `missing` the effect is added and the next round asks again.
+A diagnosis is a list of rounds. Each round tests a model against every candidate and reaches one of five verdicts;
+while the verdict is `missing`, the effect is added and the next round tests the enlarged model.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
 )
 
 REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"
-"""How much is known of a candidate: its own fit, only what the sensitivities predict, or why these data are blind."""
+"""Status of a candidate: fitted, only tested by its score, or not testable with these data."""
 
 DROPPED_FRAMES = "dropped_frames"
-"""Stands in an answer set where frames are missing from a recording: a fault of the measurement without a formula."""
+"""Member of an answer set where a recording has dropped frames: a fault of the measurement without a formula."""
 
 BETWEEN_TRIALS = "between_trials"
-"""Kind of a hypothesis that trials differ: neither physics that is missing nor a fault of the camera or gauge."""
+"""Kind of a hypothesis that trials differ: neither missing physics nor a fault of camera or gauge."""
 
 N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen", "day")
 
@@ -48,21 +48,21 @@ BETWEEN_SUMMARIES = {
     SPECIMEN: "specimens (tubes of one kind) differ",
     DAY: "B or the zero of the gauge differs from day to day",
 }
-"""Hypotheses that trials differ, by the names they have in an answer set."""
+"""Hypotheses that trials differ, by their names in an answer set."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect held against the data: a row of the ranking.
+    """One candidate effect: a row of the ranking.
 
-    `delta_chi2` is by how much −2 ln L falls when it is added (predicted from sensitivities where only `screened`), and
-    `sigma` what that is worth in standard deviations for the numbers it brings. `numbers` are its sizes with errors
-    and 95 % intervals, `along` those of all else that is fitted with it, where it is in the answer set. `largest` maps
-    each parameter to the largest size that could still hide, one-sided 95 %.
-    `reason` says in words why it is not testable, or not plausible, or another's limit. `posterior_weight` is its
-    probability among all that were refitted, had they been equally likely beforehand, with plausible ranges as priors.
-    `confounded_by` are other effects that its sizes may hold a part of. `log_bayes` is the logarithm of its marginal
-    likelihood over that of the model without it, with plausible ranges as priors.
+    `delta_chi2` is the fall of −2 ln L when it is added (predicted by the linear model where only `screened`), and
+    `sigma` its significance in standard deviations for the parameters added. `numbers` are its sizes with standard
+    errors and 95 % intervals, `along` the other parameters of the fit, where it is in the answer set. `largest` maps
+    each parameter to the upper limit of an undetected size, one-sided 95 %.
+    `reason` states in words why it is not testable, not plausible, or rejected. `posterior_weight` is its posterior
+    probability among all that were refitted, with equal prior probabilities and plausible ranges as priors.
+    `confounded_by` lists other effects that its sizes may include. `log_bayes` is the logarithm of the Bayes factor
+    against the model without it, with plausible ranges as priors.
     """
 
     effect: str
@@ -101,7 +101,7 @@ class Candidate:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
-        """Read an entry of `ranking`; what is absent stands at its default.
+        """Read an entry of `ranking`; absent keys take their defaults.
 
         Parameters
         ----------
@@ -132,13 +132,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Round:
-    """One model questioned.
+    """One model and its tests against all candidates.
 
-    `ranking` has the best candidate first, those not testable last. `cosines` tells how alike what two candidates do
-    to the trajectories looks once all that is fitted anyway is taken away: names, and a matrix in their order.
-    `fit` is that of the model, `fits` those of the hypotheses by name of effect. `sets` are the members of the answer
-    set, each with all effects it adds, where any adds more than one; `partial` the steps that mend a part of what
-    nothing mends in full, each of one effect more, with `partial_fits`: none of them is said to be missing.
+    `ranking` has the best candidate first, those not testable last. `cosines` are the correlations of the candidates'
+    scores, with the fitted parameters projected off: names, and a matrix in their order. `fit` is that of the model,
+    `fits` those of the hypotheses by name of effect. `sets` are the members of the answer set, each with all its
+    effects, where any has more than one. `partial` are steps, one effect each, that remove part of a misfit that no
+    hypothesis removes entirely, with `partial_fits`; none of these effects is said to be missing.
     """
 
     model: tuple[str, ...]
@@ -169,7 +169,7 @@ class Round:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Round:
-        """Read an entry of `rounds`; the fits are not in it.
+        """Read an entry of `rounds`, which holds no fits.
 
         Parameters
         ----------
@@ -195,16 +195,15 @@ class Round:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """The whole answer. Printed, it is what a person reads on the terminal.
+    """The result of a diagnosis. Printed, it is the text on the terminal.
 
-    `effects` are those added, in order; `fits` the model the user came with and every one after it. `drift` holds a row
-    a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
-    to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks,
-    `learned_table` the same as learned inside the fit.
-    One that was read back has no `fits` but the numbers of the last model in `stored_parameters`; `refused` is the
-    reason why no diagnosis could be made, blank where one was: there are no rounds then. `power` is what these trials
-    could have seen beside the last model. `odd_trials` are single trials without which the others are explained, and
-    with which nothing is.
+    `effects` are those added, in order; `fits` the initial model and every enlarged one. `drift` holds one row for each
+    drifting parameter, `ladder` the errors of every model (None where not computed), `next_experiment` the trials that
+    would discriminate between hypotheses that remain. `failure` states where the initial model fails, `force_table`
+    which force it lacks, `learned_table` the same as learned inside the fit.
+    A diagnosis read from a file has no `fits`, but the parameters of the last model in `stored_parameters`. `refused`
+    is the reason why no diagnosis was possible; there are no rounds then. `power` is the power of these trials to
+    detect further effects. `odd_trials` are single trials without which the others are explained.
     """
 
     rounds: tuple[Round, ...]
@@ -227,17 +226,17 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """About the model the user came with; blank where no diagnosis could be made."""
+        """Verdict on the initial model; blank where no diagnosis was possible."""
         return self.rounds[0].verdict if self.rounds else ""
 
     @property
     def final_verdict(self) -> str:
-        """About the model with everything added; blank where no diagnosis could be made."""
+        """Verdict on the final model; blank where no diagnosis was possible."""
         return self.rounds[-1].verdict if self.rounds else ""
 
     @property
     def answer_set(self) -> tuple[str, ...]:
-        """Every hypothesis that the data cannot exclude for the first effect that is missing."""
+        """Every hypothesis for the first missing effect that the data cannot exclude."""
         return self.rounds[0].answer_set if self.rounds else ()
 
     @property
@@ -247,22 +246,22 @@ class Diagnosis:
 
     @property
     def refutes(self) -> bool:
-        """Whether the initial model lacks physics, so that what is drawn with it must say so."""
+        """Whether the initial model lacks physics, so that figures drawn with it must state that."""
         return self.verdict in (MISSING, AMBIGUOUS, UNEXPLAINED)
 
     @property
     def initial_model(self) -> tuple[str, ...]:
-        """Names of the effects of the model the user came with."""
+        """Names of the effects of the initial model."""
         return self.rounds[0].model if self.rounds else ()
 
     @property
     def final_model(self) -> tuple[str, ...]:
-        """Names of the effects of the model with everything added."""
+        """Names of the effects of the final model."""
         return (*self.initial_model, *(name for name in self.effects if name not in self.initial_model))
 
     @property
     def parameters(self) -> tuple[Number, ...]:
-        """The numbers of the model with everything added, SI."""
+        """Parameters of the final model, SI."""
         return self.fits[-1].numbers if self.fits else self.stored_parameters
 
     @property
@@ -277,7 +276,7 @@ class Diagnosis:
         -------
         DataFrame
             Columns `round, effect, kind, status, delta_chi2, sigma, size, in_answer_set, plausible, reason`; the size
-            is text with its standard error and unit, for the units differ from effect to effect.
+            is text with its standard error and unit, because units differ between effects.
         """
         import pandas as pd
 
@@ -292,7 +291,7 @@ class Diagnosis:
         return pd.DataFrame(rows, columns=[*columns, "reason"])
 
     def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it; numbers in SI units."""
+        """Content of `diagnosis.json`; numbers in SI units."""
         first = self.rounds[0].to_json() if self.rounds else {}
         return {
             "verdict": self.verdict or None,
@@ -325,7 +324,7 @@ class Diagnosis:
         Returns
         -------
         Diagnosis
-            Without fits, `failure` and `force_table`, which the file does not hold.
+            Without fits, `failure` and `force_table`, which are not in the file.
         """
         rounds = list(content.get("rounds") or [{}] if content.get("verdict") else [])
         if rounds:
