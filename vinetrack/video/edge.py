@@ -30,7 +30,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
-from vinetrack.video.first_path import grown_by_change, grown_path
+from vinetrack.video.first_path import grown_by_change, grown_path, sides_of_path
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
@@ -207,8 +207,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
         Where nothing in the strip changes as a passing front does.
     """
     path, passed = grown_path(strip)
-    pictures = first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
-    power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
+    film, background = sides_of_path(strip, path, passed)
+    power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):

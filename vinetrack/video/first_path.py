@@ -11,13 +11,12 @@ unexplained.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import growth_end
-from vinetrack.video.edge_state import first_state
 from vinetrack.video.strip import Strip
-from vinetrack.video.tip_shape import ASSUMED_EXPOSURE
 
 LEAST_CHANGE = 5.0
 """Change of a column, as `kymograph.changing_path` states it, from which it counts as changed. Chosen: about 360 times
@@ -29,6 +28,10 @@ over half as many. By reasoning: at half a glint counts as growth; at twice shor
 FALL_PART, FALL_PX = 0.1, 0.2
 """Least fall of the steps in the run-up, as a part of the first difference seen and in px. Chosen: the run-up then
 ends. By reasoning: at half it reaches twice as far back, which the second path takes back."""
+
+SEEN_FRAMES = 12
+"""Frames after and before the front over which film and background are averaged. Derived: as many as a memory of
+MEMORY_FRAMES in `edge_state` has in effect, (Σw)²/Σw² = 2 · 6."""
 
 _Way = tuple[Floats, tuple[int, int]]
 """Column of the front by frame, shape (n_frames,), px; the first column passed and the one behind the last."""
@@ -105,8 +108,24 @@ def _likelier_path(strip: Strip) -> _Way:
 def _unexplained(strip: Strip, way: _Way, columns: tuple[int, int]) -> float:
     """What a path leaves unexplained of some columns, with the pictures that follow from it."""
     path, _ = way
-    pictures = first_state(strip, path, ASSUMED_EXPOSURE).pictures
+    pictures = sides_of_path(strip, path, columns)
     return float(ky.unexplained(strip.values, strip.scale, strip.offset, strip.noise, path, pictures, *columns))
+
+
+def sides_of_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
+    """Mean brightness of each pixel in the SEEN_FRAMES frames after and before the front passes it.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    path : column of the front by frame, never falling, shape (n_frames,), px.
+    columns : the first, and the one behind the last.
+
+    Returns
+    -------
+    film and background, shape (2, n_across, n_columns), grey levels.
+    """
+    return ky.sides_of_front(strip.values, strip.scale, strip.offset, path, *columns, SEEN_FRAMES)
 
 
 def _in_earnest(path: Floats, change: Floats) -> _Way:

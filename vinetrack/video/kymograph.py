@@ -65,7 +65,7 @@ LEAP, LEAP_OVER_PX = 3.0, 2.0
 reasoning: at half vines that slow down at once lose their start; at twice a tail that jerks passes for growth."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def _change_score(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, bunch: int, noise: float
 ) -> np.ndarray:
@@ -78,27 +78,28 @@ def _change_score(
     groups = rows // bunch
     binned = np.zeros((n + 1, columns), np.float32)
     score = np.zeros((n, columns), np.float32)
+    total = np.empty(columns, np.int32)
     for g in range(groups):
         for t in range(n):
-            for s in range(columns):
-                binned[t + 1, s] = 0.0
+            total[:] = 0
             for k in range(bunch):
+                values = strip[t, g * bunch + k]
                 for s in range(columns):
-                    binned[t + 1, s] += strip[t, g * bunch + k, s] * scale[t] + offset[t]
+                    total[s] += values[s]
+            gain, level = np.float32(scale[t] / bunch), np.float32(offset[t])
+            before, after = binned[t], binned[t + 1]
             for s in range(columns):
-                binned[t + 1, s] = binned[t, s] + binned[t + 1, s] / bunch
+                after[s] = before[s] + (total[s] * gain + level)
         for t in range(1, n):
             a, b = min(n, t + window), max(0, t - window)
-            after, before = a - t, t - b
-            factor = after * before / (after + before)
+            factor = np.float32((a - t) * (t - b) / (a - b))
+            share_after, share_before = np.float32(1 / (a - t)), np.float32(1 / (t - b))
+            above, here, under, line = binned[a], binned[t], binned[b], score[t]
             for s in range(columns):
-                d = (binned[a, s] - binned[t, s]) / after - (binned[t, s] - binned[b, s]) / before
-                score[t, s] += factor * d * d
-    unit = noise * noise / bunch * max(groups, 1)
-    for t in range(n):
-        for s in range(columns):
-            score[t, s] = score[t, s] / unit - 1
-    return score
+                d = (above[s] - here[s]) * share_after - (here[s] - under[s]) * share_before
+                line[s] += factor * d * d
+    unit = np.float32(noise * noise / bunch * max(groups, 1))
+    return score / unit - np.float32(1.0)
 
 
 @njit(cache=True)
@@ -220,7 +221,13 @@ def _bunch(strip: Strip) -> int:
 def _look(strip: Strip, frames: slice) -> NDArray[np.float32]:
     """Median brightness of every pixel over some frames, shape (n_across, n_along)."""
     values = strip.values[frames] * strip.scale[frames, None, None].astype(np.float32)
-    return np.asarray(np.median(values + strip.offset[frames, None, None].astype(np.float32), axis=0), np.float32)
+    values += strip.offset[frames, None, None].astype(np.float32)
+    if len(values) != FIRST_FRAMES:
+        return np.asarray(np.median(values, axis=0), np.float32)
+    # The median of five is that of the fifth, the larger minimum and the smaller maximum of two pairs.
+    a, b, c, d, e = values
+    low, high = np.maximum(np.minimum(a, b), np.minimum(c, d)), np.minimum(np.maximum(a, b), np.maximum(c, d))
+    return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
 
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
@@ -238,6 +245,62 @@ def _votes(
                 value = strip[t, u, s] * gain + level
                 out[t, s] += (abs(value - last[u, s]) - abs(value - first[u, s])) * weight[u, s]
     return out
+
+
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+def sides_of_front(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int, window: int
+) -> np.ndarray:
+    """Mean brightness of each pixel in the frames after and before a front passes it.
+
+    Parameters
+    ----------
+    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
+    scale, offset : brightness = scale · value + offset, shape (n_frames,).
+    path : column of the front by frame, never falling, shape (n_frames,), px.
+    begin, end : first column, and the one behind the last.
+    window : frames after and before the passage of which means are taken.
+
+    Returns
+    -------
+    film and background, shape (2, n_across, end − begin), grey levels; a column that is never seen bare, or never
+    covered, has the value of the nearest that is.
+    """
+    n, rows, _ = strip.shape
+    front = np.empty(n + 1, np.int64)
+    for t in range(n):
+        front[t] = min(max(math.ceil(path[t]), begin), end)
+    front[n] = front[n - 1]
+    sums, counts = np.zeros((2, rows, end - begin), np.float32), np.zeros((2, end - begin), np.float32)
+    for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        for k in range(2):
+            # The frame of the passage and its neighbour show the edge itself.
+            low, high = front[t + 1], front[min(t + window + 1, n)]
+            if k == 0:
+                low, high = begin if t <= window else front[t - window - 1], front[max(t - 1, 0)]
+            elif t + window + 1 >= n:
+                high = end
+            if high <= low:
+                continue
+            counts[k, low - begin : high - begin] += np.float32(1.0)
+            for u in range(rows):
+                values, line = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
+                for s in range(high - low):
+                    line[s] += values[s] * gain + level
+    for k in range(2):
+        known = np.flatnonzero(counts[k] > 0)
+        for s in range(end - begin):
+            source = s
+            if len(known) and counts[k, s] == 0:
+                source = known[np.argmin(np.abs(known - s))]
+            share = 1 / max(counts[k, source], np.float32(1.0))
+            for u in range(rows):
+                if source <= s:
+                    sums[k, u, s] = sums[k, u, source] * (share if source == s else np.float32(1.0))
+                else:
+                    sums[k, u, s] = sums[k, u, source] * share
+    return sums
 
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
@@ -259,7 +322,7 @@ def unexplained(
     scale, offset : brightness = scale · value + offset, shape (n_frames,).
     noise : standard deviation of a value, grey levels.
     path : column of the front by frame, shape (n_frames,), px.
-    pictures : brightness of film, then of background, shape (2 or more, n_across, n_along).
+    pictures : brightness of film, then of background, shape (2, n_across, end − begin).
     begin, end : columns over which to sum.
 
     Returns
@@ -272,11 +335,14 @@ def unexplained(
         gain, level = np.float32(scale[t]), np.float32(offset[t])
         front = min(max(math.ceil(path[t]), begin), end)
         for u in range(rows):
-            values = strip[t, u]
+            row_total = np.float32(0.0)
             for k in range(2):
-                for s in range(begin if k == 0 else front, front if k == 0 else end):
-                    off = (values[s] * gain + level - pictures[k, u, s]) * unit
-                    total += min(off * off, top)
+                low, high = (begin, front) if k == 0 else (front, end)
+                values, picture = strip[t, u, low:high], pictures[k, u, low - begin : high - begin]
+                for s in range(high - low):
+                    off = (values[s] * gain + level - picture[s]) * unit
+                    row_total += min(off * off, top)
+            total += row_total
     return total
 
 

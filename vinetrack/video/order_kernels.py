@@ -104,6 +104,60 @@ def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
+def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
+    """Mean of the largest absolute changes of single pixels from each picture to the next.
+
+    Parameters
+    ----------
+    pictures : brightness, 0 to 255, shape (n, n_pixels).
+    count : number of pixels of which the mean is taken.
+
+    Returns
+    -------
+    shape (n - 1,).
+    """
+    n, pixels = pictures.shape
+    count = min(count, pixels)
+    out, change = np.zeros(n - 1, np.float32), np.empty(pixels, np.float32)
+    bins, totals = np.zeros(LEVELS * BINS_A_LEVEL, np.int64), np.zeros(LEVELS * BINS_A_LEVEL)
+    limit = np.float32(0.0)
+    for t in range(n - 1):
+        before, after = pictures[t], pictures[t + 1]
+        for k in range(pixels):
+            change[k] = abs(after[k] - before[k])
+        # Most pixels change less than those that count: only changes near the last picture's smallest are sorted.
+        found = 0
+        while True:
+            bins[:], totals[:] = 0, 0.0
+            found = 0
+            for start in range(0, pixels, 16):
+                block = change[start : start + 16]
+                largest = np.float32(0.0)
+                for value in block:
+                    largest = max(largest, value)
+                if largest < limit:
+                    continue
+                for value in block:
+                    if value >= limit:
+                        place = min(int(value * BINS_A_LEVEL), LEVELS * BINS_A_LEVEL - 1)
+                        bins[place] += 1
+                        totals[place] += value
+                        found += 1
+            if found >= count:
+                break
+            limit = np.float32(0.0)
+        total, taken, place = 0.0, 0, LEVELS * BINS_A_LEVEL - 1
+        while taken + bins[place] < count:
+            taken += bins[place]
+            total += totals[place]
+            place -= 1
+        total += (count - taken) * totals[place] / max(bins[place], 1)
+        out[t] = total / count
+        limit = np.float32(0.7 * place / BINS_A_LEVEL)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """When the means of the pictures before and after differ most at each pixel, and the power of that difference.
 

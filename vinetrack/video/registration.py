@@ -25,6 +25,17 @@ reasoning: at half it is nearly a half, at twice a quarter."""
 PIXELS = 9000
 """Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
 a pixel and noise of 5: 1/√9000 = 0.01 px."""
+LEVEL_PIXELS = 3000
+"""Pixels that tell of light alone, and whether a shake is worth measuring with PIXELS. Derived for noise of 5 grey
+levels at 100: 5/(100·√3000) = 0.1 % of the light, 0.003 px of an edge of 30 grey levels. At half 0.004 px; at twice
+time is as of PIXELS."""
+MEDIAN_EVERY = 4
+"""Every so many pixels count in medians. Derived: of 750 pixels a median is known to 1.25/√750 = 5 % of their scatter.
+At half time grows, at twice it is known to 7 %."""
+AS_NOISE = 1.5
+"""Median shift over its standard error, with LEVEL_PIXELS, below which no shake is looked for. Derived: 0.67 of noise
+alone; a shake of 2.5 standard errors with PIXELS, the least that is taken off, makes 1.6. By reasoning: at half every
+recording is measured twice, at twice faint shakes stay."""
 SHAKE_FLOOR_PX = 0.04
 """Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
 `point_quality`."""
@@ -38,6 +49,8 @@ SHAKE_ROUNDS; at twice a picture that departs for other reasons is also moved by
 SHAKE_SETTLED_PX = 0.02
 """Shift of a round below which it is the last. Chosen: a fifth of the error of a shake that was taken off, and half of
 SHAKE_FLOOR_PX. At half another round is made, at twice up to that floor is left."""
+WHOLE_PX = 1e-6
+"""Distance of a place from a whole pixel that is rounding. Derived: places of some thousand px are known to 1e-12."""
 HALVES_APART = 0.7
 """Difference of the shifts that both halves of what stands still tell, over their sum, below which a camera shook.
 Measured on clips of seeds 1 to 6
@@ -98,18 +111,22 @@ def steady(
     shift = np.zeros((n, 2))
     fit, steadied = np.zeros((n, 4)), False
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
-    medians = _median_pictures(luma, axis, bands, picks, None)
-    reference = reference_pixels(medians, bands)
+    columns = int(np.floor(axis.length_px)) + 1
+    reference = _still_pixels(luma, axis, bands, picks, (0, columns), LEVEL_PIXELS)
     if not reference.basis[0].any():  # black all over: it tells of no light and of no shift
         return np.full(n, unit), np.zeros(n), shift, False
+    fit, sd = register(luma, axis, reference, None, unit)
+    if still or _stands_still(fit, sd, reference):
+        return *_levelled(fit, unit), shift, False
+    reference = _still_pixels(luma, axis, bands, picks, (0, columns), PIXELS)
     for turn in range(SHAKE_ROUNDS):
         fit, sd = register(luma, axis, reference, shift if turn else None, unit)
         if turn == 0:
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
-            if still or not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
+            if not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
-            middle, end = medians[0].shape[1] // 2, medians[0].shape[1]
-            halves = [reference_pixels(medians, bands, part) for part in ((0, middle), (middle, end))]
+            parts = (0, columns // 2), (columns // 2, columns)
+            halves = [_still_pixels(luma, axis, bands, picks, part, PIXELS) for part in parts]
             if not shaken_alike(luma, axis, halves, unit):
                 break
             steadied = True
@@ -118,8 +135,21 @@ def steady(
             reference = reference_pixels(_median_pictures(luma, axis, bands, picks, shift), bands)
         if turn > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
             break
+    return *_levelled(fit, unit), shift, steadied
+
+
+def _stands_still(fit: Floats, sd: Floats, reference: Reference) -> bool:
+    """Whether the shifts of frames along and across are so small that they are noise, or not worth being taken off."""
+    along, across = reference.basis[2:] @ reference.basis[2:].T
+    ratio = np.sqrt(along[0] / max(across[1], 1e-9))
+    size = np.median(np.abs(fit[:, 2:]), axis=0)
+    return bool(np.all(size < np.maximum(SHAKE_FLOOR_PX, AS_NOISE * float(np.median(sd)) * np.array([1.0, ratio]))))
+
+
+def _levelled(fit: Floats, unit: float) -> tuple[Floats, Floats]:
+    """Scale and offset that free each frame of the gain and level of a fit, shape (n_frames,) each."""
     gain = np.clip(fit[:, 0], 0.2, 5.0)
-    return unit / gain, -fit[:, 1] * unit / gain, shift, steadied
+    return unit / gain, -fit[:, 1] * unit / gain
 
 
 def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], unit: float) -> bool:
@@ -157,12 +187,52 @@ def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
     return float(np.mean(apart[most])) < max(HALVES_APART * float(np.mean(both[most])), 2 * sd_sum)
 
 
+def _still_pixels(
+    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_],
+    columns: tuple[int, int], count: int,
+) -> Reference:  # fmt: skip
+    """About `count` whole pixels of the picture in some bands, with the median of some frames and its slopes.
+
+    Whole pixels need no interpolation, along whatever axis.
+    """
+    low, high = columns
+    grids = [np.meshgrid(np.arange(low + 1, high - 1), rows[1:-1]) for rows in bands]
+    along, across = (np.concatenate([grid[k].ravel() for grid in grids]) for k in (0, 1))
+    every = max(1, len(along) // count)
+    height, width = luma.shape[1:]
+    place = np.rint(axis.points(along[::every].astype(float), across[::every].astype(float))).astype(int)
+    x, y = np.clip(place[:, 0], 1, width - 2), np.clip(place[:, 1], 1, height - 2)
+    middle, left, right, above, below = _medians_about(luma, picks, x, y)
+    right, below = (right - left) / 2, (below - above) / 2
+    unit, side, away = axis.direction, axis.normal, np.column_stack([x, y]) - np.asarray(axis.from_px, float)
+    slopes = -(right * unit[0] + below * unit[1]), -(right * side[0] + below * side[1])
+    return Reference(away @ unit, away @ side, np.stack([middle, np.ones(len(x)), *slopes]))
+
+
+@njit(cache=True, nogil=True)
+def _medians_about(luma: np.ndarray, picks: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Median over some frames of pixels and of those left, right, above and below them, shape (5, n_pixels)."""
+    out, values = np.empty((5, len(x))), np.empty(len(picks))
+    for i in range(len(x)):
+        for k in range(5):
+            right, down = (k == 2) - (k == 1), (k == 4) - (k == 3)
+            for j in range(len(picks)):
+                value = float(luma[picks[j], y[i] + down, x[i] + right])
+                m = j
+                while m > 0 and values[m - 1] > value:
+                    values[m] = values[m - 1]
+                    m -= 1
+                values[m] = value
+            out[k, i] = 0.5 * (values[(len(picks) - 1) // 2] + values[len(picks) // 2])
+    return out
+
+
 def _median_pictures(
-    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_], shift_px: Floats | None
+    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_], shift_px: Floats
 ) -> list[NDArray[np.float32]]:
     """Median of some frames in each band, shape (n_rows, n_along)."""
     chosen = luma[picks]
-    views = [sample(chosen, axis, rows, None if shift_px is None else shift_px[picks]) for rows in bands]
+    views = [sample(chosen, axis, rows, shift_px[picks]) for rows in bands]
     return [np.median(view, axis=0).astype(np.float32) for view in views]
 
 
@@ -204,9 +274,10 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
 
     along, across = axis.direction, axis.normal
     start = axis.points(reference.along_px, reference.across_px)
-    if shift_px is None and max(abs(along)) > 1 - 1e-9:
-        x, y = (np.clip(np.rint(start[:, i]), 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
-        return luma[:, y, x]
+    whole = np.rint(start)
+    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - whole).max() < WHOLE_PX):
+        x, y = (np.clip(whole[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
+        return _whole_pixels(luma, x, y)
     # Rows of a thousand: OpenCV takes no picture wider than 32767 pixels.
     wide = -(-len(start) // 1000)
     place = np.pad(start, ((0, wide * 1000 - len(start)), (0, 0)), mode="edge").reshape(wide, 1000, 2)
@@ -216,6 +287,16 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
         x, y = moved[..., 0].astype(np.float32), moved[..., 1].astype(np.float32)
         seen = np.asarray(cv2.remap(frame, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         out[i] = seen.ravel()[: len(start)]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _whole_pixels(luma: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Some pixels of every frame, shape (n_frames, n_pixels)."""
+    out = np.empty((len(luma), len(x)), luma.dtype)
+    for t in range(len(luma)):
+        for i in range(len(x)):
+            out[t, i] = luma[t, y[i], x[i]]
     return out
 
 
@@ -261,9 +342,14 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
     """
     n, count = data.shape
     out, error = np.zeros((n, 4)), np.full(n, np.inf)
-    strays, keep, everywhere = np.empty(count), np.ones(count), np.ones(count)
+    strays, keep = np.empty(count), np.ones(count)
     whole, fine = basis @ basis.T + ridge, unit * BINS_A_LEVEL
-    usual = max(median(basis[0], everywhere, fine), 1e-9)
+    # A median of a part of the pixels tells as well how large residuals are.
+    few = (count + MEDIAN_EVERY - 1) // MEDIAN_EVERY
+    part, kept, everywhere = np.empty(few), np.empty(few), np.ones(few)
+    for k in range(few):
+        part[k] = basis[0, k * MEDIAN_EVERY]
+    usual = max(median(part, everywhere, fine), 1e-9)
     for t in range(n):
         keep[:] = 1.0
         values = data[t]
@@ -279,15 +365,22 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
             a, b, c, d = inverse @ np.array([r0, r1, r2, r3])
             for k in range(count):
                 strays[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
-            size = 1.4826 * median(strays, keep, fine) + 0.3
+            for k in range(few):
+                part[k], kept[k] = strays[k * MEDIAN_EVERY], keep[k * MEDIAN_EVERY]
+            size = 1.4826 * median(part, kept, fine) + 0.3
             out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
             error[t] = size * np.sqrt(max(inverse[2, 2], 0.0))
             if turn == 0:
-                gain = median(values.astype(np.float64), everywhere, fine) / usual
-                bare = np.abs(values - gain * basis[0])
-                bare_size = 1.4826 * median(bare, everywhere, fine) + 0.3
+                for k in range(few):
+                    part[k] = values[k * MEDIAN_EVERY]
+                gain = median(part, everywhere, fine) / usual
+                for k in range(few):
+                    part[k] = abs(values[k * MEDIAN_EVERY] - gain * basis[0, k * MEDIAN_EVERY])
+                bare_size = 1.4826 * median(part, everywhere, fine) + 0.3
                 if bare_size < size:
-                    strays, size = bare, bare_size
+                    size = bare_size
+                    for k in range(count):
+                        strays[k] = abs(values[k] - gain * basis[0, k])
             inside = 0.0
             for k in range(count):
                 keep[k] = 1.0 if strays[k] < 4 * size else 0.0

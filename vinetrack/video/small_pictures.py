@@ -14,13 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.order_kernels import BINS_A_LEVEL, block_means, largest_steps, median, ratio_medians
+from vinetrack.video.order_kernels import (
+    BINS_A_LEVEL,
+    block_means,
+    largest_changes,
+    largest_steps,
+    median,
+    ratio_medians,
+)
 
 SMALL_PX = 240
 """Longest side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide;
 at half a thin vine is lost, at twice time is fourfold."""
 MAX_FRAMES = 150
 """Frames, spread evenly over the changes, in which it is sought. Chosen for time; they resolve 1 % of the growth."""
+BUSIEST_PIXELS = 200
+"""Pixels of a small picture whose mean change is its activity. Chosen: the area of a thin vine's tip; half or twice
+changes only how the MAX_FRAMES frames are spread over the changes."""
 GROWN = 0.4
 """Part of a pixel's change that lasts, times the part by which it stands out at the end, from which growth may have
 brought it. Measured on 40 short tubes beside long doors (`benchmarks/long_doors.py`, seeds 71001-71040) and 40 drawn by
@@ -138,8 +148,7 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     n = len(small)
     if n <= MAX_FRAMES:
         return np.arange(n)
-    change = np.abs(np.diff(small, axis=0))
-    activity = np.partition(change.reshape(n - 1, -1), -20, axis=1)[:, -200:].mean(axis=1)
+    activity = largest_changes(small.reshape(n, -1), BUSIEST_PIXELS)
     floor = float(np.quantile(activity, 0.2))
     busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
     total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
@@ -207,14 +216,18 @@ def _sides(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
     out = [np.zeros_like(picture) for _ in range(4)]
     for share, reach in ((1.0, 1), (1e-2, 4), (1e-4, 16)):
-        size = 2 * min(round(3 * reach * AROUND_PX), max(picture.shape)) + 1
-        whole = cv2.getGaussianKernel(size, reach * AROUND_PX, cv2.CV_32F).ravel()
+        # Wide filters work on a picture that is shrunk by as much as they are wider.
+        height, width = picture.shape
+        shrunk = cv2.resize(picture, (-(-width // reach), -(-height // reach)), interpolation=cv2.INTER_AREA)
+        size = 2 * min(round(3 * AROUND_PX), max(shrunk.shape)) + 1
+        whole = cv2.getGaussianKernel(size, AROUND_PX, cv2.CV_32F).ravel()
         back, ahead = whole.copy(), whole.copy()
         back[size // 2 + 1 :] = ahead[: size // 2] = 0.0
         for side, (along, across) in zip(
             out, ((back, whole), (ahead, whole), (whole, back), (whole, ahead)), strict=True
         ):
-            side += share * cv2.sepFilter2D(picture, -1, along, across, borderType=cv2.BORDER_CONSTANT)
+            seen = cv2.sepFilter2D(shrunk, -1, along, across, borderType=cv2.BORDER_CONSTANT)
+            side += share * (seen if reach == 1 else cv2.resize(seen, (width, height)))
     return out
 
 

@@ -17,6 +17,10 @@ from vinetrack.video.strip import Strip, recut, squared
 MOST_RECUTS = 3
 """Most times that the strip is cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew
 only while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
+FIRST_SLOPE = 0.08
+"""Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or
+columns. Chosen: the strip is 0.3 widths higher than the tube, and the tube's own slope is found in it. Only time
+depends on it."""
 OFF_CENTRE_PX = 0.8
 """Tilt of the axis over its length, or shift, that is left uncorrected: the tip's rows then lag by under a tenth of it.
 Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
@@ -46,7 +50,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
     """
     if front_share_of(axis) < LEAST_FRONT_SHARE:
         return None
-    strip = first = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
+    strip = first = cut_along(luma, squared(axis, FIRST_SLOPE * axis.width_px), 0.65 * axis.width_px + 3)
     tube = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * MOST_RECUTS if axis.bends else MOST_RECUTS):
