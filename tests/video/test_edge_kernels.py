@@ -10,8 +10,7 @@ import pytest
 from vinetrack.video import edge_cover, picture_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
-from vinetrack.video.kymograph import fan_gains
-from vinetrack.video.order_kernels import median
+from vinetrack.video.order_kernels import fan_gains, median
 from vinetrack.video.registration import _pixels, reference_pixels
 from vinetrack.video.resample import sample
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.kymograph import fan_gains, passing_times
+from vinetrack.video.order_kernels import fan_gains, passing_times
 from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 LEAST_FRONT_SHARE = 0.45

@@ -1,4 +1,7 @@
-"""Compiled medians: exact ones of many values whose range is known, by a histogram instead of by sorting."""
+"""Compiled medians by a histogram instead of by sorting, largest changes, and paths through pixels changing in order.
+
+Medians are exact, of many values whose range is known.
+"""
 
 from __future__ import annotations
 
@@ -126,10 +129,9 @@ def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
         for k in range(pixels):
             change[k] = abs(after[k] - before[k])
         # Most pixels change less than those that count: only changes near the last picture's smallest are sorted.
-        found = 0
         while True:
             bins[:], totals[:] = 0, 0.0
-            found = 0
+            counted = 0
             for start in range(0, pixels, 16):
                 block = change[start : start + 16]
                 largest = np.float32(0.0)
@@ -142,8 +144,8 @@ def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
                         place = min(int(value * BINS_A_LEVEL), LEVELS * BINS_A_LEVEL - 1)
                         bins[place] += 1
                         totals[place] += value
-                        found += 1
-            if found >= count:
+                        counted += 1
+            if counted >= count:
                 break
             limit = np.float32(0.0)
         total, taken, place = 0.0, 0, LEVELS * BINS_A_LEVEL - 1
@@ -224,3 +226,77 @@ def block_means(luma: np.ndarray, side: int) -> np.ndarray:
                     block += total[x * side + j]
                 line[x] = np.rint(block * weight)
     return out
+
+
+@njit(cache=True, nogil=True)
+def fan_gains(
+    along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
+) -> np.ndarray:
+    """Sum what monotone paths collect in each band of two bins across parallel lines.
+
+    Parameters
+    ----------
+    along, across : place of each changed pixel along the lines, px, and across in bins, shape (n_pixels,).
+    time, weight : when each changes, counted in pictures, and how much, shape (n_pixels,).
+    bins : bins across.
+    length : of the lines, px; places are 4 px apart.
+    n_times : pictures.
+
+    Returns
+    -------
+    change collected in order, shape (bins − 1,).
+    """
+    places = length // 4 + 1
+    table = np.zeros((bins, n_times, places), np.float32)
+    low, high = np.full((bins, n_times), places), np.full((bins, n_times), -1)
+    for i in range(len(along)):
+        b, t, s = min(max(int(across[i]), 0), bins - 1), int(time[i]), min(max(int(along[i] / 4), 0), places - 1)
+        table[b, t, s] += weight[i]
+        low[b, t], high[b, t] = min(low[b, t], s), max(high[b, t], s)
+    out = np.zeros(bins - 1)
+    best = np.zeros(places + 1)
+    for b in range(bins - 1):
+        best[:] = 0.0
+        for t in range(n_times):
+            last = max(high[b, t], high[b + 1, t]) + 1
+            # `best` never falls along the line: it rises only where something changes now, and on from there.
+            for s in range(min(low[b, t], low[b + 1, t]) + 1, places + 1):
+                if s > last and best[s] >= best[s - 1]:
+                    break
+                best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
+        out[b] = best[-1]
+    return out
+
+
+@njit(cache=True)
+def passing_times(table: np.ndarray) -> np.ndarray:
+    """Find the monotone path that collects most, and when it passes each place.
+
+    Parameters
+    ----------
+    table : change by time and place, shape (n_times, n_places).
+
+    Returns
+    -------
+    time, counted in pictures, shape (n_places,); NaN beyond the ends of the path.
+    """
+    n, places = table.shape
+    best = np.zeros((n, places + 1))
+    came = np.zeros((n, places + 1), np.uint8)
+    for t in range(n):
+        for s in range(places + 1):
+            best[t, s] = best[t - 1, s] if t > 0 else 0.0
+            if s > 0 and best[t, s - 1] + table[t, s - 1] > best[t, s]:
+                best[t, s] = best[t, s - 1] + table[t, s - 1]
+                came[t, s] = 1
+    passed = np.full(places, np.nan)
+    t, s = n - 1, places
+    while s > 0 and t >= 0:
+        if came[t, s] == 1:
+            passed[s - 1] = t
+            s -= 1
+        elif t > 0:
+            t -= 1
+        else:
+            break
+    return passed
