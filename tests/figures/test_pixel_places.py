@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from matplotlib.text import Text
 
-from vinetrack.figures.pixel_places import draw_pixel_places, periodic_error, places_in_pixel
+from vinetrack.figures.pixel_places import draw_pixel_places, periodic_error, subpixel_positions
 
 
 def places(amplitude_px: float, count: int = 4000, seed: int = 971) -> np.ndarray:
@@ -35,8 +35,8 @@ def test_only_sound_moving_frames_of_recordings_count() -> None:
         {"edge_px": [10.25, 11.5, 12.75, np.nan, 14.0], "flag": ["", np.nan, "doubtful", "lost", "after_end"]}
     )
     elsewhere = pd.DataFrame({"edge_px": [np.nan, np.nan], "flag": [np.nan, np.nan]})
-    assert places_in_pixel({"a": filmed, "b": elsewhere}).tolist() == [0.25, 0.5]
-    assert len(places_in_pixel({})) == 0
+    assert subpixel_positions({"a": filmed, "b": elsewhere}).tolist() == [0.25, 0.5]
+    assert len(subpixel_positions({})) == 0
 
 
 @pytest.mark.parametrize(("amplitude_px", "words"), [(0.1, "more than chance"), (0.0, "no more than chance")])

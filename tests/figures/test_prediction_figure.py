@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.figures.prediction_figures import MOST_CURVES, PredictionPicture, draw_predictions
+from vinetrack.figures.prediction_figures import MAX_CURVES, PredictionPicture, draw_predictions
 from vinetrack.figures.style import render
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
@@ -48,7 +48,7 @@ def test_several_conditions_are_told_apart_by_name() -> None:
 
 
 def test_conditions_that_have_no_colour_left_are_counted() -> None:
-    assert "and 2 more, not drawn" in words([picture() for _ in range(MOST_CURVES + 2)])
+    assert "and 2 more, not drawn" in words([picture() for _ in range(MAX_CURVES + 2)])
 
 
 def test_a_tail_that_pushes_is_marked() -> None:

@@ -111,7 +111,7 @@ def test_two_points_of_nearly_one_value_stand_inside_the_axes() -> None:
     assert left.get_xlim()[1] > 1.05 * 20
     assert "N = 2 vines of 1 trial\n" in words(figure)
     assert "no trend: 2 sizes; at least 3" in words(figure)
-    assert "the scatter of replicates is not in it" in words(figure).replace("\n", " ")
+    assert "does not include replicate scatter" in words(figure).replace("\n", " ")
 
 
 def test_single_trials_have_no_standard_error() -> None:
@@ -119,7 +119,7 @@ def test_single_trials_have_no_standard_error() -> None:
     refused = {"refused": "6 conditions; a power of wall with an error takes 7", "n": 6}
     family["trend"] = dict.fromkeys(family["trend"], refused)
     said = words(draw_efficiency({"efficiency": [family]})).replace("\n", " ")
-    assert "N = 1 trial a point" in said
+    assert "N = 1 trial per point" in said
     assert "standard error" not in said
     assert "no trend: 6 conditions" in said
 
@@ -129,7 +129,7 @@ def test_three_ways_to_count_efficiency() -> None:
     assert len(figure.axes) == 6
     assert points(figure, 0)[0][:, 1] == pytest.approx([100 * 0.5 * (t / 100) ** -0.6 for t in (50, 100, 200)])
     assert points(figure, 2)[0][1, 1] == pytest.approx(40.0)
-    assert "34 kPa with 35.6 g, after 150 mm of growth; N = 4 trials a point" in words(figure)
+    assert "34 kPa with 35.6 g, after 150 mm of growth; N = 4 trials per point" in words(figure)
     assert "1 more family in" in words(figure)
     assert "power of the diameter 0.10" in words(figure)
 
@@ -147,7 +147,7 @@ def test_final_speeds_stand_beside_the_model() -> None:
     curves = [curve for curve in ax.lines if curve.get_linewidth() == 1.5 and len(curve.get_xdata()) == 3]
     assert [curve.get_ydata()[0] for curve in curves] == pytest.approx([0.7, 1.4])
     assert words(figure).count("the law") == 1
-    assert "vine0, after 120 mm\nN = 4 trials a point" in words(figure)
+    assert "vine0, after 120 mm\nN = 4 trials per point" in words(figure)
 
 
 def test_vines_with_one_payload_at_each_pressure_are_not_drawn() -> None:
@@ -157,7 +157,7 @@ def test_vines_with_one_payload_at_each_pressure_are_not_drawn() -> None:
 
 def test_without_families_the_figures_say_why() -> None:
     assert "scaled copies" in words(draw_speed_scaling({"steady_speed": []}))
-    assert "one place" in words(draw_efficiency({}))
+    assert "the same length" in words(draw_efficiency({}))
 
 
 FAMILIES = [speed_family([6.0, 12.0, 18.0, 24.0]), speed_family([6.0, 12.0], 30.0)]

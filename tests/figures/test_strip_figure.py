@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Track
-from vinetrack.figures.strip_figure import LARGEST_PX, draw_strip, flagged, shrunk
+from vinetrack.figures.strip_figure import MAX_STRIP_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
 from vinetrack.report.svg import compact_svg
 from vinetrack.video.axis import Axis
@@ -73,7 +73,7 @@ def test_a_frame_without_an_edge_shows_the_picture_alone() -> None:
 def test_large_pictures_are_drawn_small() -> None:
     figure = draw_strip("a", tracking(n_along=1900, height=1200), 1e-3)
     shapes = [image.get_array().shape for ax in axes(figure) for image in ax.images]
-    assert max(size for shape in shapes for size in shape) <= LARGEST_PX
+    assert max(size for shape in shapes for size in shape) <= MAX_STRIP_PX
 
 
 def test_a_smaller_picture_holds_the_means_of_the_larger() -> None:

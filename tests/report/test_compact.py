@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vinetrack.figures.style import BLUE, INK, PAPER, look, render
-from vinetrack.report.svg import circle_diameter, compact_svg, moved, parse_path, recoded, write_path
+from vinetrack.report.svg import circle_diameter, compact_svg, moved, parse_path, recoded_image, write_path
 
 
 def drawn(draw) -> str:  # type: ignore[no-untyped-def]
@@ -125,7 +125,7 @@ def test_images_are_recoded_and_stay_what_they_show() -> None:
     file = io.BytesIO()
     Image.fromarray(noisy).convert("RGBA").save(file, "PNG")
     href = "data:image/png;base64,\n" + base64.b64encode(file.getvalue()).decode()
-    small = recoded(href)
+    small = recoded_image(href)
     assert small.startswith("data:image/webp;base64,")
     assert len(small) < len(href) / 5
     back = np.asarray(Image.open(io.BytesIO(base64.b64decode(small.split(",")[1]))).convert("L"), dtype=float)

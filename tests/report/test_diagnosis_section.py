@@ -20,10 +20,10 @@ from vinetrack.report.build import ReportFigure
 from vinetrack.report.diagnosis_section import (
     DiagnosisResult,
     diagnosis_section,
-    hidden_table,
     law_table,
     moved_table,
     tied_pairs,
+    upper_limit_table,
 )
 from vinetrack.report.diagnosis_section import next_experiment as next_entry
 
@@ -178,14 +178,14 @@ def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() 
 
 def test_what_could_still_hide_is_in_the_unit_of_its_number() -> None:
     row = candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")})
-    table = hidden_table([Candidate.from_json(row)])
+    table = upper_limit_table([Candidate.from_json(row)])
     assert table is not None
     assert table.rows == [("leak", "k", "2.50 kPa")]
     unfitted = candidate("leak", 1.0, numbers=[], largest={"leak.k": 2500.0, "leak.j": 1.0})
-    table = hidden_table([Candidate.from_json(unfitted)], {"leak.k": ("κ", "Pa")})
+    table = upper_limit_table([Candidate.from_json(unfitted)], {"leak.k": ("κ", "Pa")})
     assert table is not None
     assert table.rows == [("leak", "κ", "2.50 kPa"), ("leak", "j", "1.00 SI")]
-    assert hidden_table([Candidate.from_json(candidate("leak", 1.0))]) is None
+    assert upper_limit_table([Candidate.from_json(candidate("leak", 1.0))]) is None
 
 
 def test_candidates_that_cannot_be_tested_here_are_listed_with_the_reason() -> None:
@@ -217,7 +217,7 @@ def test_ties_are_named_most_alike_first() -> None:
 def test_how_the_numbers_moved_stands_side_by_side() -> None:
     table = moved_table(moved())
     assert table is not None
-    assert list(table.head) == ["Number", "initial model", "+ reservoir depletion"]
+    assert list(table.head) == ["Parameter", "initial model", "+ reservoir depletion"]
     assert [list(row) for row in table.rows] == [
         ["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"],
         ["γ", "–", "1.1700 ± 0.0040"],
@@ -233,7 +233,7 @@ def test_the_law_under_every_model_is_by_the_method_that_heads_the_report() -> N
         ("+ reservoir depletion", "v", "0.3700", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
     ]
     assert law_table(None) is None
-    assert "The damping law under every model" in shown(diagnosis(), laws=laws())
+    assert "The damping law with the pressure of every model" in shown(diagnosis(), laws=laws())
 
 
 def test_the_ladder_is_a_table_of_numbers_too() -> None:

@@ -76,7 +76,7 @@ def words(html: str) -> str:
 def test_the_verdict_is_the_root_mean_square_over_conditions_and_names_the_worst() -> None:
     assert verdict(comparison(3.0, 4.0)) == (
         "Over 2 conditions the model is off by 3.54 mm, and replicates scatter by 1.00 mm (root mean square). "
-        "Worst is c1, by 4.00 mm, most of all after 123 mm of growth."
+        "Worst is c1, by 4.00 mm, with the maximum after 123 mm of growth."
     )
 
 
@@ -89,10 +89,10 @@ def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
     assert "c1 4.00 1.00 4.0 0.250 70.0 123" in text
     assert "B v 6.44 ± 0.12 6.200 to 6.680 N·(s/m)ⁿ" in text
     assert "P_y all 3.00 open kPa" in text
-    assert "B 3.0 %; pressure 1.0 %, held" in text
+    assert "B 3.0 %; pressure 1.0 % (fixed)" in text
     assert "v 0.370 0.490 6.44 6.10 5.1" in text
     assert "Not in this fit: b: its leading edge never moves." in text
-    assert "1 rule is broken" in text
+    assert "1 rule for neglecting terms is violated" in text
     assert "Trial a: the tail would have to push." in text
 
 

@@ -8,10 +8,10 @@ import pytest
 from test_report import EVIL, SVG, Tags, page, trials
 
 from vinetrack.report import trials_section as report_trials
-from vinetrack.report.build import LARGEST_CLIP_BYTES, Clip
+from vinetrack.report.build import MAX_CLIP_BYTES, Clip
 from vinetrack.report.svg import inline_svg
 from vinetrack.report.trials_section import (
-    LARGEST_SVG_BYTES,
+    MAX_SVG_BYTES,
     SHARED_ERROR,
     TrackedRecording,
     calibration_table,
@@ -64,7 +64,7 @@ def test_the_calibration_is_listed_with_its_error_and_what_it_rests_on() -> None
 
 
 def test_the_error_of_the_scale_is_said_to_be_apart_from_random_error() -> None:
-    assert "kept apart from the random error" in SHARED_ERROR
+    assert "stated separately from the random error" in SHARED_ERROR
 
 
 def test_recordings_of_one_target_share_a_row_and_its_largest_error() -> None:
@@ -100,27 +100,27 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
     names = ("a", "b", "c")
     recordings = {name: recording() for name in names}
     weight = len(inline_svg(SVG, "s-a", "Strip of a with its tracked edge"))
-    monkeypatch.setattr(report_trials, "PICTURES_BYTES", 2 * weight)
+    monkeypatch.setattr(report_trials, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
     html = page(trials=trials(*names), recordings=recordings)
     assert html.count('aria-label="Strip of') == 2
-    assert "The pictures of 1 trials are left out here" in html
+    assert "The figures of 1 trials are left out here" in html
     assert html.count("4 frames: 1 before release, 1 doubtful") == 3
 
 
 def test_a_clip_beside_the_page_is_linked_and_one_plays_in_it() -> None:
     html = page(clips={"a": "overlays/a.mp4"}, clip=Clip("a", b"film", EVIL, b"frame"))
     assert html.count("data:image/webp;base64,ZnJhbWU=") == 2
-    assert '<a href="overlays/a.mp4">Its clip, beside this page</a>' in html
+    assert '<a href="overlays/a.mp4">Clip (separate file)</a>' in html
     assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
     assert EVIL not in html
 
 
 def test_a_clip_too_large_for_the_page_does_not_play_in_it() -> None:
-    assert "<video" not in page(clip=Clip("a", bytes(LARGEST_CLIP_BYTES + 1), "c"))
+    assert "<video" not in page(clip=Clip("a", bytes(MAX_CLIP_BYTES + 1), "c"))
 
 
 def test_a_strip_too_large_for_the_page_is_left_out() -> None:
-    html = page(recordings={"a": TrackedRecording(SVG + " " * LARGEST_SVG_BYTES, [""])})
+    html = page(recordings={"a": TrackedRecording(SVG + " " * MAX_SVG_BYTES, [""])})
     assert "Strip of a" not in html
 
 

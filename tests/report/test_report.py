@@ -15,7 +15,7 @@ from vinetrack.narrative.law_text import headline, tally, without_law
 from vinetrack.report.build import ReportContent, ReportFigure, ReportSection, ReportTable, build_report
 from vinetrack.report.section import data_uri
 from vinetrack.report.svg import inline_svg
-from vinetrack.report.trials_section import MOST_ROWS, speed_sparkline
+from vinetrack.report.trials_section import MAX_DATA_ROWS, speed_sparkline
 
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
@@ -223,7 +223,7 @@ def test_the_motion_of_a_trial_is_one_click_away_thinned_to_what_is_shown() -> N
     link = next(a for tag, a in Tags(html).tags if tag == "a" and a.get("download") == "a.csv")
     lines = downloaded(link["href"]).splitlines()
     assert lines[0] == "time_s,lead_velocity_m_s"
-    assert 100 < len(lines) <= 1 + MOST_ROWS
+    assert 100 < len(lines) <= 1 + MAX_DATA_ROWS
 
 
 def test_a_section_of_another_room_stands_before_the_trials() -> None:

@@ -1,8 +1,8 @@
-"""The candidates of the diagnosis: their gains, the cosines between them, and parameters that drift with a condition.
+"""Candidates of the diagnosis: their gains, the cosines between them, and parameters that drift with a condition.
 
-Those that the data cannot tell from the best are filled in colour; a hollow bar was predicted from the sensitivities
-and not fitted: then its size is the score in standard deviations. A cosine of 1 means that no analysis of these trials
-can tell two candidates apart, −1 that one is the other with its sign turned.
+Candidates in the answer set are drawn in colour. A hollow bar is a candidate that was not fitted: its length is the
+score in standard deviations. A cosine of 1 means that no analysis of these trials can tell two candidates apart, −1
+that one is the other with opposite sign.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_CANDIDATES = 12
-"""Of a round; chosen: 0.33 in each, 4 in of figure; the table in the report has them all."""
+"""Candidates drawn per round; chosen: 0.33 in each, 4 in of figure; the table in the report has all."""
 
 _ROLES = {
     "answer": ("in the answer set", BLUE),
@@ -44,8 +44,8 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
 
     Parameters
     ----------
-    rounds : of each the question in words, and a table with a row a candidate, best first: `effect, kind, status,
-        delta_chi2, sigma, in_answer_set, plausible, size` (fitted numbers in words, blank where there are none).
+    rounds : for each its question as text, and a table with a row per candidate, best first: `effect, kind, status,
+        delta_chi2, sigma, in_answer_set, plausible, size` (fitted values as text, blank if there are none).
 
     Returns
     -------
@@ -69,7 +69,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
 
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows with a finite gain or score: the answer set first, then by height."""
+    """Rows with a finite gain or score: the answer set first, then by bar length."""
     gain = np.sqrt(np.maximum(table["delta_chi2"].to_numpy(dtype=float), 0.0))
     score = np.abs(table["sigma"].to_numpy(dtype=float))
     # A predicted gain may have the wrong sign of the parameter or too small a noise; the score accounts for both.
@@ -81,7 +81,7 @@ def _drawable(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _role(row: Any) -> str:
-    """Which of `ROLES` a candidate has."""
+    """The key of a candidate in `_ROLES`."""
     if row.in_answer_set:
         return "answer"
     return "measurement" if row.kind == "measurement" else "physical"
@@ -201,15 +201,15 @@ _MODELS = {"before": (BEFORE, "before", -0.06), "after": (AFTER, "after", 0.06)}
 
 
 def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
-    """Draw a parameter's best value in each group of trials over that of the common law, against a condition.
+    """Draw the best value of a parameter in each group of trials, relative to the common law, against a condition.
 
-    A model that lacks nothing leaves all groups at 1.
+    With a complete model all groups are at 1.
 
     Parameters
     ----------
-    groups : one row a group: `model` (`before` or `after`), `parameter, vine, symbol, against, level, ratio,
-        ratio_sigma, n_trials`; SI, `level` NaN where the groups are vines. Panels in order of first appearance.
-    added : the effects that were added, in words.
+    groups : one row per group: `model` (`before` or `after`), `parameter, vine, symbol, against, level, ratio,
+        ratio_sigma, n_trials`; SI, `level` NaN if the groups are vines. Panels in order of first appearance.
+    added : the effects that were added, as text.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""The damping law, as points with both fits of F = B·x_ssⁿ and as its numbers with all their intervals.
+"""The damping law: points with both fits of F = B·x_ssⁿ, and the parameters with all their intervals.
 
-On log axes the law is a straight line of slope n, the same for all vines. Trials that no fit used are hollow.
+On logarithmic axes the law is a straight line of slope n, the same for all vines. Trials not used in a fit are hollow.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TWO_LINE_VINES = 6
 """Chosen: a legend with two lines for each of six vines is 2.5 in high, of 5.6 in of figure; twice as many overflow."""
 
 _MAX_LEGEND_VINES = 14
-"""Chosen: of one line each, with the lines of both methods, they fill the height of the figure; others are counted."""
+"""Chosen: with one line each, and those of both methods, they fill the height of the figure; others are counted."""
 
 
 def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure:
@@ -34,13 +34,13 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure:
 
     Parameters
     ----------
-    points : one row a trial with `trial, vine, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N, used`.
+    points : one row per trial with `trial, vine, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N, used`.
     damping : as in `damping.json`.
 
     Returns
     -------
     Figure
-        One that says why where there is nothing to draw, as of all drawing functions.
+        If there is nothing to draw, it states the reason, as in all drawing functions.
     """
     from matplotlib.figure import Figure
 
@@ -86,7 +86,7 @@ def _draw_points(ax: Axes, group: pd.DataFrame, style: VineStyle) -> None:
 
 
 def _below(sigma: pd.Series, value: pd.Series) -> np.ndarray:
-    """Bars of one standard error below and above; the lower one stays above zero, which log axes cannot show."""
+    """Error bars of one standard error; the lower one ends above zero, which logarithmic axes cannot show."""
     bar = np.nan_to_num(sigma.to_numpy(dtype=float))
     return np.vstack([np.minimum(bar, 0.9 * value.to_numpy(dtype=float)), bar])
 
@@ -165,19 +165,19 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
 _B_KEYS = ("B", "B_95", "B_95_total")
 _OFFSETS = {"log_log": -0.17, "both_axes": 0.17}
 _MAX_VINES = 40
-"""Chosen: at half an inch a vine, 40 make a figure of 22 in, the longest that a page shows whole."""
+"""Chosen: at half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole."""
 
 
 def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
     """Draw n and B with their 95 % intervals, B as deviation from its best estimate.
 
-    Thick bars come from resampling whole trials, or from Student's t where they are too few; thin ones add the stated
-    error of the yield pressure, which all trials of a vine share and no resampling shows.
+    Thick bars come from a bootstrap of whole trials, or from Student's t if they are too few; thin ones add the stated
+    error of the yield pressure, which all trials of a vine share and a bootstrap cannot show.
 
     Parameters
     ----------
     damping : as in `damping.json`.
-    published : numbers drawn beside them: `{"n": …, "B": {vine: …}, "source": …}`; None where there are none.
+    published : published values, drawn too: `{"n": …, "B": {vine: …}, "source": …}`; None for none.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = N
 
 
 def _deviation(value: Any, best_B: float) -> Any:
-    """B, or an interval of it, as deviation from the best estimate in per cent; None stays None."""
+    """B, or its interval, as deviation from the best estimate in per cent; None remains None."""
     if value is None:
         return None
     if isinstance(value, list | tuple):
@@ -243,7 +243,7 @@ def _finish_exponents(left: Axes, right: Axes, best: dict[str, dict[str, Any]]) 
     right.set_yticks(range(len(best)), labels, fontsize=9)
     right.tick_params(axis="y", length=0)
     right.grid(axis="y", visible=False)
-    title = "thick: 95 % by the scatter of trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
+    title = "thick: 95 %, from the scatter of trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
     right.set_title(title, fontsize=9, fontweight="normal")
     left.locator_params(axis="x", nbins=5)
 

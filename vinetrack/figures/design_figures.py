@@ -1,4 +1,4 @@
-"""What a design promises: the conditions of a campaign, the fastest vine, and the pressure that a chamber loses."""
+"""Figures of designs: the conditions of a campaign, the fastest vine, and the pressure loss of a chamber."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def draw_campaign(points: Sequence[PlannedPoint], n_error: float, B_errors: Mapp
 
     Parameters
     ----------
-    points : one a trial.
+    points : one per trial.
     n_error, B_errors : expected standard errors, of B relative and by vine.
 
     Returns
@@ -86,7 +86,7 @@ class FilmChoice:
 
 
 def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
-    """Draw the films side by side: speed against diameter, and how sure the choice is.
+    """Draw the films side by side: speed against diameter, and the certainty of the choice.
 
     Parameters
     ----------
@@ -119,13 +119,13 @@ def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figu
         bars.set_xlim(-0.6, len(films) - 0.4)
         bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
         bars.set_xlabel("film (µm)")
-        bars.set_title("90 % band; how often it is the fastest", fontsize=10, fontweight="normal")
+        bars.set_title("90 % band; percentage of draws in which it is the fastest", fontsize=10, fontweight="normal")
         fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
         fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
     return fig
 
 
-_LEAST_LITRES = 1e-4
+_MIN_LITRE_AXIS = 1e-4
 """Chosen: below 0.1 mL an axis is in millilitres, so that its ticks need no exponent."""
 
 
@@ -140,13 +140,13 @@ class GasLawLoss:
 def draw_reservoir(
     volumes_m3: np.ndarray, laws: Sequence[GasLawLoss], loss: float, swept_m3: float, chosen_m3: float | None
 ) -> Figure:
-    """Draw how much of the gauge pressure a closed chamber loses while a vine grows out of it, against its volume.
+    """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume.
 
     Parameters
     ----------
     volumes_m3 : array, shape (n_volumes,), rising.
     laws : isothermal and adiabatic; the area between the first two is shaded.
-    loss : share of the gauge pressure that may be lost.
+    loss : allowed fraction of the gauge pressure.
     swept_m3 : volume of the grown vine.
     chosen_m3 : volume of the chamber in question; None for none.
 
@@ -156,7 +156,7 @@ def draw_reservoir(
     """
     from matplotlib.figure import Figure
 
-    factor, unit = (1e3, "L") if volumes_m3[0] >= _LEAST_LITRES / 10 else (1e6, "mL")
+    factor, unit = (1e3, "L") if volumes_m3[0] >= _MIN_LITRE_AXIS / 10 else (1e6, "mL")
     with look():
         fig = Figure(figsize=(7.2, 4.4), layout="constrained")
         ax = fig.subplots()

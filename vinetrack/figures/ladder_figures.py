@@ -1,6 +1,6 @@
-"""Errors of the models of the ladder, and the condition that the initial model predicts worst, before and after.
+"""Errors of the models of the ladder, and the condition with the largest error of the initial model, before and after.
 
-Errors fall by factors, so their axis is logarithmic. The scatter of replicates is shaded: below it an error tells
+Errors change by factors, so their axis is logarithmic. The range below replicate scatter is shaded: an error there says
 nothing about the model.
 """
 
@@ -26,17 +26,17 @@ _ERRORS = {
     "rms_left_out_m": ("on left-out conditions", VERMILLION, "s", "-"),
     "rms_highest_pressure_m": ("on the left-out highest pressure", GREEN, "^", DASHED),
 }
-"""Columns of `ladder.csv`: the name of each error, its colour, marker and line."""
+"""Columns of `ladder.csv`, with label, colour, marker and line style."""
 
 _WIDTH_IN = 5.2
-"""Chosen: both figures stand beside each other on a page of 11 in."""
+"""Chosen: both figures fit side by side on a page of 11 in."""
 
 _STEP_IN = 1.55
-"""Of one model of the ladder; chosen: the longest name of an effect, broken after 18 letters of 10 pt."""
+"""Width per model of the ladder; chosen: the longest name of an effect, wrapped at 18 letters of 10 pt."""
 
 
 def draw_ladder(ladder: pd.DataFrame) -> Figure:
-    """Draw the errors of the initial model and of every model after it.
+    """Draw the errors of the initial model and of every further model of the ladder.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def _step_label(step: int, added: Any, partial: Any) -> str:
 
 
 def _error_limits(errors_mm: list[np.ndarray]) -> tuple[float, float]:
-    """From a little below the least to a little above the largest, at least a factor of four."""
+    """Limits around all values with a margin, spanning at least a factor of four."""
     known = np.concatenate(errors_mm)
     known = known[np.isfinite(known) & (known > 0)]
     if not known.size:
@@ -103,23 +103,23 @@ def _draw_floor(ax: Axes, floor_mm: np.ndarray) -> None:
 
 
 def _write_values(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
-    """The numbers beside the points where no line runs, moved apart where they would lie on each other."""
+    """Write the values next to the points, clear of the lines and of each other."""
     low, high = (math.log10(value) for value in ax.get_ylim())
-    apart = 0.075 * (high - low)
+    spacing = 0.075 * (high - low)
     n_steps = len(next(iter(errors_mm.values())))
     for step in range(n_steps):
         shown = [(float(values[step]), _ERRORS[key][1]) for key, values in errors_mm.items() if values[step] > 0]
         shown.sort()
         side, sideways = ("right", -9) if step == 0 and n_steps > 1 else ("left", 9)
-        lifted = 0.6 * apart if 0 < step < n_steps - 1 else 0.0  # lines come from above left and go on to the right
+        lifted = 0.6 * spacing if 0 < step < n_steps - 1 else 0.0  # lines arrive from above left and leave to the right
         levels = [math.log10(value) + lifted for value, _ in shown]
         for i in range(1, len(levels)):
-            levels[i] = max(levels[i], levels[i - 1] + apart)
-        above = max(levels[-1] - (high - apart / 2), 0.0) if levels else 0.0
+            levels[i] = max(levels[i], levels[i - 1] + spacing)
+        excess = max(levels[-1] - (high - spacing / 2), 0.0) if levels else 0.0
         for (value, colour), level in zip(shown, levels, strict=True):
             style: dict[str, Any] = {"color": colour, "fontsize": 9, "fontweight": "bold", "ha": side, "va": "center"}
             ax.annotate(
-                number(value), (step, 10 ** (level - above)), (sideways, 0), textcoords="offset points", **style
+                number(value), (step, 10 ** (level - excess)), (sideways, 0), textcoords="offset points", **style
             )
 
 
@@ -135,12 +135,12 @@ def _ladder_legend(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
 
 
 BEFORE, AFTER = VERMILLION, BLUE
-"""Colours of the model before and after, here and in the clips."""
+"""Colours of the models before and after adding effects, here and in the clips."""
 
 _BEFORE_LINE: Any = (0, (5, 2))
-"""Dashes of five line widths; chosen: a little longer than `DASHED`, since lines of replicates overlap."""
+"""Dashes of five line widths; chosen: slightly longer than `DASHED`, because lines of replicates overlap."""
 _MAX_POINTS = 160
-"""Of one trial; chosen: 160 points on 5 in are one every 2.3 pt, closer than dots of 4.5 pt can be told apart."""
+"""Points per trial; chosen: 160 on 5 in are one per 2.3 pt, closer than dots of 4.5 pt can be distinguished."""
 
 
 def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figure:
@@ -148,10 +148,10 @@ def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figu
 
     Parameters
     ----------
-    title : the condition in words.
+    title : the condition as text.
     trials : `trial, time_s, lead_position_m, model_before_m, model_after_m`, time since release and positions from the
-        origin; `model_after_m` NaN where nothing was added.
-    added : the effects that were added, in words.
+        origin; `model_after_m` is NaN if nothing was added.
+    added : the effects that were added, as text.
 
     Returns
     -------
@@ -189,13 +189,13 @@ def rms_m(trials: pd.DataFrame, model: str) -> float:
 
     Parameters
     ----------
-    trials : one row a point with `trial, time_s, lead_position_m` and the model's positions.
+    trials : one row per point with `trial, time_s, lead_position_m` and the model's positions.
     model : column of the model: `model_before_m` or `model_after_m`.
 
     Returns
     -------
     float
-        Every trial counts alike, as in `comparison.csv`; NaN where the model predicts nothing.
+        All trials have the same weight, as in `comparison.csv`; NaN without a prediction.
     """
     squares = [
         float(np.mean((part["lead_position_m"] - part[model]) ** 2))
@@ -205,7 +205,7 @@ def rms_m(trials: pd.DataFrame, model: str) -> float:
 
 
 def _moving(part: pd.DataFrame) -> pd.DataFrame:
-    """One trial from 6 % of its time before release on, thinned to what a small figure can show."""
+    """One trial, starting before release by 6 % of its duration, thinned for a small figure."""
     end_s = float(part["time_s"].iloc[-1])
     kept = part[part["time_s"] >= -0.06 * end_s]
     return kept.iloc[:: max(len(kept) // _MAX_POINTS, 1)]

@@ -1,6 +1,6 @@
-"""The missing force as learned inside the fit: a curve with its band, or a map with where the trials have been.
+"""The missing force learned within the fit: a curve with its band, or a map with the paths of the trials.
 
-What trials have not visited is left blank: the force there is the prior's and nobody's.
+Regions without trials are left blank: there the force is that of the prior.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Floats
 
 _BAND = 1.96
-"""Standard errors on either side of a 95 % band. Derived: of a normal distribution."""
+"""Half width of a 95 % band in standard errors. Derived: normal distribution."""
 
 _LEVELS, _LABELLED = 11, 5
-"""Shades from nothing to the largest force, and lines with a number. Chosen: a tenth of the largest force can still be
-told apart; more numbers would overlap."""
+"""Shades from zero to the largest force, and labelled contour lines. Chosen: a tenth of the largest force can still be
+distinguished; more labels would overlap."""
 
 
 def draw_learned_force(table: pd.DataFrame) -> Figure:
@@ -32,8 +32,8 @@ def draw_learned_force(table: pd.DataFrame) -> Figure:
 
     Parameters
     ----------
-    table : columns `lead_position_m, tail_velocity_m_s, time_s, pressure_Pa` (NaN where the force does not depend on
-        it), `force_N, sigma_N, trials` (that came near) and `condition`: blank on the grid, else a place along the
+    table : columns `lead_position_m, tail_velocity_m_s, time_s, pressure_Pa` (NaN if the force does not depend on it),
+        `force_N, sigma_N, trials` (number that came near) and `condition`: blank on the grid, else a point along the
         first trial of a condition.
 
     Returns
@@ -69,7 +69,7 @@ def _draw_curve(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variable: str
     ax.axhline(0, color=INK, lw=0.8)
     places = factor * along[variable].to_numpy(float)
     ax.plot(places, np.full(places.size, 0.02), "|", color=MUTED, ms=6, transform=ax.get_xaxis_transform(),
-            label=f"where trials have been, N = {along['condition'].nunique()} conditions")  # fmt: skip
+            label=f"range of the trials, N = {along['condition'].nunique()} conditions")  # fmt: skip
     ax.set(xlabel=words, ylabel="missing force (N)")
     ax.margins(x=0.01)
     ax.figure.legend(loc="outside upper left", ncols=3, fontsize=9)
@@ -101,5 +101,5 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
     ax.set(xlabel=x_words, ylabel=y_words, xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.grid(visible=False)
     if signed:
-        ax.set_title(f"grey: N = {along['condition'].nunique()} conditions", fontsize=9, fontweight="normal",
+        ax.set_title(f"grey: trials, N = {along['condition'].nunique()} conditions", fontsize=9, fontweight="normal",
                      color=MUTED)  # fmt: skip

@@ -1,8 +1,8 @@
-"""Where the model fails: the misfit of every condition along its growth, and the force that it lacks.
+"""Where the model fails: the misfit of every condition along its growth, and the missing force.
 
-Colour says by how much and to which side, in millimetres; numbers stand only where the misfit exceeds what replicates
-explain. Cells fade to nothing with the misfit, so that the page shows through, whatever its colour. A force that is one
-curve against one quantity depends on that quantity.
+Colour shows size and sign of the misfit; numbers, in millimetres, are written only where it exceeds replicate scatter.
+Cells become transparent with decreasing misfit, so that the page shows through, whatever its colour. If the force is a
+single curve against one quantity, it depends on that quantity.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_AHEAD, _BEHIND = BLUE, VERMILLION
+_AHEAD_COLOUR, _BEHIND_COLOUR = BLUE, VERMILLION
 _MAX_ROWS = 48
-"""Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once. Of more those with the largest
-misfit are drawn, and the legend states it."""
+"""Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once. If there are more, those with
+the largest misfit are drawn, and the legend says so."""
 
 _NUMBERED_ROWS = 26
 """Chosen: with more conditions, the figure is scaled down until numbers of 7.5 pt cannot be read."""
@@ -37,10 +37,10 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
 
     Parameters
     ----------
-    table : one row a condition and stretch of growth: `condition_label, n_trials, growth_from, growth_to` (fractions of
-        the way), `misfit_before_m, misfit_after_m` (mean of measured minus model; the latter NaN where nothing was
-        added) and `scatter_m` (by which that mean may be off by chance, one standard error).
-    added : the effects that were added, in words.
+    table : one row per condition and bin of growth: `condition_label, n_trials, growth_from, growth_to` (fractions of
+        the growth), `misfit_before_m, misfit_after_m` (mean of measured minus model; the latter NaN if nothing was
+        added) and `scatter_m` (standard error of that mean from replicate scatter).
+    added : the effects that were added, as text.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
 
 
 def _largest_misfits(table: pd.DataFrame, columns: Sequence[str]) -> list[str]:
-    """Labels of the conditions with the largest misfit, as many as there is room for, in the order of the table."""
+    """Labels of the conditions with the largest misfit, at most `_MAX_ROWS`, in the order of the table."""
     labels = list(dict.fromkeys(table["condition_label"]))
     if len(labels) <= _MAX_ROWS:
         return labels
@@ -98,7 +98,11 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str
         y, misfit_mm = place[row.condition_label], 1e3 * misfit_m
         left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
         depth = min(abs(misfit_mm) / full_mm, 1.0)
-        cell: dict[str, Any] = {"facecolor": _AHEAD if misfit_mm > 0 else _BEHIND, "alpha": 0.85 * depth, "lw": 0}
+        cell: dict[str, Any] = {
+            "facecolor": _AHEAD_COLOUR if misfit_mm > 0 else _BEHIND_COLOUR,
+            "alpha": 0.85 * depth,
+            "lw": 0,
+        }
         ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, **cell))
         beyond = not abs(misfit_m) <= 2 * row.scatter_m  # an unknown scatter (NaN) explains no misfit
         if beyond and len(labels) <= _NUMBERED_ROWS and depth > 0.06:
@@ -111,13 +115,13 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str
 
 
 def _misfit_legend(fig: Figure, words: tuple[str, str], n_columns: int) -> None:
-    """The legend: both colours, then what full colour is and which conditions are shown, blank where all are."""
+    """The legend: both colours, the meaning of full colour, and which conditions are shown (blank if all)."""
     from matplotlib.patches import Patch
 
     full_colour, which = words
     handles = [
-        Patch(facecolor=_AHEAD, alpha=0.85, label="measured is ahead of the model"),
-        Patch(facecolor=_BEHIND, alpha=0.85, label="measured is behind"),
+        Patch(facecolor=_AHEAD_COLOUR, alpha=0.85, label="measured is ahead of the model"),
+        Patch(facecolor=_BEHIND_COLOUR, alpha=0.85, label="measured is behind"),
         Patch(facecolor=MUTED, alpha=0.2, label=full_colour),
     ]
     if which:
@@ -140,12 +144,12 @@ _MAX_FORCE_PANELS = 4
 
 
 def draw_missing_force(table: pd.DataFrame) -> Figure:
-    """Draw the force that is missing.
+    """Draw the missing force.
 
     Parameters
     ----------
-    table : one row a point: `against` (a key of `FORCE_AXES`), `value` (SI), `force_N, sigma_N` (one standard error,
-        NaN where unknown) and `condition`, blank for the mean over all.
+    table : one row per point: `against` (a key of `FORCE_AXES`), `value` (SI), `force_N, sigma_N` (one standard error,
+        NaN if unknown) and `condition`, blank for the mean over all.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Model and measurement, one small panel a condition: positions against time, or what is left against growth."""
+"""Model and measurement, one small panel per condition: positions against time, or residuals against growth."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_PANELS = 60
-"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label. Of more conditions
-those that the model misses by most are drawn, and the title states it."""
+"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label. If there are more
+conditions, those with the largest error are drawn, and the title says so."""
 
 _MAX_POINTS_IN_ALL = 12_000
 """Measured: 12,000 points keep the SVG below a megabyte, with 200 trials too."""
 
 _WIDTH_IN = 11.0
 """Chosen: the width of the page at which letters of 11 pt are as large as its text."""
-_NOTHING = "The model in use was not fitted: there is no prediction to compare with the measurement."
+_NO_FIT = "The model in use was not fitted: there is no prediction to compare with the measurement."
 
 _Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
 
@@ -36,9 +36,9 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
 
     Parameters
     ----------
-    comparison : one row a condition with `condition, condition_label, vine, rms_position_m, ratio`.
+    comparison : one row per condition with `condition, condition_label, vine, rms_position_m, ratio`.
     trajectories : by condition, `trial, time_s, lead_position_m, model_position_m, replicates_mean_m,
-        replicates_sigma_m`, and where effects were added `model_after_m`.
+        replicates_sigma_m`, and, if effects were added, `model_after_m`.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
 
 
 def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw measurement minus model against growth; parameters as for `draw_model_comparison`.
+    """Draw measurement minus model against growth.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def _panels(
     chosen = {row.condition for row in farthest}
     shown = [row for row in known if row.condition in chosen]
     if not shown:
-        return blank(_NOTHING)
+        return blank(_NO_FIT)
     n_columns = page_columns(len(shown), 8)
     n_rows = math.ceil(len(shown) / n_columns)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
@@ -91,7 +91,7 @@ def _panels(
         if draw is _draw_positions and "model_after_m" in trajectories[shown[0].condition]:
             title += "; dashed: this model, full: with the effects that were added"
         if len(known) > len(shown):
-            title += f"; the {len(shown)} of {len(known)} conditions that the model misses by most"
+            title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
         wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
         fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
     return fig
@@ -103,7 +103,7 @@ def _label(ax: Axes, row: Any, n_trials: int, font: float, width_pt: float, draw
     ax.set_title(label, fontsize=size, fontweight="normal", pad=3)
     times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
     words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {n_trials}"
-    # Growth leaves the upper left empty; residuals may go anywhere, and have room made for them below.
+    # The curve of growth leaves the upper left empty; residuals get extra room below.
     x, y, side, height = (0.98, 0.03, "right", "bottom") if draw is _draw_residuals else (0.03, 0.97, "left", "top")
     ax.text(x, y, words, transform=ax.transAxes, ha=side, va=height, fontsize=font - 1.5, color=MUTED)
     ax.tick_params(labelsize=font - 0.5, colors=INK)
@@ -111,7 +111,7 @@ def _label(ax: Axes, row: Any, n_trials: int, font: float, width_pt: float, draw
 
 
 def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
-    """Each trial from a little before model or measurement moves, thinned to what a small panel can show."""
+    """Each trial from shortly before model or measurement moves, thinned for a small panel."""
     parts = []
     for _, part in table.groupby("trial", sort=False):
         time_s, growth_m = (part[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
@@ -154,4 +154,4 @@ def _draw_residuals(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -
         residual_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
         ax.plot(1e3 * part["lead_position_m"], residual_mm, color=colour, lw=0.9)
     low, high = ax.get_ylim()
-    ax.set_ylim(low - 0.35 * (high - low), high)  # room for the words below
+    ax.set_ylim(low - 0.35 * (high - low), high)  # room for the text below

@@ -1,8 +1,8 @@
-"""Frames of a clip: the recording, the tracked edge, and the edges that the model predicts before and after.
+"""Frames of a clip: the recording, the tracked edge, and the edges predicted by the models before and after.
 
-The tracked edge crosses the tube, the predicted ones stand beside it, the earlier model reaching farther out: so all
-stay visible where they agree. A bar above, where no player puts its buttons, says which is which, how far each is off,
-the time, and how much slower than life the clip is.
+The tracked edge crosses the tube and the predicted ones are drawn on both sides of it, that of the earlier model
+farther out, so that all remain visible where they agree. A bar above, clear of the controls of video players, names the
+edges and states the error of each model, the time, and the factor of the slow motion.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
-"""Okabe and Ito's yellow, vermillion and sky blue: told apart by anyone, and on any grey."""
+"""Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey."""
 
 PATH = "#9aa3b0"
-"""Grey of a bent path: the edges stay the only colours."""
+"""Colour of a bent path: grey, so that only edges are coloured."""
 BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
-_LARGEST_ZOOM = 2.0
-"""Pixels of the clip for one of the recording; chosen: beyond twice, single pixels are seen and nothing else is."""
+_MAX_ZOOM = 2.0
+"""Pixels of the clip per pixel of the recording; chosen: a larger zoom only shows single pixels."""
 
-_REACHES = (2.0, 1.4)
-"""Of the edges of the models before and after from the axis, in radii of the tube; chosen: outside the tube and of
-unequal length, so that all edges stay visible where they agree."""
+_MODEL_EDGE_REACH = (2.0, 1.4)
+"""Distance from the axis to which the edges of the models before and after are drawn, in radii of the tube; chosen:
+outside the tube and of unequal length, so that all edges remain visible where they agree."""
 
 
 @dataclass(frozen=True)
 class Edge:
-    """One edge through a clip: its name, its colour, and where it is along the axis in every frame, px (NaN: unseen).
+    """One edge in a clip: its name, its colour, and its position along the axis in every frame, px (NaN: none).
 
-    `off_mm` is how far it lies ahead of the tracked edge in every frame, None for that itself; `by_hand` tells that it
-    is the tracked edge where a person has corrected it.
+    `off_mm` is its distance ahead of the tracked edge in every frame, None for the tracked edge itself; `by_hand` marks
+    the tracked edge at points corrected by hand.
     """
 
     name: str
@@ -57,10 +57,10 @@ class Edge:
 
 @dataclass(frozen=True)
 class ClipView:
-    """What all frames of a clip share.
+    """Layout shared by all frames of a clip.
 
-    `size_px` is width and height of the recording; `mm_per_px` its scale along the axis; `slowed` by how much the clip
-    is slower than life.
+    `size_px` is width and height of the recording; `mm_per_px` its scale along the axis; `slowed` the factor of the
+    slow motion.
     """
 
     title: str
@@ -73,8 +73,8 @@ class ClipView:
 
     @property
     def zoom(self) -> float:
-        """Pixels of the clip for one of the recording."""
-        return min(self.width_px / self.size_px[0], _LARGEST_ZOOM)
+        """Pixels of the clip per pixel of the recording."""
+        return min(self.width_px / self.size_px[0], _MAX_ZOOM)
 
     @property
     def picture_px(self) -> tuple[int, int]:
@@ -87,14 +87,14 @@ def _even(value: float) -> int:
 
 
 def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
-    """One frame of the clip, RGB, shape (height, width, 3), both even.
+    """Draw one frame of the clip, RGB, with even height and width.
 
     Parameters
     ----------
-    view : how the picture is laid out.
+    view : layout of the clip.
     picture : the recording's frame in grey levels, uint8 (see `levels`).
-    frame : its number, which the edges count by.
-    time_ms : since release; NaN where the rate of capture is not known: the frame is written in its place.
+    frame : index of the frame in the edges.
+    time_ms : since release; NaN if the capture rate is unknown; the frame number is then written instead.
     edges : the tracked one first, then those of the models before and after, then that of corrected points.
 
     Returns
@@ -112,7 +112,7 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
     if view.axis.bends:
         _draw_path(pen, view)
-    for edge, reach in (*zip(models, _REACHES, strict=False), *((edge, 0.0) for edge in seen)):
+    for edge, reach in (*zip(models, _MODEL_EDGE_REACH, strict=False), *((edge, 0.0) for edge in seen)):
         _draw_edge(pen, view, edge, frame, reach)
     _scale_bar(pen, view, line_px)
     whole = Image.new("RGB", (width, height + bar_px), BAR)
@@ -132,13 +132,13 @@ def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
 
 
 def _draw_path(pen: ImageDraw, view: ClipView) -> None:
-    """Draw the axis of a vine that bends, thin: a straight one tells itself."""
+    """Draw a thin line along a bent axis; a straight axis is obvious."""
     places = view.axis.points(np.arange(0.0, view.axis.length_px, 3.0))
     pen.line([tuple((place + 0.5) * view.zoom - 0.5) for place in places], fill=PATH, width=1)
 
 
 def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: float) -> None:
-    """Draw across the tube where `reach` is 0, else on both sides of it as far as that."""
+    """Draw an edge across the tube if `reach` is 0, else on both sides of it up to `reach` radii."""
     along = float(edge.along_px[frame])
     if not math.isfinite(along):
         return
@@ -147,14 +147,14 @@ def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: fl
     thick = max(round(view.picture_px[0] / 320), 3)
     for low, high in spans:
         ends = [view.axis.points(np.array(along), across * radius) for across in (low, high)]
-        # Pixel centres lie at whole numbers in the recording, at halves in the clip.
+        # Pixel centres are at integers in the recording, at half-integers in the clip.
         line = [tuple((end + 0.5) * view.zoom - 0.5) for end in ends]
         pen.line(line, fill="black", width=thick + 2)
         pen.line(line, fill=edge.colour, width=thick)
 
 
 def _scale_bar(pen: ImageDraw, view: ClipView, line_px: int) -> None:
-    """A bar of a round length, about a sixth of the picture, in its lower left corner."""
+    """Draw a scale bar of a round length, about a sixth of the picture, in the lower left corner."""
     width, height = view.picture_px
     wanted_mm = width / 6 / view.zoom * view.mm_per_px
     if not math.isfinite(wanted_mm) or wanted_mm <= 0:
@@ -174,7 +174,7 @@ def _scale_bar(pen: ImageDraw, view: ClipView, line_px: int) -> None:
 
 @lru_cache(maxsize=2)
 def _legend(view: ClipView, names: tuple[tuple[str, str], ...], bar_px: int, line_px: int) -> Image:
-    """The part of the bar that never changes; numbers are written over it."""
+    """The constant part of the bar above; numbers are written over it."""
     from PIL import Image, ImageDraw
 
     width = view.picture_px[0]
@@ -216,7 +216,7 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
-    """Grey levels stretched so that `low` is black and `high` white, uint8.
+    """Return grey levels stretched so that `low` is black and `high` white.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""All trials at a glance: speed against growth in small panels, replicates over each other, steady stretches thick.
+"""All trials: speed against growth in small panels, replicates superposed, steady windows thick.
 
-Against growth rather than time, because trials last between milliseconds and seconds but grow about as far. With up to
-60 conditions every condition has a panel with a speed axis of its own, as steady speed rises about as P^2.7; with
-more, every vine has one on a shared logarithmic axis and its trials are coloured by pressure.
+The abscissa is growth rather than time, because trials last between milliseconds and seconds but grow equally far. With
+up to 60 conditions every condition has a panel with its own speed axis, since steady speed rises about as P^2.7; with
+more, every vine has one on a shared logarithmic axis, with trials coloured by pressure.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ MAX_CONDITION_PANELS = 60
 """Chosen: 60 panels in rows of nine are 1.2 in wide, the narrowest that has room for its label."""
 
 MAX_PANELS = 120
-"""Chosen: twelve rows of ten panels; vines beyond are left out, and the title states it."""
+"""Chosen: twelve rows of ten panels; further vines are left out, and the title says so."""
 
 _MAX_POINTS_IN_ALL = 12_000
 """Measured: 12,000 points keep the SVG below a megabyte, with 900 trials too."""
 
-_LEAST_POINTS, _MOST_POINTS = 15, 150
-"""Points of one trial. Chosen: fifteen draw a speed that rises once and stays; a panel shows no more than 150."""
+_MIN_POINTS, _MAX_POINTS = 15, 150
+"""Points per trial. Chosen: fifteen suffice for a speed that rises and stays; a panel shows no more than 150."""
 
 _WIDTH_IN = 11.0
 """Chosen: the width of the page at which letters of 11 pt are as large as its text."""
@@ -54,13 +54,13 @@ class _Curve:
 
 
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw every trial's speed.
+    """Draw the speed of every trial.
 
     Parameters
     ----------
-    trials : one row a trial with `trial, vine, condition, condition_label, pressure_kPa, status, steady_from_s,
+    trials : one row per trial with `trial, vine, condition, condition_label, pressure_kPa, status, steady_from_s,
         steady_to_s`.
-    kinematics : table of each trial that has one, by its name.
+    kinematics : tables by trial, where they exist.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
 
     shown = trials[trials["status"] != "left_out"]
     drawn = [name for name in shown["trial"] if _has_points(kinematics.get(name))]
-    n_points = min(max(_MAX_POINTS_IN_ALL // max(len(drawn), 1), _LEAST_POINTS), _MOST_POINTS)
+    n_points = min(max(_MAX_POINTS_IN_ALL // max(len(drawn), 1), _MIN_POINTS), _MAX_POINTS)
     curves = {name: _curve(kinematics[name], n_points) for name in drawn}
     if not curves:
         return blank("No trial has positions from which a speed could be computed.")
@@ -107,7 +107,7 @@ def _has_points(table: pd.DataFrame | None) -> bool:
 
 
 def _curve(table: pd.DataFrame, n_points: int) -> _Curve:
-    """One trial's curve, thinned to what a small panel can show."""
+    """One trial's curve, thinned for a small panel."""
     position_m = table["lead_position_m"].to_numpy(dtype=float)
     step = max(len(table) // n_points, 1)
     return _Curve(
@@ -175,7 +175,7 @@ def _draw_panel(ax: Axes, panel: _Panel, curves: Mapping[str, _Curve], colours: 
 
 
 def _limit_speed(ax: Axes, curves: Sequence[_Curve], logarithmic: bool = False) -> None:
-    """Limits that one wild value cannot spoil: the fastest percent of points may leave the panel."""
+    """Set limits that are robust to outliers: the fastest per cent of points may lie outside the panel."""
     if not curves:
         ax.set_yticks([])
         return
@@ -195,7 +195,7 @@ def _moves(curve: _Curve) -> bool:
 
 
 def _title(trials: pd.DataFrame, curves: Mapping[str, _Curve], n_panels: int, by_condition: bool) -> str:
-    what = "one panel a condition, each with its own speed axis" if by_condition else "one panel a vine"
+    what = "one panel per condition, each with its own speed axis" if by_condition else "one panel per vine"
     missing = len(trials) - len(curves)
     lines = f"{len(curves)} {'trial' if len(curves) == 1 else 'trials'}, {what}; thick: steady by the gated rule"
     if missing:

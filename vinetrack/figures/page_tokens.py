@@ -1,4 +1,4 @@
-"""Colours of pages that follow a light or a dark screen, and which of them stands for which colour of a figure."""
+"""Colours of pages with a light and a dark scheme, and their mapping from the colours of figures."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ TOKENS = {
     VERMILLION.lower(): "--vermillion",
     GREEN.lower(): "--green",
 }
-"""Custom property of a page's style sheet by colour of a figure; purple, sky and orange are seen on either screen."""
+"""CSS custom property by colour of a figure; purple, sky and orange are visible in either scheme."""
 
 
 def page_tokens() -> str:
-    """CSS that gives the properties their values on a light and on a dark screen."""
+    """Return CSS with the values of the properties in the light and the dark scheme."""
     return Path(__file__).with_name("page_tokens.css").read_text(encoding="utf-8")
 
 
 def page_frame() -> str:
-    """CSS of local pages: the properties of `page_tokens`, and what frames a page, its heading and its cards."""
+    """Return CSS of local pages: the properties of `page_tokens`, and the style of page, heading and cards."""
     return page_tokens() + Path(__file__).with_name("page_frame.css").read_text(encoding="utf-8")
 
 
 def follows_screen(colour: str) -> str:
-    """CSS of a figure's colour, where a page may change it.
+    """Return the CSS of a figure's colour, as a property if the page may change it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Panels, axes and legends as all figures have them."""
+"""Panels, axes and legends common to all figures."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 _CHARACTERS_PER_IN = 12.5
-"""Chosen: the mean character of DejaVu Sans at 10 pt is 4.7 pt wide, 15 an inch; a sixth is left for wide letters."""
+"""Chosen: the mean character of DejaVu Sans at 10 pt is 4.7 pt wide, 15 per inch; a sixth is margin for wide ones."""
 
 _HEADROOM = 1.08
 """Chosen: axes that begin at zero end 8 % above the largest value, so that no marker of 6 pt is cut."""
 
 
 def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list[Axes]:
-    """Divide a figure into rows of panels and hide those that are not needed.
+    """Divide a figure into rows of panels and hide the surplus ones.
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list
 
 
 def page_columns(n_panels: int, most: int) -> int:
-    """Return how many of these panels stand in a row, so that the page is about 1.3 times as high as it is wide.
+    """Return the number of panels per row with which the page is about 1.3 times as high as wide.
 
     Parameters
     ----------
     n_panels : panels of the figure.
-    most : panels in a row at most.
+    most : maximum per row.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def page_columns(n_panels: int, most: int) -> int:
 
 
 def panel_font(n_columns: int) -> float:
-    """Return the size of letters in panels of a page of 11 inches, pt: the narrower the panel, the smaller.
+    """Return the font size in panels of a page of 11 inches, smaller for narrower panels.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def panel_font(n_columns: int) -> float:
 
 
 def line_key(label: str, **style: Any) -> Line2D:
-    """Return an entry of a legend: a line or a marker that stands for what was drawn.
+    """Return a legend entry with a line or a marker.
 
     Parameters
     ----------
@@ -109,13 +109,13 @@ def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: 
 
 
 def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) -> float:
-    """Return the font size at which a text fits a width, at most `largest`, pt: names come as long as people make them.
+    """Return the font size at which a text fits a width, at most `largest`, pt.
 
     Parameters
     ----------
     text : one line.
-    width_pt : the room there is.
-    largest : font size at most, pt.
+    width_pt : available width.
+    largest : maximum font size, pt.
     bold : whether the text is bold.
 
     Returns
@@ -131,12 +131,12 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
 
 
 def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
-    """Put the legend over the axes, where no datum can lie under it; keywords as of `Axes.legend`.
+    """Put the legend above the axes, where it covers no data.
 
     Parameters
     ----------
     ax : whose legend it is.
-    n_columns : entries beside each other.
+    n_columns : columns of entries.
     keywords : of `Axes.legend`; `handles` replace those of the axes.
     """
     handles, labels = ax.get_legend_handles_labels()
@@ -156,11 +156,11 @@ def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
 
 
 def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence under the whole figure, wrapped to its width; nothing where it is blank.
+    """Put a sentence below the figure, wrapped to its width; nothing if it is blank.
 
     Parameters
     ----------
-    fig : below whose panels it stands.
+    fig : the figure.
     note : one or more sentences; blank for none.
     """
     if note:
@@ -168,9 +168,9 @@ def note_below(fig: Figure, note: str) -> None:
 
 
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end a little above all that is drawn, however near to each other the values are.
+    """Let the axes begin at zero and end slightly above the largest value.
 
-    A margin in proportion to the range of the data would vanish where two points of nearly one value are all there is.
+    A margin in proportion to the range of the data would vanish for two points of nearly equal value.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def counted(low: int, high: int, noun: str) -> str:
 
 
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
-    """Write ticks of logarithmic axes as plain numbers, so that less than a decade still has readable values.
+    """Label logarithmic axes with plain numbers, readable even within less than a decade.
 
     Parameters
     ----------
@@ -221,6 +221,6 @@ def plain_log_ticks(ax: Axes, which: str = "both") -> None:
 
 
 def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
-    """Limits a factor two apart or more: a single point must not fill the figure with its error bars."""
+    """Widen limits to a factor of two at least: a single point must not fill the figure with its error bars."""
     middle = math.sqrt(low * high)
     return min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))

@@ -1,4 +1,4 @@
-"""The paper's figures and Table II in our drawing, with what was left out of Eq. (2)."""
+"""The paper's figures and Table II redrawn, with the consequences of terms neglected in Eq. (2)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DAMPING_PANELS = (
-    ("paper", "x_ss_paper_m_s", "force_paper_N", "eligible", "The published rule to the letter"),
+    ("paper", "x_ss_paper_m_s", "force_paper_N", "eligible", "The literal published rule"),
     ("both_axes", "x_ss_m_s", "force_N", "used", "Weight in the force, gated windows, errors on both axes"),
 )
 
@@ -113,21 +113,21 @@ _BANDS = (
     ("depletion_slow", "depletion_fast", ORANGE, "chamber not refilled,\nisothermal to adiabatic"),
     ("depletion_slow_slack", "depletion_fast_slack", PURPLE, "both"),
 )
-_POINTS = 40
+_MAX_MEAN_POINTS = 40
 """Chosen: circles of 3.2 pt along 3 in of panel touch each other where there are more than 70."""
 
-_SHOWN = 1.9
+_MAX_DURATION_RATIO = 1.9
 """Chosen: panels end at 1.9 times the duration of Eq. (2); slower motions are cut off."""
 
 
 def draw_paper_position(
     motions: pd.DataFrame, means: pd.DataFrame, errors: pd.DataFrame, printed_cm: Mapping[int, float]
 ) -> Figure:
-    """Draw the leading edge at three pressures (Fig. 4), with what departures from Eq. (2) would change.
+    """Draw the leading edge at three pressures (Fig. 4), with the consequences of departures from Eq. (2).
 
     Parameters
     ----------
-    motions : `pressure_kPa, departure, time_s, lead_position_m`; `departure` is `eq2` or what is added to it.
+    motions : `pressure_kPa, departure, time_s, lead_position_m`; `departure` is `eq2` or the term added to it.
     means : `pressure_kPa, time_s, lead_position_m, lead_position_sigma_m, n_trials`, since release; may be empty.
     errors : `pressure_kPa, rms_mean_m`; may be empty.
     printed_cm : published root mean square by pressure in kPa.
@@ -149,7 +149,9 @@ def draw_paper_position(
             curves = {str(name): part for name, part in at_pressure.groupby("departure", sort=False)}
             _draw_departures(ax, curves)
             _draw_mean(ax, means[means["pressure_kPa"] == pressure_kPa])
-            ax.set(xlabel="time since release (s)", xlim=(0, _SHOWN * float(curves["eq2"]["time_s"].iloc[-1])))
+            ax.set(
+                xlabel="time since release (s)", xlim=(0, _MAX_DURATION_RATIO * float(curves["eq2"]["time_s"].iloc[-1]))
+            )
             rms_m = errors.loc[errors["pressure_kPa"] == pressure_kPa, "rms_mean_m"]
             ours = f"ours {100 * float(rms_m.iloc[0]):.2f} cm" if len(rms_m) else "not among the trials"
             ax.set_title(
@@ -162,7 +164,7 @@ def draw_paper_position(
 
 
 def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:
-    """Eq. (2), and the bands and the line of what departs from it; bands are filled between equal positions."""
+    """Draw Eq. (2) and departures from it as bands and a line; bands are filled between equal positions."""
     for slow, fast, colour, label in _BANDS:
         position_cm = np.linspace(0, 28, 200)
         first, last = (_time_at(curves[name], position_cm) for name in (slow, fast))
@@ -183,7 +185,7 @@ def _draw_departures(ax: Axes, curves: Mapping[str, pd.DataFrame]) -> None:
 
 
 def _time_at(curve: pd.DataFrame, position_cm: np.ndarray) -> np.ndarray:
-    """When a motion passes each place; where it never gets, the place is put at the end of time."""
+    """Times at which a motion passes each position; 1000 s for positions that it does not reach."""
     time_s, grown_cm = curve["time_s"].to_numpy(float), 100 * curve["lead_position_m"].to_numpy(float)
     when = np.interp(position_cm, grown_cm, time_s)
     return np.where(position_cm <= grown_cm.max() + 1e-9, when, 1e3)
@@ -192,7 +194,7 @@ def _time_at(curve: pd.DataFrame, position_cm: np.ndarray) -> np.ndarray:
 def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
     if not len(mean):
         return
-    part = mean.iloc[:: max(len(mean) // _POINTS, 1)]
+    part = mean.iloc[:: max(len(mean) // _MAX_MEAN_POINTS, 1)]
     time_s, position_cm, sigma_cm = (
         part["time_s"].to_numpy(float),
         100 * part["lead_position_m"].to_numpy(float),
@@ -213,7 +215,7 @@ def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
 
 
 def draw_paper_reservoir(pressures: pd.DataFrame) -> Figure:
-    """Draw the gauge pressure left in the chamber while the largest vine grows, if nothing refills it.
+    """Draw the gauge pressure left in the chamber while the largest vine grows, if it is not refilled.
 
     Parameters
     ----------
@@ -266,7 +268,7 @@ _DEPARTURES = (
     ("tail that cannot push", "slack", "slack", GREEN),
     ("both", "depletion_slow_slack", "depletion_fast_slack", PURPLE),
 )
-_LEAST_RMS = 0.01
+_MIN_RMS = 0.01
 """Chosen: 0.1 mm and 1 cm/s, a hundredth of the printed errors; smaller ones are not drawn on the logarithmic axis."""
 
 
@@ -320,12 +322,12 @@ def _draw_rms_panel(ax: Axes, printed: dict[int, float], ours: dict[int, float],
         low, high = (
             np.array([_departure_size(departures, kPa, name) for kPa in printed]) for name in (low_name, high_name)
         )
-        shown = high >= _LEAST_RMS
-        middle = np.sqrt(np.maximum(low, _LEAST_RMS) * np.maximum(high, _LEAST_RMS))
+        shown = high >= _MIN_RMS
+        middle = np.sqrt(np.maximum(low, _MIN_RMS) * np.maximum(high, _MIN_RMS))
         ax.errorbar(
             (places + 0.15 * k)[shown],
             middle[shown],
-            yerr=[(middle - np.maximum(low, _LEAST_RMS))[shown], (high - middle)[shown]],
+            yerr=[(middle - np.maximum(low, _MIN_RMS))[shown], (high - middle)[shown]],
             fmt="_",
             color=colour,
             ms=11,

@@ -1,7 +1,7 @@
-"""Where edges fall within a pixel: an estimate that is drawn to whole or half pixels gathers there (pixel locking).
+"""Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or half pixels.
 
-Edges of many frames fall anywhere within a pixel, one place as often as another. A periodic error ε = −A sin 2πy of a
-place y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the length πA.
+Without a bias the edges of many frames are distributed uniformly within a pixel. A periodic error ε = −A sin 2πy at the
+position y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the modulus πA.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Floats
 
-FEWEST_PLACES = 100
-"""Edges from which a histogram is drawn. Chosen: ten in each bin; a locking of 0.05 px is then told from chance. At
-half one of 0.08 px is, at twice one of 0.04 px."""
+MIN_EDGES = 100
+"""Minimum number of edges for a histogram. Chosen: ten in each bin; a locking of 0.05 px is then significant. At half
+one of 0.08 px is, at twice one of 0.04 px."""
 BINS = 10
-"""Bins of a pixel. Chosen: locking has one or two humps a pixel; half would hide the second."""
+"""Bins of a pixel. Chosen: locking has one or two humps per pixel; half would hide the second."""
 
 
-def places_in_pixel(tracks: Mapping[str, pd.DataFrame]) -> Floats:
-    """Gather where the edges of all sound moving frames fall within a pixel.
+def subpixel_positions(tracks: Mapping[str, pd.DataFrame]) -> Floats:
+    """Return the positions of the edges of all unflagged frames within their pixel.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def places_in_pixel(tracks: Mapping[str, pd.DataFrame]) -> Floats:
 
     Returns
     -------
-    shape (n_places,), px, 0 to 1: the fraction of `edge_px`, which counts along the axis.
+    array, shape (n_edges,), px, 0 to 1: the fractional part of `edge_px`.
     """
     parts = [np.zeros(0)]
     for track in tracks.values():
@@ -47,27 +47,27 @@ def places_in_pixel(tracks: Mapping[str, pd.DataFrame]) -> Floats:
     return np.concatenate(parts)
 
 
-def periodic_error(places_px: Floats) -> tuple[float, float]:
-    """Find the error that repeats with every pixel.
+def periodic_error(subpixel_px: Floats) -> tuple[float, float]:
+    """Estimate the error that is periodic with one pixel.
 
     Parameters
     ----------
-    places_px : within a pixel, shape (n_places,), px.
+    subpixel_px : position within a pixel, shape (n_edges,), px.
 
     Returns
     -------
-    its amplitude, and the one that chance alone exceeds once in twenty, px (Rayleigh: √(ln 20 / n) / π).
+    amplitude, px, and its 5 % critical value under uniformity (Rayleigh test: √(ln 20 / n) / π).
     """
-    length = abs(np.mean(np.exp(2j * np.pi * places_px)))
-    return float(length) / math.pi, math.sqrt(math.log(20) / len(places_px)) / math.pi
+    length = abs(np.mean(np.exp(2j * np.pi * subpixel_px)))
+    return float(length) / math.pi, math.sqrt(math.log(20) / len(subpixel_px)) / math.pi
 
 
-def draw_pixel_places(places_px: Floats) -> Figure:
-    """Draw how often edges fall into each tenth of a pixel, with what chance makes of an even share.
+def draw_pixel_places(subpixel_px: Floats) -> Figure:
+    """Draw the histogram of edges within a pixel, with the two-standard-deviation band of a uniform distribution.
 
     Parameters
     ----------
-    places_px : within a pixel, shape (n_places,), px.
+    subpixel_px : position within a pixel, shape (n_edges,), px.
 
     Returns
     -------
@@ -75,22 +75,22 @@ def draw_pixel_places(places_px: Floats) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    count = len(places_px)
+    count = len(subpixel_px)
     even = count / BINS
-    spread = 2 * math.sqrt(even * (1 - 1 / BINS))
-    amplitude, chance = periodic_error(places_px)
-    told = "more than chance" if amplitude > chance else "no more than chance"
+    half_width = 2 * math.sqrt(even * (1 - 1 / BINS))
+    amplitude, chance = periodic_error(subpixel_px)
+    comparison = "more than chance" if amplitude > chance else "no more than chance"
     with look():
         fig = Figure(figsize=(6.6, 3.6), layout="constrained")
         ax = fig.subplots()
-        ax.hist(places_px, bins=BINS, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
-        ax.axhspan(even - spread, even + spread, color=MUTED, alpha=0.25, lw=0)
+        ax.hist(subpixel_px, bins=BINS, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
+        ax.axhspan(even - half_width, even + half_width, color=MUTED, alpha=0.25, lw=0)
         ax.axhline(even, color=MUTED, ls=DASHED)
-        ax.set(xlabel="place within a pixel (px)", ylabel="edges", xlim=(0, 1))
+        ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1))
         ax.set_title(f"N = {count} frames", loc="left")
         note_below(
             fig,
-            f"An error that repeats with every pixel has an amplitude of {number(amplitude, 2)} px, {told}: "
-            f"{number(chance, 2)} px would be exceeded once in twenty.",
+            f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
+            f"{number(chance, 2)} px are exceeded by chance in 5 % of cases.",
         )
     return fig

@@ -1,7 +1,7 @@
-"""What a campaign can see: probability of finding each candidate over its size, as a map.
+"""Detection power of a campaign: the probability of finding each effect against its size, as a map.
 
-A row an effect, a column a size as a part of the largest plausible one; the sizes found with 50 and 90 % stand behind
-the row in the unit of the effect.
+One row per effect; columns are sizes relative to the largest plausible one. The sizes found with 50 and 90 % are listed
+at the end of each row in the unit of the effect.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.power import EffectPower, Power
 
-LEAST_PART, MOST_PART, COLUMNS = 1e-4, 3.0, 108
-"""Range of sizes as parts of the largest plausible one, and columns of the map. Chosen: effects that trials show at a
-ten-thousandth of what is plausible need no finer account, and beyond three times it no diagnosis counts a size; 24
-columns a decade make a 10 % step."""
+MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS = 1e-4, 3.0, 108
+"""Range of sizes relative to the largest plausible one, and columns of the map. Chosen: no detail is needed below a
+ten-thousandth of it, and no diagnosis accepts a size beyond three times it; 24
+columns per decade make a 10 % step."""
 
-_COLUMNS_AT = (0.0, 0.35, 0.7)
-"""Places of the columns of sizes, as parts of their width. Chosen: numbers with the longest unit do not meet."""
+_TEXT_COLUMN_X = (0.0, 0.35, 0.7)
+"""Abscissae of the columns of sizes, relative to their width. Chosen: numbers with the longest unit do not touch."""
 
 _ROW_IN, _WIDTH_IN = 0.31, 9.6
-"""Chosen: one line of 10 pt a row; a map of 4 in between names and sizes."""
+"""Chosen: one line of 10 pt per row; a map of 4 in between names and sizes."""
 
 
 def draw_power(power: Power) -> Figure:
-    """Draw the probability with which each effect is found over its size.
+    """Draw the probability with which each effect is found, against its size.
 
     Parameters
     ----------
@@ -47,8 +47,8 @@ def draw_power(power: Power) -> Figure:
 
     entries = sorted(power.effects, key=_order)
     if not entries or power.wary:
-        return blank(f"What these trials could have seen is not worked out: {power.wary or 'no candidate acts here'}.")
-    parts = np.geomspace(LEAST_PART, MOST_PART, COLUMNS)
+        return blank(f"What these trials could have seen was not computed: {power.wary or 'no candidate acts here'}.")
+    parts = np.geomspace(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS)
     probabilities = np.array(
         [
             [entry.probability_at(entry.zero + part * (entry.largest - entry.zero)) for part in parts]
@@ -57,24 +57,24 @@ def draw_power(power: Power) -> Figure:
     )
     with look():
         fig = Figure(figsize=(_WIDTH_IN, _ROW_IN * len(entries) + 1.75), layout="constrained")
-        ax, told = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
-        edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, COLUMNS + 1)
+        ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
+        edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, N_COLUMNS + 1)
         mesh = ax.pcolormesh(
             edges, np.arange(len(entries) + 1) - 0.5, probabilities, cmap=_colours(), vmin=0, vmax=1, rasterized=True
         )
         _mark_rows(ax, entries)
-        _list_sizes(told, entries)
+        _list_sizes(sizes, entries)
         bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
         bar.set_label("probability of finding it (%)")
         bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
         bar.outline.set_visible(False)
         trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
-        ax.set_title(f"What {trials} can show", loc="left", pad=26)
+        ax.set_title(f"What {trials} can detect", loc="left", pad=26)
     return fig
 
 
 def _order(entry: EffectPower) -> float:
-    """Effects that are seen at the smallest part of their plausible sizes first."""
+    """Sort key: effects found at the smallest fraction of their plausible size first."""
     return abs((entry.size_at(0.9) - entry.zero) / (entry.largest - entry.zero))
 
 
@@ -85,14 +85,14 @@ def _colours() -> Any:
 
 
 def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
-    """Names to the left, and a line at what is plausible."""
+    """Label the rows, and draw a line at the largest plausible size."""
     ax.set_xscale("log")
-    ax.set_xlim(LEAST_PART, MOST_PART)
+    ax.set_xlim(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE)
     ax.set_ylim(len(entries) - 0.5, -0.5)
     ax.grid(visible=False)
-    ax.set_xlabel("size, as part of the largest plausible")
+    ax.set_xlabel("size relative to the largest plausible")
     ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
-    # White beneath the dots: ink alone is not seen on the dark of what is found.
+    # A white line below the dots keeps them visible on the dark part of the map.
     ax.axvline(1.0, color="white", linewidth=2.2)
     ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
     ax.set_yticks(range(len(entries)), [f"{plain(entry.effect)}, {entry.symbol}" for entry in entries])
@@ -102,13 +102,13 @@ def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
 
 
 def _list_sizes(ax: Axes, entries: list[EffectPower]) -> None:
-    """Sizes beside the rows of the map, in the unit of each effect; grey beyond what is plausible."""
+    """Write sizes next to the rows of the map, in the unit of each effect; grey beyond the plausible range."""
     ax.set_axis_off()
     ax.set_ylim(len(entries) - 0.5, -0.5)
     ax.set_xlim(0, 1)
     for row, entry in enumerate(entries):
-        for column, value in zip(_COLUMNS_AT, (entry.size_at(0.5), entry.size_at(0.9), entry.largest), strict=True):
-            beyond = column == _COLUMNS_AT[-1] or abs(value - entry.zero) > abs(entry.largest - entry.zero)
+        for column, value in zip(_TEXT_COLUMN_X, (entry.size_at(0.5), entry.size_at(0.9), entry.largest), strict=True):
+            beyond = column == _TEXT_COLUMN_X[-1] or abs(value - entry.zero) > abs(entry.largest - entry.zero)
             ax.text(column, row, size_text(entry, value), va="center", fontsize=9, color=MUTED if beyond else INK)
-    for column, words in zip(_COLUMNS_AT, ("found\n50 %", "found\n90 %", "largest\nplausible"), strict=True):
+    for column, words in zip(_TEXT_COLUMN_X, ("found\n50 %", "found\n90 %", "largest\nplausible"), strict=True):
         ax.text(column, -0.65, words, va="bottom", fontsize=9, color=INK)

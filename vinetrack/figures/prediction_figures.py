@@ -1,4 +1,4 @@
-"""Simulated motions: what vines not yet built will do, and what one effect changes."""
+"""Simulated motions: predictions for vines not yet built, and the change by one effect."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOST_CURVES = len(VINE_COLOURS)
-"""As many as there are colours."""
+MAX_CURVES = len(VINE_COLOURS)
+"""Derived: the number of colours."""
 _PREDICTION_WIDTH_IN = 9.6
 """Chosen: two panels of 4 in with their labels."""
 
@@ -26,7 +26,7 @@ _LOG_AXIS_RATIO = 6.0
 """Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis; then it is
 logarithmic, that of time from 1 % of the fastest on."""
 
-_SLACK = 0.01
+_NEGLIGIBLE_COMPRESSION = 0.01
 """Chosen: compression in the tail below 1 % of the largest tension is rounding of the simulation and gets no note."""
 
 
@@ -51,7 +51,7 @@ class PredictionPicture:
 
 
 def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
-    """Draw one condition with the uncertainty budget of its final speed, or several conditions over each other.
+    """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) 
     """
     from matplotlib.figure import Figure
 
-    drawn = pictures[:MOST_CURVES]
+    drawn = pictures[:MAX_CURVES]
     with look():
         fig = Figure(figsize=(_PREDICTION_WIDTH_IN, 7.2))
         axes = fig.subplots(2, 2)
@@ -107,7 +107,7 @@ def _draw_curves(axes: np.ndarray, picture: PredictionPicture, colour: str) -> N
 
 
 def _longest(*times_ms: np.ndarray) -> float:
-    """The time axis: to the end of the slow side, but no more than four times that of the median."""
+    """End of the time axis: that of the slow limit, but at most four times that of the median."""
     ends = [float(np.max(t[np.isfinite(t)], initial=0.0)) for t in times_ms]
     return min(ends[2], 4 * ends[1]) if ends[1] > 0 else ends[0] or 1.0
 
@@ -129,7 +129,7 @@ def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_f
     lows, highs = zip(
         *((p.curve["tension_low_90_N"].min(), p.curve["tension_high_90_N"].max()) for p in drawn), strict=True
     )
-    if min(lows) < -_SLACK * max(highs):
+    if min(lows) < -_NEGLIGIBLE_COMPRESSION * max(highs):
         tension.axhline(0.0, color=INK, lw=0.8)
         tension.set_title(
             "below 0 the model predicts compression in the tail", fontsize=9.5, fontweight="normal", color=MUTED
@@ -142,7 +142,7 @@ def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_f
 
 
 def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
-    """Bars of the final speed: all uncertainties, then each alone."""
+    """Bars of the final speed: with all uncertainties, then with each alone."""
     low, median, high = picture.final
     rows = [("all inputs", low, high), *picture.shares]
     for k, (_, start, stop) in enumerate(rows):
@@ -161,12 +161,12 @@ def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
 
 
 def _folded(name: str) -> str:
-    """A name in lines of 15 letters; long names of effects are parted at their underscores."""
+    """Wrap a name at 15 letters; long names of effects are split at underscores."""
     return textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15)
 
 
 def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
-    """Name the condition of each colour, in place of the bars."""
+    """List the condition of each colour, instead of the bars."""
     ax.set_axis_off()
     lines = [(colour, picture.title) for colour, picture in zip(VINE_COLOURS, pictures, strict=False)]
     for k, (colour, words) in enumerate(lines):
@@ -187,7 +187,7 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     Parameters
     ----------
     name : of the effect.
-    size : its parameters as text, such as `C_D = 1`; blank where it has none.
+    size : its parameters as text, such as `C_D = 1`; blank if it has none.
     vine : the vine and the trial as text.
     table : columns as of `vinetrack.dynamics.effect_motion.effect_motion`.
 
@@ -223,7 +223,7 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
 
 
 def _bulk_limits(table: pd.DataFrame) -> tuple[float, float]:
-    """From 0 past the bulk of both curves: the jump of a first frame or of a diverging end would hide them."""
+    """Limits from 0 to above the 99th percentile, since a jump at the start or a divergence would hide the rest."""
     speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
     top = 1.15 * float(np.quantile(speeds, 0.99))
     return min(0.0, 1.15 * float(np.quantile(speeds, 0.01))), top if top > 0 else 1.0

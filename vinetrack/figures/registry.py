@@ -1,8 +1,8 @@
 """Every figure of a results folder, declared once: file name, label, title, section of the report, data and drawing.
 
-The workflow asks for the files, its report for label, category and caption, the figures stage for the drawing, and
-the page for title, caption and data. A new figure is an entry of `FIGURES`, an entry of `_drawing` and a caption
-`<name>.rst` in `CAPTIONS` (in files, because Snakemake's report reads captions from files). Imports no matplotlib.
+The workflow uses the file names, its report label, category and caption, the figures stage the drawing function, and
+the page title, caption and data. A new figure is an entry of `FIGURES`, an entry of `_drawing` and a caption
+`<name>.rst` in `CAPTIONS` (files, because Snakemake's report reads captions from files). Does not import matplotlib.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CAPTIONS = Path(__file__).parents[1] / "report" / "captions"
-"""Folder of the captions; Snakemake would look for a relative one beside the file of the rule."""
+"""Folder of the captions; absolute, because Snakemake resolves relative paths from the file of the rule."""
 
 _CATEGORIES = {
     "damping": "Experiment",
     "model": "Experiment",
     "trials": "Trials",
-    "paper": "Beside the paper",
+    "paper": "Comparison with the paper",
     "power": "Power",
 }
-"""Category in Snakemake's report of each section of the page; all other sections are of the diagnosis."""
+"""Category in Snakemake's report by section of the page; all other sections belong to the diagnosis."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class RegisteredFigure:
     Attributes
     ----------
     name : of its files `figures/<name>.<format>` and of its caption.
-    section : part of the page that it stands in: `damping`, `model`, `paper`, `trials`, or one of the diagnosis
+    section : its section of the page: `damping`, `model`, `paper`, `trials`, or one of the diagnosis
         (`verdict`, `where`, `candidates`, `tied`, `power`, `drift`).
     label : its name in Snakemake's report.
     title : its heading on the page.
-    data : file of the results folder that holds its numbers; blank where the page makes a table for it alone.
+    data : file of the results folder with its data; blank if the page makes a separate table for it.
     """
 
     name: str
@@ -70,18 +70,16 @@ _ALL = (
         "The exponent and the coefficients, by both methods",
         "damping.json",
     ),
-    RegisteredFigure("scaling", "damping", "Coefficient and size", "How damping grows with size", "scaling.json"),
+    RegisteredFigure("scaling", "damping", "Coefficient and size", "Damping against size", "scaling.json"),
     RegisteredFigure(
-        "speed_scaling", "damping", "Steady speed and size", "How steady speed goes with size", "conditions.csv"
+        "speed_scaling", "damping", "Steady speed and size", "Steady speed against size", "conditions.csv"
     ),
-    RegisteredFigure(
-        "efficiency", "damping", "Energy efficiency", "How much of the work becomes motion", "conditions.csv"
-    ),
+    RegisteredFigure("efficiency", "damping", "Energy efficiency", "Energy efficiency", "conditions.csv"),
     RegisteredFigure(
         "payload_speed", "damping", "Final speed and payload", "Final speed and payload", "conditions.csv"
     ),
     RegisteredFigure("overview", "damping", "All trials", "All trials at a glance", "trials.csv"),
-    RegisteredFigure("pixel_places", "damping", "Places within a pixel", "Where edges fall within a pixel"),
+    RegisteredFigure("pixel_places", "damping", "Positions within a pixel", "Positions of edges within a pixel"),
     RegisteredFigure("model_comparison", "model", "Model and measurement", "Model and measurement"),
     RegisteredFigure("model_residuals", "model", "Residuals of the model", "Residuals of the model", "comparison.csv"),
     RegisteredFigure("ladder", "verdict", "The ladder of errors", "The ladder of errors"),
@@ -89,7 +87,7 @@ _ALL = (
     RegisteredFigure("where", "where", "Where it fails", "Misfit by condition and position"),
     RegisteredFigure("missing_force", "where", "The missing force", "The missing force"),
     RegisteredFigure("learned_force", "where", "The learned force", "The missing force, learned inside the fit"),
-    RegisteredFigure("candidates", "candidates", "Candidates", "What would explain it"),
+    RegisteredFigure("candidates", "candidates", "Candidates", "Candidates"),
     RegisteredFigure("cosines", "tied", "Tied candidates", "Candidates that these trials cannot tell apart"),
     RegisteredFigure("power", "power", "What could be seen", "What these trials could have seen"),
     RegisteredFigure("drift", "drift", "Drift of parameters", "Parameters that change with a condition"),
@@ -130,7 +128,7 @@ CAMPAIGN_FIGURES = {
 """Figures of a whole experiment."""
 
 PAPER_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.section == "paper"}
-"""Figures that an experiment gets besides where published numbers are set beside it."""
+"""Further figures of an experiment that is compared with the published numbers."""
 
 DIAGNOSIS_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.category == "Diagnosis"}
 """Figures that show the diagnosis."""
@@ -142,7 +140,7 @@ def draw(name: str, *inputs: Any, **options: Any) -> Figure:
     Parameters
     ----------
     name : of the figure.
-    inputs, options : what the drawing function of that figure takes.
+    inputs, options : arguments of the drawing function.
 
     Returns
     -------
@@ -157,7 +155,7 @@ def draw(name: str, *inputs: Any, **options: Any) -> Figure:
 
 
 def _drawing(name: str) -> Callable[..., Figure]:
-    """The drawing function of a figure; clips (`overlay`) are composed frame by frame instead."""
+    """The drawing function of a figure; clips (`overlay`) have none, they are composed frame by frame."""
     from vinetrack.figures import (
         candidate_figures,
         damping_figures,

@@ -1,6 +1,6 @@
 """Damping, steady speed, efficiency and final speed against the size and the load of the vine.
 
-Straight lines and power laws are drawn beside each other because neither is known to be right.
+Both straight lines and power laws are drawn, because neither is known to be right.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
     Parameters
     ----------
     scaling : as in `scaling.json`.
-    published : printed values to draw beside it, `{"B": {vine: …}, "source": …}`; None for none.
+    published : published values, drawn too: `{"B": {vine: …}, "source": …}`; None for none.
     note : a sentence below the figure.
 
     Returns
@@ -109,7 +109,7 @@ def _finish_scaling(ax: Axes, families: list[dict[str, Any]]) -> None:
 
 
 _MAX_SPEED_FAMILIES = 5
-"""Chosen: each pressure has three lines of legend above the axes; the others stand in scaling.json."""
+"""Chosen: each pressure has three lines of legend above the axes; the others are in scaling.json."""
 _SPEED_PANELS = (
     ("x_ss_m_s", "x_ss_sigma_m_s", "steady tail speed x_ss (m/s)", "Speed"),
     ("x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "x_ss / diameter (1/s)", "Speed over diameter"),
@@ -119,7 +119,7 @@ _SPEED_PANELS = (
 def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
     """Draw x_ss and x_ss/D against D: straight lines full, power laws dashed.
 
-    Bars are standard errors; that of a single trial is the error of its reading alone.
+    Error bars are standard errors; that of a single trial does not include replicate scatter.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def _trend_text(lines: dict[str, Any]) -> str:
 def _single_trial_note(families: list[dict[str, Any]]) -> str:
     if not any(count == 1 for family in families for count in family["n_steady"]):
         return ""
-    return "The bar of a single trial is the error of its reading; the scatter of replicates is not in it."
+    return "The error bar of a single trial does not include replicate scatter."
 
 
 _EFFICIENCIES = {
@@ -191,7 +191,7 @@ _SIZE_UNITS = {"thickness_um": "µm", "diameter_mm": "mm"}
 
 
 def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
-    """Draw the largest family of conditions that differ in size alone.
+    """Draw the largest family of conditions that differ only in size.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
 
     families = scaling.get("efficiency") or []
     if not families:
-        return blank("No two vines of different size were grown to one place at one pressure with one payload.")
+        return blank("No two vines of different size were grown to the same length at one pressure with one payload.")
     family = families[0]
     along = [name for name in _SIZE_AXES if len(set(family[name])) > 1]
     shown = [key for key in _EFFICIENCIES if np.any(np.array(family[key], dtype=float) > 0)]
@@ -256,7 +256,7 @@ def _efficiency_title(family: dict[str, Any], n_families: int) -> str:
     more = f"; {left} more {'family' if left == 1 else 'families'} in scaling.json" if left else ""
     return (
         f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
-        f"N = {counted(min(counts), max(counts), 'trial')} a point{error}{more}"
+        f"N = {counted(min(counts), max(counts), 'trial')} per point{error}{more}"
     )
 
 
@@ -269,13 +269,13 @@ PAYLOAD_LINE = "model and its 95 %"
 def draw_payload_speed(
     conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = PAYLOAD_LINE
 ) -> Figure:
-    """Draw final speeds of vines that were grown with more than one payload.
+    """Draw final speeds of vines grown with more than one payload.
 
     Parameters
     ----------
-    conditions : one row a condition with `vine, pressure_kPa, payload_g, n_final, final_at_mm,
+    conditions : one row per condition with `vine, pressure_kPa, payload_g, n_final, final_at_mm,
         final_lead_velocity_m_s, final_lead_velocity_sigma_m_s`.
-    model : the same along payloads, without `n_final`; may be empty.
+    model : the same for the model, without `n_final`; may be empty.
     note : a sentence below the figure, such as a published value.
     line : name of the model's curve.
 
@@ -285,9 +285,9 @@ def draw_payload_speed(
     """
     from matplotlib.figure import Figure
 
-    moved = conditions[conditions["final_lead_velocity_m_s"] > 0]
-    moved = moved[moved.groupby(["vine", "pressure_kPa"])["payload_g"].transform("nunique") > 1]
-    vines = [str(vine) for vine in dict.fromkeys(moved["vine"])][:_MAX_VINES]
+    reached = conditions[conditions["final_lead_velocity_m_s"] > 0]
+    reached = reached[reached.groupby(["vine", "pressure_kPa"])["payload_g"].transform("nunique") > 1]
+    vines = [str(vine) for vine in dict.fromkeys(reached["vine"])][:_MAX_VINES]
     if not vines:
         return blank("No vine was grown with more than one payload at one pressure.")
     with look():
@@ -295,7 +295,7 @@ def draw_payload_speed(
         width_in = 6.6 if len(vines) == 1 else 4.4 * n_columns
         fig = Figure(figsize=(width_in, 0.6 + 4.2 * math.ceil(len(vines) / n_columns)), layout="constrained")
         for ax, vine in zip(panel_grid(fig, len(vines), n_columns), vines, strict=True):
-            _draw_vine(ax, moved[moved["vine"] == vine], model[model["vine"] == vine], line)
+            _draw_vine(ax, reached[reached["vine"] == vine], model[model["vine"] == vine], line)
         note_below(fig, note)
     return fig
 
@@ -314,7 +314,7 @@ def _draw_vine(ax: Axes, measured: pd.DataFrame, model: pd.DataFrame, line: str)
     ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
     up_from_zero(ax)
     error = ", ± standard error" if counts.max() > 1 else ""
-    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} a point{error}"
+    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} per point{error}"
     legend_above(ax, n_columns=2, title=title, alignment="left", fontsize=9)
 
 
@@ -323,6 +323,6 @@ def _draw_curve(ax: Axes, curve: pd.DataFrame, colour: str, label: str) -> None:
         curve[name].to_numpy(float)
         for name in ("payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s")
     )
-    reach = 1.96 * np.nan_to_num(sigma_m_s)
+    half_width = 1.96 * np.nan_to_num(sigma_m_s)
     ax.plot(payload_g, speed_m_s, color=colour, lw=1.5, label=label or None)
-    ax.fill_between(payload_g, speed_m_s - reach, speed_m_s + reach, color=colour, alpha=0.2, lw=0)
+    ax.fill_between(payload_g, speed_m_s - half_width, speed_m_s + half_width, color=colour, alpha=0.2, lw=0)

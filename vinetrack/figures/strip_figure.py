@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
     from vinetrack.video.track import Tracking
 
-LARGEST_PX = 480
-"""Pixels a side of the strip; chosen: 67 an inch, so that the edge is seen and 200 strips fit a page of 10 MB."""
+MAX_STRIP_PX = 480
+"""Pixels per side of the strip; chosen: 67 per inch, so that the edge is visible and 200 strips fit a page of 10 MB."""
 
 _FRAME_PX = 320
-"""Pixels a side of a frame; chosen: frames are a third as wide as the strip, 133 pixels an inch."""
+"""Pixels per side of a frame; chosen: frames are a third as wide as the strip, 133 pixels per inch."""
 
-_UNREMARKABLE = frozenset({"before_release"})
+_IGNORED_FLAGS = frozenset({"before_release"})
 
 
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
@@ -31,7 +31,7 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     Parameters
     ----------
     title : name of the trial.
-    tracking : the tracker's result; where its times are NaN, frames are counted in their place.
+    tracking : result of the tracker; if its times are NaN, the axis counts frames.
     m_per_px : scale along the axis, for the axis in millimetres; NaN for none.
 
     Returns
@@ -57,8 +57,8 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
 
 def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -> None:
     track, strip = tracking.track, tracking.kymograph
-    small = shrunk(strip, LARGEST_PX)
-    time_ms, down = _downwards(tracking)
+    small = shrunk(strip, MAX_STRIP_PX)
+    time_ms, down = _time_axis(tracking)
     dark, light = np.nanpercentile(small, [1, 99])
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     shown_ms = time_ms[tracking.strip_rows]
@@ -93,19 +93,19 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
 
 
-def _downwards(tracking: Tracking) -> tuple[np.ndarray, str]:
-    """Where every frame stands in the strip, ms or counted, and what that is."""
+def _time_axis(tracking: Tracking) -> tuple[np.ndarray, str]:
+    """Ordinate of every frame in the strip, in ms or frames, and its label."""
     time_s = tracking.track.time_s
     return (1e3 * time_s, "time (ms)") if np.isfinite(time_s).all() else (np.arange(float(time_s.size)), "frame")
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture of at most `largest_px` pixels a side, each the mean of those it replaces that are not NaN.
+    """Return a picture reduced to at most `largest_px` pixels per side by averaging, ignoring NaN.
 
     Parameters
     ----------
-    picture : shape (height, width), NaN where nothing is known.
-    largest_px : pixels of the longer side at most.
+    picture : shape (height, width), NaN where unknown.
+    largest_px : maximum pixels per side.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
 
 
 def flagged(flag: Any) -> np.ndarray:
-    """Return a mask, shape (n_frames,), of the frames with any flag but `before_release`.
+    """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def flagged(flag: Any) -> np.ndarray:
     -------
     array of bool, shape (n_frames,)
     """
-    return np.array([bool(set(str(entry).split(";")) - _UNREMARKABLE - {""}) for entry in flag], dtype=bool)
+    return np.array([bool(set(str(entry).split(";")) - _IGNORED_FLAGS - {""}) for entry in flag], dtype=bool)
 
 
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:

@@ -1,8 +1,8 @@
-"""One look for every figure: colours that colour-blind readers can tell apart, sizes that can be read in a talk.
+"""Common style of all figures: colours that colour-blind readers can distinguish, sizes readable in a talk.
 
-Figures are made without pyplot, so drawing one leaves no state behind and many can be drawn in parallel. Their
-background is transparent and everything neutral is drawn in INK or GRID, so that a page can recolour an inlined SVG
-for a dark screen; a PNG gets a white background.
+Figures are made without pyplot, so drawing leaves no global state and many can be drawn in parallel. The background is
+transparent and neutral parts are drawn in INK or GRID, so that a page can recolour an inline SVG for a dark scheme; a
+PNG has a white background.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ PAPER = "#fdfdfe"
 """Filling of hollow markers; a page may recolour it like INK and GRID."""
 
 BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
-"""Okabe and Ito's palette without its black and its yellow, which vanish on one background or the other."""
+"""Okabe and Ito's palette without black and yellow, each of which is invisible on one of the backgrounds."""
 
 VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
 VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "user": GREEN}
-"""The ways of choosing a steady window, the same colours in every figure."""
+"""Colour of each rule for steady windows, the same in every figure."""
 
 RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
 
@@ -77,7 +77,7 @@ _RC: Any = {
 
 @dataclass(frozen=True)
 class VineStyle:
-    """How one vine is drawn wherever it appears."""
+    """Colour and marker of a vine, the same in every figure."""
 
     colour: str
     marker: str
@@ -85,7 +85,7 @@ class VineStyle:
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw inside this: matplotlib's settings are as the project wants them, and restored afterwards."""
+    """Context manager that applies the project's matplotlib settings and restores the former ones."""
     import matplotlib as mpl
 
     with mpl.rc_context(_RC):
@@ -93,7 +93,7 @@ def look() -> Iterator[None]:
 
 
 def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
-    """Give each vine, in the order of first appearance, a colour and a marker; 42 pairs before one repeats.
+    """Give each vine, in the order of first appearance, a colour and a marker; with 42 different pairs.
 
     Parameters
     ----------
@@ -112,11 +112,11 @@ def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
 
 
 def rows(table: pd.DataFrame) -> Iterator[Any]:
-    """Rows of a table with its columns as attributes; pandas' own type of them fits no number.
+    """Iterate over the rows of a table with its columns as attributes, typed as `Any` for convenience.
 
     Parameters
     ----------
-    table : any table with names of columns that are Python names.
+    table : its column names must be Python identifiers.
 
     Returns
     -------
@@ -126,11 +126,11 @@ def rows(table: pd.DataFrame) -> Iterator[Any]:
 
 
 def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure:
-    """Return a figure that says why there is nothing to draw; the place of a missing picture is never left empty.
+    """Return a figure with a message in place of a figure that cannot be drawn.
 
     Parameters
     ----------
-    message : the reason, one or more sentences.
+    message : the reason, in one or more sentences.
     width_in, height_in : size of the figure, inches.
 
     Returns
@@ -147,13 +147,13 @@ def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure
 
 
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
-    """Return the figure in each format, the same bytes for the same figure; PNG on white, the others transparent.
+    """Return the figure in each format, reproducible to the byte; PNG on white, the others transparent.
 
     Parameters
     ----------
     fig : the figure.
     formats : of `png`, `svg`, `pdf`.
-    dpi : pixels an inch of a PNG.
+    dpi : pixels per inch of a PNG.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
 
 @contextmanager
 def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
-    """Room for its labels found once: each format would find it again, and draw the figure once more to do so."""
+    """Execute the layout engine once, instead of once per format, each of which would draw the figure again."""
     engine, before = fig.get_layout_engine(), fig.dpi
     if engine is None:
         yield
@@ -183,7 +183,7 @@ def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
     fig.dpi = dpi
     engine.execute(fig)
     fig.dpi = before
-    fig.set_layout_engine(None)  # "none" would have the figure drawn twice still
+    fig.set_layout_engine(None)  # the engine "none" would still draw the figure twice
     try:
         yield
     finally:

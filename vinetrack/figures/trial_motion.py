@@ -1,7 +1,7 @@
 """One trial: position and speed against time, and the steady window of each rule.
 
-The three rules are bars in a strip of their own below the curves, so that windows that overlap stay apart, with the
-verdict of each in words beside it; their x_ss is drawn across the curve where it was measured.
+The three rules are bars in a strip below the curves, so that overlapping windows are separate, with the result of each
+as text below; their x_ss is drawn across the curve where it was measured.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _WIDTH_IN = 7.2
 """Chosen: one panel that fits a page of A4."""
 
 _TEXT_COLUMNS = 106
-"""Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt makes 126; a sixth is left for wide letters."""
+"""Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt makes 126; a sixth is a margin for wide letters."""
 
 _LINE_IN = 0.175
 """Derived: 8.8 pt · 1.43 spacing / 72 pt."""
@@ -91,7 +91,7 @@ def _three_rows(fig: Figure, heights_in: dict[str, float], height_in: float) -> 
 
 
 def _unusable(track: pd.DataFrame) -> np.ndarray:
-    """Mask of the rows without a usable position of the leading edge."""
+    """Mask of the rows without a usable position."""
     flags = track["flag"].fillna("").astype(str)
     return flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
 
@@ -143,7 +143,7 @@ def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, trave
 
 
 def _speed_limits(speed_m_s: np.ndarray, sigma_m_s: np.ndarray) -> tuple[float, float]:
-    """Limits that hold every speed, and its 2 σ band only where that does not shrink the curve below half the axes."""
+    """Limits that contain every speed, and its 2 σ band unless that would shrink the curve below half the axes."""
     finite = speed_m_s[np.isfinite(speed_m_s)]
     if not finite.size:
         return 0.0, 1.0

@@ -156,7 +156,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     dict
         Arguments of the drawing function by name of figure; figures without content are left out.
     """
-    from vinetrack.figures.pixel_places import FEWEST_PLACES, places_in_pixel
+    from vinetrack.figures.pixel_places import MIN_EDGES, subpixel_positions
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
     from vinetrack.figures.size_figures import PAYLOAD_LINE
     from vinetrack.narrative.law_text import METHOD_NAMES
@@ -167,7 +167,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     described = describe_conditions(trials, known)
     names = described.loc[described["status"] != "left_out", "trial"]
     moved = {name: read_result(results.kinematics(name)) for name in names}
-    places = places_in_pixel({name: read_result(results.track(name)) for name in names})
+    places = subpixel_positions({name: read_result(results.track(name)) for name in names})
     in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
     points = points.assign(used=points["used"] & bool(in_fit))
     compared = label_conditions(read_result(results.comparison), described)
@@ -186,7 +186,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
         "efficiency": (scaling,) if scaling["efficiency"] else (),
         "payload_speed": (read_result(results.conditions), payload, "", line) if len(payload) else (),
         "overview": (described, moved) if moved else (),
-        "pixel_places": (places,) if len(places) >= FEWEST_PLACES else (),
+        "pixel_places": (places,) if len(places) >= MIN_EDGES else (),
         "model_comparison": (compared, with_final_model(trajectories, diagnosed)) if len(compared) else (),
         "model_residuals": (compared, trajectories) if len(compared) else (),
     }

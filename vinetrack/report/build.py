@@ -1,4 +1,4 @@
-"""The report: everything a person wants to see, in one HTML file without scripts, links or fonts from elsewhere."""
+"""The report: all results in one HTML file without scripts or external resources."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_sectio
 from vinetrack.report.model_section import ModelResult, model_section
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable, figure_entry, section_entry
 from vinetrack.report.trials_section import (
-    LARGEST_SVG_BYTES,
+    MAX_SVG_BYTES,
     METHODS,
     SHARED_ERROR,
     TrackedRecording,
@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
 
-LARGEST_CLIP_BYTES = 2_500_000
-"""Chosen: of the 15 MB that a report may have; a larger clip is left as a file beside it."""
+MAX_CLIP_BYTES = 2_500_000
+"""Chosen: a sixth of the 15 MB that a report may have; a larger clip is left as a file beside it."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip that plays in the page: the trial, the MP4 file, what it shows, and a WebP picture to stand for it.
+    """A clip that plays in the page: the trial, the MP4 file, a caption, and a WebP poster.
 
-    The picture is seen until the clip plays, and on paper.
+    The poster is shown until the clip plays, and in print.
     """
 
     trial: str
@@ -57,11 +57,11 @@ class Clip:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContent:
-    """Everything the report is made of: the tables of the results folder, its pictures and its provenance.
+    """Content of the report: tables, figures and provenance of the results folder.
 
-    `recordings` has an entry for every trial that came as one; `clips` says where beside the page the clip of a trial
-    is, and `clip` is the one to play in it. `sections` are parts that other rooms add, shown before the trials. `notes`
-    say what blank cells of the sheet stand for.
+    `recordings` has an entry for every trial with a recording; `clips` has the path of the clip of a trial relative to
+    the page, and `clip` the one that plays in it. `sections` are further parts, shown before the trials. `notes` state
+    the values assumed for blank cells of the sheet.
     """
 
     name: str
@@ -82,11 +82,11 @@ class ReportContent:
 
 
 def build_report(content: ReportContent) -> str:
-    """Return the page. Whatever a user wrote is escaped; only our own SVG goes in as it is.
+    """Return the page. User text is escaped; only SVG made by the package is inserted as it is.
 
     Parameters
     ----------
-    content : see `ReportContent`; `trial_figures` holds an SVG per trial that is to be shown in full.
+    content : see `ReportContent`; `trial_figures` has an SVG for each trial that is shown in full.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def build_report(content: ReportContent) -> str:
         diagnosis=diagnosis_section(content.diagnosis),
         figures=_figures(content),
         clip=_clip(content.clip),
-        sections=[section_entry(section, LARGEST_SVG_BYTES) for section in content.sections],
+        sections=[section_entry(section, MAX_SVG_BYTES) for section in content.sections],
         trials=trials,
         n_left_out=n_left_out,
         calibrations=calibration_table(content.recordings),
@@ -147,17 +147,17 @@ def figure_caption(name: str) -> str:
 
 
 def _figures(content: ReportContent) -> dict[str, list[dict[str, Any]]]:
-    """Figures for the template, by the section of the page that they stand in."""
+    """Figures for the template, by section of the page."""
     by_section: dict[str, list[dict[str, Any]]] = {figure.section: [] for figure in FIGURES.values()}
     for figure in content.figures:
-        if len(figure.svg) <= LARGEST_SVG_BYTES:
+        if len(figure.svg) <= MAX_SVG_BYTES:
             section = FIGURES[figure.key].section if figure.key in FIGURES else "damping"
             by_section[section].append(figure_entry(figure))
     return by_section
 
 
 def _clip(clip: Clip | None) -> dict[str, str] | None:
-    if clip is None or len(clip.mp4) > LARGEST_CLIP_BYTES:
+    if clip is None or len(clip.mp4) > MAX_CLIP_BYTES:
         return None
     source, poster = (base64.b64encode(part).decode("ascii") for part in (clip.mp4, clip.poster))
     return {

@@ -24,24 +24,22 @@ if TYPE_CHECKING:
 
 
 ABOUT_SIGMA = (
-    "● in the answer set. Δχ² counts the noise of the tracks alone, σ also how much trials disagree: of a fitted "
-    "candidate it is √Δχ² or less."
+    "● in the answer set. Δχ² is relative to the noise of the tracks alone; σ also accounts for disagreement between "
+    "trials: for a fitted candidate it is √Δχ² or less."
 )
 
 
 ABOUT_POWER = (
-    "By linear theory, with the noise and scatter of the fit, beside all effects of the last model. Found there: at "
-    "the largest plausible size. Taken for: which other candidate has the highest score, at the size found in 90 %."
+    "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Found there: at the "
+    "largest plausible size. Taken for: the other candidates with the highest score, at the size found in 90 %."
 )
 
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """The diagnosis, the errors of its models, the values of every number along it, and the damping law under each.
+    """The diagnosis, with the errors, parameters and damping laws of its models; None for parts that do not exist.
 
-    None where a part does not exist.
-    `summaries` says of effects by name what each is, in a sentence; `units` of parameters (`effect.parameter`) their
-    symbol and unit.
+    `summaries` describes each effect in a sentence; `units` has symbol and unit by `effect.parameter`.
     """
 
     diagnosis: Diagnosis
@@ -81,7 +79,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "where": [line for line in diagnosis.where if line not in drifting],
         "force": missing_force(diagnosis.missing_force),
         "rounds": [_round(i, entry) for i, entry in enumerate(diagnosis.rounds)],
-        "hidden": _hidden(diagnosis, result.units),
+        "hidden": _upper_limits(diagnosis, result.units),
         "power": power_entry(diagnosis.power),
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
@@ -121,7 +119,7 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
     note = (
         "Root mean square error of position. Left out: every condition is predicted by the model fitted to all others; "
         "every vine's highest pressure by the model fitted to all lower ones. Excess: √(rms² − replicates²). Partial: "
-        "a step that mends a part of what nothing mends in full; it is not said to be missing."
+        "a step that explains part of a misfit that nothing explains in full; it is not claimed to be missing."
     )
     return ReportTable("The numbers of the ladder", head, rows, frozenset(range(1, len(head))), note)
 
@@ -151,7 +149,7 @@ def _round(index: int, entry: Round) -> dict[str, Any]:
         "verdict": entry.verdict,
         "explanation": entry.explanation,
         "table": ReportTable("", head, rows, frozenset({2, 3}), ABOUT_SIGMA) if rows else None,
-        "blind": _blind(entry.ranking),
+        "blind": _not_testable(entry.ranking),
     }
 
 
@@ -169,12 +167,12 @@ def round_question(entry: Round) -> str:
     return f"which effect is missing from {listed(entry.model)}?"
 
 
-def _hidden(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
-    """Upper limits on undetected effects, where no effect is missing: only then they hold."""
-    return hidden_table(diagnosis.rounds[-1].ranking, units) if diagnosis.final_verdict == ADEQUATE else None
+def _upper_limits(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
+    """Upper limits on undetected effects; they are valid only if no effect is missing."""
+    return upper_limit_table(diagnosis.rounds[-1].ranking, units) if diagnosis.final_verdict == ADEQUATE else None
 
 
-def hidden_table(
+def upper_limit_table(
     ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
     """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none.
@@ -201,8 +199,8 @@ def hidden_table(
     if not rows:
         return None
     note = (
-        "A larger size contradicts these trials (95 %, one-sided; of either sign where that leaves more room). "
-        "Which sizes would have been noticed is said with the verdict: that takes more."
+        "Larger sizes contradict these trials (95 %, one-sided; of the sign with the larger limit). Sizes that would "
+        "have been detected are larger; they are given with the verdict."
     )
     return ReportTable(
         "Upper limits on undetected effects", ("Candidate", "number", "limit"), rows, frozenset({2}), note
@@ -210,7 +208,7 @@ def hidden_table(
 
 
 def power_entry(power: Power | None) -> dict[str, Any] | None:
-    """Return what the trials could have seen for the template: sentences, and a table of sizes; None where unknown.
+    """Return what the trials could have detected, for the template: sentences and a table of sizes; None if unknown.
 
     Parameters
     ----------
@@ -230,11 +228,9 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
     return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
 
-def _blind(ranking: Sequence[Candidate]) -> list[str]:
+def _not_testable(ranking: Sequence[Candidate]) -> list[str]:
     """Candidates without an observable effect under these conditions, each with the reason."""
-    return [
-        f"{plain(row.effect)}: {row.reason or 'no reason is given'}" for row in ranking if row.status == NOT_TESTABLE
-    ]
+    return [f"{plain(row.effect)}: {row.reason or 'no reason given'}" for row in ranking if row.status == NOT_TESTABLE]
 
 
 def tied_pairs(entry: Round) -> list[str]:
@@ -287,11 +283,11 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         )
         for pair, sigma in (content.get("separation_sigma") or {}).items()
     ]
-    told = ReportTable("", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
+    separation_table = ReportTable("", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
     return {
         "text": str(content.get("text") or ""),
         "trials": ReportTable("", head, rows, frozenset(range(len(head)))) if rows and head else None,
-        "separations": told if separations else None,
+        "separations": separation_table if separations else None,
         "calibration": str(content.get("calibration") or ""),
     }
 
@@ -303,7 +299,7 @@ def _simulated(entry: Mapping[str, Any]) -> str:
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: sentences, weights and simple laws beside it; None for none.
+    """Return the missing force for the template: sentences, weights and simple laws; None for none.
 
     Parameters
     ----------
@@ -324,27 +320,29 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         for law in content.get("laws") or []
     ]
     head = ("Simple law", "explains of the missing force", "size (N)")
-    table = ReportTable("Which simple law it looks like", head, rows, frozenset({1, 2})) if rows else None
+    table = ReportTable("Simple laws that resemble it", head, rows, frozenset({1, 2})) if rows else None
     learned = content.get("learned") or {}
     weights = [
         (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
         for name, weight in (learned.get("weights") or {}).items()
     ]
-    told = ReportTable("What describes the learned force", ("Variables", "posterior weight"), weights, frozenset({1}))
+    weight_table = ReportTable(
+        "Variables of the learned force", ("Variables", "posterior weight"), weights, frozenset({1})
+    )
     return {
         "sentence": str(content.get("sentence") or content.get("text") or ""),
         "laws": table,
         "learned": str(learned.get("sentence") or ""),
-        "weights": told if weights else None,
+        "weights": weight_table if weights else None,
     }
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
-    """Return how fitted numbers changed as effects were added: a row a number, a column a model; None without any.
+    """Return the change of the parameters as effects were added, one column per model; None without any.
 
     Parameters
     ----------
-    moved : as in `diagnosis/moved.csv`: one row a number and model, SI.
+    moved : as in `diagnosis/moved.csv`: one row per number and model, SI.
 
     Returns
     -------
@@ -353,7 +351,7 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
     if moved is None or not len(moved):
         return None
     steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
-    head = ["Number", *map(_step, steps)]
+    head = ["Parameter", *map(_step, steps)]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     titles: dict[tuple[str, str], str] = {}
     for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
@@ -362,11 +360,11 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
         titles[key] = left
         cells.setdefault(key, {})[str(entry["added"])] = right
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
-    return ReportTable("Fitted numbers under every model", head, rows, frozenset(range(1, len(head))))
+    return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
 
 
 def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
-    """Return the damping law from steady speeds with the pressure at the vine that each model gives; None without.
+    """Return the damping law from steady speeds with the pressure at the vine in each model; None without laws.
 
     Parameters
     ----------
@@ -387,7 +385,7 @@ def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
         row = (_step("+".join(added)), str(entry["vine"]), number(entry["n"], 4), interval(bounds["n"]))
         rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
     head = ("Model", "Vine", "n", "95 %", "B, N·(s/m)ⁿ", "95 %", "Trials")
-    note = (
-        "From steady speeds, as in the section on the damping law, with the pressure at the vine that each model gives."
+    note = "From steady speeds, as in the section on the damping law, with the pressure at the vine in each model."
+    return ReportTable(
+        "The damping law with the pressure of every model", head, rows, frozenset(range(2, len(head))), note
     )
-    return ReportTable("The damping law under every model", head, rows, frozenset(range(2, len(head))), note)

@@ -37,11 +37,11 @@ class ModelResult:
 
 
 def model_section(result: ModelResult | None) -> dict[str, Any] | None:
-    """Return the section on the model in use as text for the template; None where no model was fitted or refused.
+    """Return the section on the model in use as text for the template; None if no model was fitted or refused.
 
     Parameters
     ----------
-    result : None where no model was fitted.
+    result : None if no model was fitted.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def model_section(result: ModelResult | None) -> dict[str, Any] | None:
 
 
 def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
-    """The model that the diagnosis ended with; None where nothing was added."""
+    """The final model of the diagnosis; None if nothing was added."""
     if diagnosis is None or not diagnosis.effects:
         return None
     from vinetrack.narrative.verdict_summary import settled_rows
@@ -80,8 +80,8 @@ def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
             number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m", "floor_m")
         )
         text = (
-            f"With {listed(diagnosis.effects)} the model is off by {inside} mm, and by {outside} mm on conditions left "
-            f"out of the fit; replicates scatter by {floor} mm (root mean square)."
+            f"With {listed(diagnosis.effects)} the error of the model is {inside} mm, and {outside} mm on conditions "
+            f"left out of the fit; replicate scatter is {floor} mm (root mean square)."
         )
     return {
         "names": " + ".join(diagnosis.final_model),
@@ -112,7 +112,7 @@ def verdict(comparison: pd.DataFrame) -> str:
         sentence += f", and replicates scatter by {number(1e3 * _rms(known['replicate_floor_m']))} mm"
     return (
         f"{sentence} (root mean square). Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, "
-        f"most of all after {number(1e3 * worst['worst_at_m'])} mm of growth."
+        f"with the maximum after {number(1e3 * worst['worst_at_m'])} mm of growth."
     )
 
 
@@ -137,7 +137,7 @@ def _number(entry: Number) -> dict[str, str]:
 
 
 def _spread(name: str, spread: BetweenTrialSpread) -> str:
-    how = "" if spread.estimated else ", held"
+    how = "" if spread.estimated else " (fixed)"
     return f"{name} {number(100 * spread.value, 2)} %{how}"
 
 

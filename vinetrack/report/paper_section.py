@@ -1,4 +1,4 @@
-"""The paper's numbers beside ours, as a section of the report: Tables I and II, every row of `paper.csv`, figures."""
+"""Section of the report that compares the paper's numbers with ours: Tables I and II, `paper.csv`, figures."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
-    """Put the section together.
+    """Return the section.
 
     Parameters
     ----------
     table : as in `paper.csv`.
     departures : as in `paper_departures.csv`.
-    figures : the pictures, in order.
+    figures : in order.
 
     Returns
     -------
@@ -33,14 +33,14 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
     return ReportSection(
         key="paper",
-        title="Beside the paper",
+        title="Comparison with the paper",
         paragraphs=[
-            f"The numbers of {published.SOURCE} beside ours. {tally(table)} Each row says which kind it is.",
+            f"The numbers of {published.SOURCE} next to ours. {tally(table)} Each row is marked with its kind.",
             f"{'; '.join(present)}.",
-            "The errors of Eq. (2) at low pressure (1.90 cm at 7 kPa) are set beside what a chamber that nothing "
-            "refills, and a tail that cannot push, would cause in the same vine. Neither is claimed to be the reason: "
-            "how fast the regulator refills, and how long the vines were, is not printed, and B and n of Fig. 6 may "
-            "have taken up a part of it.",
+            "The errors of Eq. (2) at low pressure (1.90 cm at 7 kPa) are compared with those that a chamber without "
+            "refill, and a tail that cannot push, would cause in the same vine. Neither is claimed to be the reason: "
+            "how fast the regulator refills, and how long the vines were, is not published, and B and n of Fig. 6 may "
+            "have absorbed a part of it.",
         ],
         tables=[table_one(table), *table_two(table, departures), *every_row(table)],
         figures=list(figures),
@@ -48,7 +48,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
 
 
 def tally(table: pd.DataFrame) -> str:
-    """How many rows there are of each kind, as a sentence.
+    """Return the number of rows of each kind, as a sentence.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def tally(table: pd.DataFrame) -> str:
 
 
 def table_one(table: pd.DataFrame) -> ReportTable:
-    """Table I of the paper, with what Fig. 6 found and what we did.
+    """Return Table I of the paper, with the results of Fig. 6 and ours.
 
     Parameters
     ----------
@@ -102,11 +102,11 @@ def table_one(table: pd.DataFrame) -> ReportTable:
         "R² printed",
         "R² here",
     )
-    return ReportTable("Table I, with what Fig. 6 found", head, body, frozenset(range(1, len(head))))
+    return ReportTable("Table I, with the results of Fig. 6", head, body, frozenset(range(1, len(head))))
 
 
 def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> list[ReportTable]:
-    """Table II of the paper, positions and speeds, with ours and with what departures from Eq. (2) would cause.
+    """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2).
 
     Parameters
     ----------
@@ -150,8 +150,8 @@ _ERRORS = (
         "rms_position_m",
         100.0,
         published.POSITION_RMS_CM,
-        "Here: the mean of the trials against Eq. (2) with the printed numbers. The last three: what a departure from "
-        "Eq. (2) would cause, simulated for a vine of 280 mm.",
+        "Here: mean of the trials minus Eq. (2) with the printed numbers. The last three columns: the error that a "
+        "departure from Eq. (2) would cause, simulated for a vine of 280 mm.",
     ),
     (
         "Table II, rms of final speed, m/s",
@@ -160,13 +160,13 @@ _ERRORS = (
         "rms_final_lead_velocity_m_s",
         1.0,
         published.FINAL_SPEED_RMS_M_S,
-        "At 12 cm, over payloads; B of this vine is not printed and taken in proportion to the wall.",
+        "At 12 cm, over payloads; B of this vine is not printed and is scaled in proportion to the wall.",
     ),
 )
 
 
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
-    """All of `paper.csv`, a table for each part of the paper.
+    """Return all rows of `paper.csv`, in one table for each part of the paper.
 
     Parameters
     ----------
@@ -174,9 +174,9 @@ def every_row(table: pd.DataFrame) -> list[ReportTable]:
 
     Returns
     -------
-    list of ReportTable, one a part of the paper
+    list of ReportTable, one per part of the paper
     """
-    head = ("what", "printed", "here (95 %)", "kind", "how, and what stands beside it")
+    head = ("what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
     made = []
     parts = table["where"].map(_part)
     for title in (*_PARTS, _ELSEWHERE):
@@ -206,7 +206,7 @@ _PARTS = {
     "Fig. 9": ("Fig. 9",),
     "Chamber and injector": ("Section III-B", "Section V-B"),
 }
-"""Parts of the paper, and the places that belong to each."""
+"""Parts of the paper, with their sections and figures."""
 
 _ELSEWHERE = "The fast vine, air drag, pressures"
 
@@ -216,7 +216,7 @@ def _unit(unit: str) -> str:
 
 
 def _part(where: str) -> str:
-    """The part a place belongs to, by what stands first in it."""
+    """The part of the paper of an entry of `where`, from its first reference."""
     first = where.split(";")[0].split(",")[0].split(" against")[0]
     return next((title for title, places in _PARTS.items() if first in places), _ELSEWHERE)
 
@@ -226,7 +226,7 @@ def _by_row(table: pd.DataFrame) -> Mapping[str, Any]:
 
 
 def _published_of(by_row: Mapping[str, Any], row: str) -> float | None:
-    """The published value of a row; None where there is no such row."""
+    """The published value of a row; None if there is no such row."""
     return float(by_row[row].published) if row in by_row else None
 
 
@@ -242,7 +242,7 @@ def _ours(row: Any) -> str:
 
 
 def _shown(value: float | None) -> str:
-    """A number to three digits, a whole one as it is."""
+    """A number to three digits; integers are unchanged."""
     whole = value is not None and math.isfinite(value) and math.isclose(value, round(value), rel_tol=1e-9)
     return f"{value:.0f}" if whole else number(value)
 

@@ -1,4 +1,4 @@
-"""What a page is made of: pictures with their data, tables, and sections of both, from whichever room they come."""
+"""Building blocks of the page: figures with their data, tables, and sections of both."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from urllib.parse import quote
 
 from vinetrack.report.svg import inline_svg
 
-_PLAIN = ",;:!*'()/ -._~+@=$?"
-"""Characters that an address in quotation marks may hold as they are."""
+_UNESCAPED = ",;:!*'()/ -._~+@=$?"
+"""Characters that need no escaping in a quoted URL."""
 
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A picture of the report: its SVG, what it shows, and the table it was drawn from as a file to download."""
+    """A figure of the report: its SVG, its caption, and its data as a file to download."""
 
     key: str
     title: str
@@ -28,7 +28,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table of the report: text in rows, shown as it is; `numbers` are the columns set to the right."""
+    """A table of the report, as text in rows; `numbers` are the right-aligned columns."""
 
     title: str
     head: Sequence[str]
@@ -39,7 +39,7 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A part of the page under one heading: paragraphs, then tables, then pictures."""
+    """A part of the page under one heading: paragraphs, then tables, then figures."""
 
     key: str
     title: str
@@ -49,11 +49,11 @@ class ReportSection:
 
 
 def figure_entry(figure: ReportFigure) -> dict[str, Any]:
-    """A picture for the template.
+    """Return a figure for the template.
 
     Parameters
     ----------
-    figure : its SVG as matplotlib wrote it.
+    figure : with the SVG as written by matplotlib.
 
     Returns
     -------
@@ -72,12 +72,12 @@ def figure_entry(figure: ReportFigure) -> dict[str, Any]:
 
 
 def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, Any]:
-    """A section for the template; pictures too large for a page are left as files beside it.
+    """Return a section for the template, without figures that are too large for a page.
 
     Parameters
     ----------
     section : of the page.
-    largest_svg_bytes : of a picture in the page.
+    largest_svg_bytes : maximum size of a figure in the page.
 
     Returns
     -------
@@ -93,19 +93,19 @@ def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, A
 
 
 def data_uri(name: str, text: str) -> str:
-    """A file to download that is part of the page itself, written whichever way is shorter.
+    """Return a file as a data URI, in the shorter of two encodings.
 
     Parameters
     ----------
-    name : of the file; its ending gives the type.
+    name : of the file; its suffix gives the type.
     text : its content.
 
     Returns
     -------
-    str, a data address
+    str, a data URI
     """
     kind = "application/json" if name.endswith(".json") else "text/csv"
-    escaped = quote(text, safe=_PLAIN)
+    escaped = quote(text, safe=_UNESCAPED)
     encoded = "base64," + base64.b64encode(text.encode("utf-8")).decode("ascii")
     head = f"data:{kind};charset=utf-8"
     return f"{head};{encoded}" if len(encoded) <= len(escaped) else f"{head},{escaped}"

@@ -1,8 +1,8 @@
-"""Matplotlib's SVG made small and fit for a page: a tenth of its size, the same picture, and its text is text.
+"""Compact matplotlib's SVG for a page: a tenth of the size, with the same appearance, and text as text.
 
 Three things make such files large and slow: an element for every marker, tick and grid line; coordinates to a millionth
-of a point; and pictures as PNG. Here neighbours of equal style become one path, round markers
-become the round ends of lines without length, coordinates are relative and rounded, and pictures are WebP.
+of a point; and images as PNG. Here neighbouring paths of equal style are merged, round markers become the round caps of
+lines of zero length, coordinates are relative and rounded, and images are WebP.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from vinetrack.figures.page_tokens import TOKENS
 Command = tuple[str, tuple[float, ...]]
 """A command of a path and its numbers: M, L, Q, C or Z in absolute coordinates, pt."""
 
-_THEMED = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
+_THEME_COLOURS = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
 
-_PICTURE_QUALITY = 45
-"""Of WebP, 0 to 100; chosen: strips are noise with one edge in it, and the edge survives what the noise does not."""
+_WEBP_QUALITY = 45
+"""WebP quality, 0 to 100; chosen: strips are mostly noise, and their edge is preserved at this quality."""
 
-_SHORT_MARKER = 8
-"""Commands; chosen: filled shapes of so few are markers, which look the same drawn as one path (a diamond has 5)."""
+_MAX_MARKER_COMMANDS = 8
+"""Commands up to which a filled shape counts as a marker, which may be merged; chosen: a diamond has 5."""
 
-_LONGEST_PATH = 20_000
+_MAX_PATH_COMMANDS = 20_000
 """Commands of a merged path; chosen: browsers slow down on paths of several hundred thousand."""
 
 _COUNTS = {"M": 2, "L": 2, "Q": 4, "C": 6, "Z": 0}
@@ -44,7 +44,7 @@ _KEPT = {
 
 @dataclass
 class _Element:
-    """One element of the compact picture; `commands` stand for the `d` of a path."""
+    """One element of the compact picture; `commands` are the `d` of a path."""
 
     tag: str
     style: dict[str, str] = field(default_factory=dict)
@@ -55,22 +55,22 @@ class _Element:
 
 
 def inline_svg(svg: str, prefix: str, description: str) -> str:
-    """Return an SVG file as an element ready to stand in a page.
+    """Return an SVG file as an element for inline use in a page.
 
-    Neutral colours become the page's own, so that it follows a dark screen. The page's style sheet sets the size by
-    `--wide`, at which text in the picture is as large as that of the page.
+    Neutral colours become those of the page, so that it follows a dark scheme. The style sheet of the page sets the
+    size by `--wide`, at which text in the picture is as large as that of the page.
 
     Parameters
     ----------
     svg : a file as matplotlib writes it.
-    prefix : put before every identifier, since several pictures share one page.
-    description : for readers who cannot see the picture.
+    prefix : prepended to every identifier, because several pictures share one page.
+    description : text alternative of the picture.
 
     Returns
     -------
     str, an `svg` element
     """
-    body, width_pt, height_pt = compact_svg(svg, prefix, _THEMED)
+    body, width_pt, height_pt = compact_svg(svg, prefix, _THEME_COLOURS)
     label, box = escape(description, quote=True), f"0 0 {width_pt:g} {height_pt:g}"
     return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--wide:{1.33 * width_pt:.0f}px">{body}</svg>'
 
@@ -81,7 +81,7 @@ def compact_svg(svg: str, prefix: str, colours: Mapping[str, str]) -> tuple[str,
     Parameters
     ----------
     svg, prefix : as of `inline_svg`.
-    colours : what to write in place of a colour, by its hexadecimal code in lower case.
+    colours : replacements of colours, by hexadecimal code in lower case.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def compact_svg(svg: str, prefix: str, colours: Mapping[str, str]) -> tuple[str,
     Raises
     ------
     ValueError
-        If it is no such file.
+        If it is not such a file.
     """
     try:
         root = ElementTree.fromstring(svg)
@@ -120,7 +120,7 @@ def _style(node: ElementTree.Element) -> dict[str, str]:
 
 
 def _converted(node: ElementTree.Element, markers: Mapping[str, ElementTree.Element]) -> list[_Element]:
-    """One node of the file: left out, as an element, or as its children where it only groups them."""
+    """Convert one node of the file: to nothing, to an element, or to its children if it only groups them."""
     tag, style, attributes = _tag(node), _style(node), _attributes(node)
     kept = {key: _rounded(attributes[key]) for key in _KEPT.get(tag, ()) if key in attributes}
     if tag in ("metadata", "style", "title"):
@@ -139,7 +139,9 @@ def _converted(node: ElementTree.Element, markers: Mapping[str, ElementTree.Elem
     if tag == "use":
         return [_marker(markers[attributes["href"].lstrip("#")], style, attributes)]
     if tag == "image":
-        return [_Element("image", {}, kept | {"href": recoded(attributes["href"]), "preserveAspectRatio": "none"})]
+        return [
+            _Element("image", {}, kept | {"href": recoded_image(attributes["href"]), "preserveAspectRatio": "none"})
+        ]
     if tag == "text":
         kept = {key: value for key, value in kept.items() if not re.fullmatch(r"rotate\(-?0 .*\)", value)}
         style = {key: value for key, value in style.items() if (key, value) != ("text-anchor", "start")}
@@ -148,7 +150,7 @@ def _converted(node: ElementTree.Element, markers: Mapping[str, ElementTree.Elem
 
 
 def _copied(node: ElementTree.Element) -> _Element:
-    """A node as it is, its numbers rounded."""
+    """A copy of a node with its numbers rounded."""
     attributes = {key: _rounded(value) for key, value in _attributes(node).items() if key != "style"}
     commands = parse_path(attributes.pop("d")) if _tag(node) == "path" else []
     children = [_copied(child) for child in node]
@@ -156,10 +158,10 @@ def _copied(node: ElementTree.Element) -> _Element:
 
 
 def _rounded(value: str) -> str:
-    """A number, or the numbers of a transform, to two decimals; names are left alone."""
+    """A number, or the numbers of a transform, to two decimals; names are unchanged."""
     if not _NUMBERS.fullmatch(value):
         return value
-    # A matrix or a scale stretches hundreds of pixels: at two decimals, 0.005 · 300 px would be off by 1.5 px.
+    # A matrix or scale multiplies hundreds of pixels: an error of 0.005 over 300 px would be 1.5 px.
     decimals = 5 if "matrix" in value or "scale" in value else 2
     return re.sub(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?", lambda match: _short(float(match[0]), decimals), value)
 
@@ -169,7 +171,7 @@ def _short(value: float, decimals: int = 2) -> str:
 
 
 def _marker(shape: ElementTree.Element, style: dict[str, str], place: Mapping[str, str]) -> _Element:
-    """One marker as a path of its own; a round one without an edge as the round end of a line without length."""
+    """One marker as a path; a round one without an edge as the round cap of a line of zero length."""
     commands, style = parse_path(shape.attrib.get("d", "")), {**_style(shape), **style}
     x, y = float(place.get("x", 0)), float(place.get("y", 0))
     diameter, fill, edge = circle_diameter(commands), style.get("fill", "#000000"), style.get("stroke", "none")
@@ -182,16 +184,16 @@ def _marker(shape: ElementTree.Element, style: dict[str, str], place: Mapping[st
     return _Element("path", dot, commands=[("M", (x, y)), ("L", (x, y))])
 
 
-def recoded(href: str) -> str:
-    """Return a PNG in a data address as WebP; unchanged where that is no smaller, or where it is no PNG.
+def recoded_image(href: str) -> str:
+    """Return a PNG in a data URI as WebP; unchanged if that is not smaller, or if it is not a PNG.
 
     Parameters
     ----------
-    href : a data address.
+    href : a data URI.
 
     Returns
     -------
-    str, a data address
+    str, a data URI
     """
     from PIL import Image
 
@@ -202,13 +204,13 @@ def recoded(href: str) -> str:
     picture = Image.open(io.BytesIO(raw))
     alpha = picture.mode == "RGBA" and picture.getchannel("A").getextrema() != (255, 255)
     file = io.BytesIO()
-    picture.convert("RGBA" if alpha else "RGB").save(file, "WEBP", quality=_PICTURE_QUALITY, method=4)
+    picture.convert("RGBA" if alpha else "RGB").save(file, "WEBP", quality=_WEBP_QUALITY, method=4)
     kind, small = ("webp", file.getvalue()) if file.tell() < len(raw) else ("png", raw)
     return f"data:image/{kind};base64,{base64.b64encode(small).decode('ascii')}"
 
 
 def _merged(elements: Sequence[_Element], axis: bool = False) -> list[_Element]:
-    """Neighbouring paths of equal style as one; in an axis, where nothing hides anything, all of equal style."""
+    """Merge neighbouring paths of equal style; in an axis, where nothing overlaps, all paths of equal style."""
     merged: list[_Element] = []
     for element in sorted(elements, key=lambda element: element.tag == "text") if axis else elements:
         candidates = merged if axis else merged[-1:]
@@ -225,8 +227,8 @@ def _mergeable(first: _Element, second: _Element) -> bool:
         first.tag == second.tag == "path"
         and first.style == second.style
         and first.attributes == second.attributes
-        and len(first.commands) + len(second.commands) < _LONGEST_PATH
-        and (first.style.get("fill") == "none" or len(second.commands) <= _SHORT_MARKER)
+        and len(first.commands) + len(second.commands) < _MAX_PATH_COMMANDS
+        and (first.style.get("fill") == "none" or len(second.commands) <= _MAX_MARKER_COMMANDS)
     )
 
 
@@ -274,7 +276,7 @@ def parse_path(d: str) -> list[Command]:
     Raises
     ------
     ValueError
-        If there is anything else in it.
+        If it has any other command.
     """
     commands: list[Command] = []
     letter, numbers = "", [0.0][:0]
@@ -310,8 +312,8 @@ def moved(commands: Sequence[Command], x: float, y: float) -> list[Command]:
 def write_path(commands: Sequence[Command]) -> str:
     """Return the `d` of a path: relative steps on a grid of 0.1 pt (0.13 pixels of a screen, 35 µm on paper).
 
-    Every step begins where the rounded one before it ended, so that rounding does not add up. Steps of no length are
-    left out, but for those that make a dot.
+    Every step begins at the rounded end of the previous one, so that rounding errors do not accumulate. Steps of zero
+    length are left out, except those that make a dot.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Every trial as the page shows it: its numbers, its status and why, its strip, its motion, its data; and its scale."""
+"""Trials in the report: values, status and reason, strip, motion, data, and calibration."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
     from vinetrack.report.build import ReportContent
 
-LARGEST_SVG_BYTES = 1_500_000
-"""Chosen: a tenth of the 15 MB that a report may have; a larger picture is left as a file beside it."""
+MAX_SVG_BYTES = 1_500_000
+"""Chosen: a tenth of the 15 MB that a report may have; a larger figure is left as a file beside it."""
 
-KINDS = {
+CALIBRATION_NAMES = {
     "charuco": "ChArUco board",
     "checkerboard": "checkerboard",
     "two_points": "two points and their distance",
@@ -39,35 +39,37 @@ FLAG_WORDS = {
     "after_end": "after the end",
 }
 SHARED_ERROR = (
-    "The error of the scale is kept apart from the random error of single points: all points of a recording share it, "
-    "and all recordings share that of one target. It stretches every length and speed alike, so that no replicate "
-    "shows it and no average reduces it. It is no part of the ± of a speed nor of the intervals from resampling; the "
-    "wider intervals of B include it (a scale that is off by ε moves ln B by n·ε), and n does not depend on it."
+    "The error of the scale is stated separately from the random error of single points: it is common to all points of "
+    "a recording and to all recordings of one target. It changes every length and speed by the same factor, so that "
+    "replicates do not show it and averaging does not reduce it. It is not included in the ± of a speed or in "
+    "bootstrap intervals; the wider intervals of B include it (a relative scale error ε changes ln B by n·ε), and n is "
+    "independent of it."
 )
 
 METHODS = (
     (
         "Edge",
-        "A strip along the axis of growth is cut from every frame and freed of flicker and shake by what "
-        "stands still beside the vine. A pixel that the vine covers changes once: its brightness before and after and "
-        "the place of the edge in every frame are found in turns, the edge by maximum likelihood from a step blurred "
-        "by optics and by its own motion, at mid-exposure. Time is the number of the frame over the rate of capture.",
+        "A strip along the axis of growth is cut from every frame; flicker and shake are estimated from the stationary "
+        "scene beside the vine and removed. A pixel that the vine covers changes once: its brightness before and after "
+        "and the position of the edge in every frame are estimated alternately, the edge by maximum likelihood from a "
+        "step blurred by the optics and by its own motion, at mid-exposure. Time is the frame number divided by the "
+        "capture rate.",
     ),
     (
         "Scale",
-        "Positions along the axis go through a camera with radial distortion that looks at a tilted plane, fitted to "
-        "the corners of the target; without a target, through one number.",
+        "Positions along the axis are converted with the model of a camera with radial distortion looking at a tilted "
+        "plane, fitted to the corners of the target; without a target, with a single scale.",
     ),
 )
-"""How recordings were measured, as (heading, paragraph) pairs."""
+"""Methods for recordings, as (heading, paragraph) pairs."""
 
 
 @dataclass(frozen=True)
 class TrackedRecording:
     """A recording in the report: its strip as SVG ("" for none), the flags of its frames, and its calibration.
 
-    `calibration` is what the recording's stage wrote: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
-    n_corners, n_pictures, notes`; None where there was none to be had.
+    `calibration` was written by the recording's stage: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
+    n_corners, n_pictures, notes`; None if there is none.
     """
 
     strip: str
@@ -76,7 +78,7 @@ class TrackedRecording:
 
 
 def count_frames(flags: Iterable[str]) -> str:
-    """How many frames there are, and how many of them carry which flag, in words.
+    """Return the number of frames, and of those with each flag, as text.
 
     Parameters
     ----------
@@ -96,7 +98,7 @@ def count_frames(flags: Iterable[str]) -> str:
 
 
 def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[str, Any]]:
-    """One row a calibration, with what it found and the trials that rest on it.
+    """Return one row per calibration, with its results and its trials.
 
     Parameters
     ----------
@@ -104,7 +106,7 @@ def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[s
 
     Returns
     -------
-    list of dict for the template, one a calibration
+    list of dict for the template, one per calibration
     """
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, recording in recordings.items():
@@ -134,7 +136,7 @@ def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[s
     ]
     has_target = bool(first["n_corners"]) and _is_number(first["reprojection_px"])
     return {
-        "kind": KINDS.get(first["kind"], first["kind"]),
+        "kind": CALIBRATION_NAMES.get(first["kind"], first["kind"]),
         "image": first["image"] or "",
         "mm_per_px": spread,
         "error": f"{number(100 * max(errors), 2)} %" if errors else "unknown",
@@ -149,15 +151,15 @@ def _is_number(value: Any) -> bool:
     return value is not None and math.isfinite(value)
 
 
-PICTURES_BYTES = 10_000_000
-"""Of the pictures of single trials together; derived: 15 MB of a report less 5 MB for all else of 200 trials."""
+MAX_TRIAL_FIGURES_BYTES = 10_000_000
+"""Total size of the figures of single trials; derived: 15 MB of a report minus 5 MB for the rest with 200 trials."""
 
-MOST_ROWS, MOST_ROWS_IN_ALL = 240, 24_000
-"""Rows of motion to download, of one trial and of all; chosen: as many as figures show; files have all."""
+MAX_DATA_ROWS, MAX_DATA_ROWS_TOTAL = 240, 24_000
+"""Maximum rows of motion data in the page, per trial and in total; chosen: as many as figures show; files have all."""
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
-    """All trials for the template, and of how many the pictures were too much for one page.
+    """Return all trials for the template, and the number of trials whose figures were left out for size.
 
     Parameters
     ----------
@@ -166,13 +168,13 @@ def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
     Returns
     -------
     entries : list of dict for the template
-    n_left_out : int, trials whose pictures exceed `PICTURES_BYTES` together
+    n_left_out : int, trials whose figures exceed `MAX_TRIAL_FIGURES_BYTES` in total
     """
     entries, left_out, weight = [], 0, 0
     for row in rows(content.trials):
         entry = _trial_numbers(row, content)
         strip, motion = _trial_pictures(row, content)
-        if weight + len(strip) + len(motion) > PICTURES_BYTES:
+        if weight + len(strip) + len(motion) > MAX_TRIAL_FIGURES_BYTES:
             left_out += bool(strip or motion)
             strip = motion = ""
         weight += len(strip) + len(motion)
@@ -187,7 +189,7 @@ def _marked(**pictures: str) -> dict[str, Any]:
 
 
 def _trial_pictures(row: Any, content: ReportContent) -> tuple[str, str]:
-    """Strip and motion of one trial, ready for the page; blank where there is none."""
+    """Strip and motion figure of one trial, ready for the page; blank if there is none."""
     name = row.trial
     recording, motion = content.recordings.get(name), content.trial_figures.get(name, "")
     strip = recording.strip if recording is not None else ""
@@ -200,7 +202,7 @@ def _trial_pictures(row: Any, content: ReportContent) -> tuple[str, str]:
 
 
 def _fits(svg: str) -> bool:
-    return 0 < len(svg) <= LARGEST_SVG_BYTES
+    return 0 < len(svg) <= MAX_SVG_BYTES
 
 
 def _trial_numbers(row: Any, content: ReportContent) -> dict[str, Any]:
@@ -230,8 +232,8 @@ def _trial_numbers(row: Any, content: ReportContent) -> dict[str, Any]:
 
 
 def _thinned(curve: pd.DataFrame, n_trials: int) -> str:
-    """A trial's motion as CSV, with five digits, which is finer than any of them is known."""
-    most = max(min(MOST_ROWS_IN_ALL // n_trials, MOST_ROWS), 2)
+    """Motion of a trial as CSV, with five digits, more than the accuracy of any value."""
+    most = max(min(MAX_DATA_ROWS_TOTAL // n_trials, MAX_DATA_ROWS), 2)
     shown = curve.iloc[:: -(-len(curve) // most)]
     return str(shown.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
 
@@ -256,7 +258,7 @@ def speed_sparkline(
     width_px: int = 132,
     height_px: int = 30,
 ) -> str:
-    """Speed against time as a small SVG, the steady stretch thick; blank where there is nothing to draw.
+    """Return speed against time as a small SVG, with the steady window thick; blank if there is nothing to draw.
 
     Parameters
     ----------
