@@ -15,7 +15,7 @@ from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.intervals import precision
-from vinetrack.inference.robust_covariance import _few_trials, robust_covariance, widened_covariance
+from vinetrack.inference.robust_covariance import _few_trial_variances, robust_covariance, widened_covariance
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA, Systematics
 
 Pairs = list[tuple[Trial, Track]]
@@ -96,7 +96,7 @@ def test_of_few_trials_the_variance_of_their_mean_is_found_without_bias(trials: 
     for _ in range(3000):
         values = 0.2 * draw.standard_normal(trials)
         scores = 25.0 * (values - values.mean())[:, None]
-        variance, degrees = _few_trials(information, scores, solution, plain)
+        variance, degrees = _few_trial_variances(information, scores, solution, plain)
         assert degrees[0] == pytest.approx(trials - 1)
         found.append(variance[0])
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)

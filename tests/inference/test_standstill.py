@@ -47,5 +47,5 @@ def test_what_is_free_in_a_trial_is_named_only_where_it_is(fallen: tuple[Trial, 
     trial, track = fallen
     steep = replace(track, lead_position_m=2.0 * track.lead_position_m)
     messages = " ".join(vt.fit(vt.make_model(["gravity"]), [(trial, steep)]).messages)
-    assert "times the noise of the tracks: something is missing" in messages
+    assert "times the noise of the tracks: an effect is missing" in messages
     assert "B and pressure" not in messages

@@ -20,7 +20,12 @@ from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures, systematics_of
-from vinetrack.inference.trace_errors import as_recorded, penalty, trace_error_step, with_fitted_trace_errors
+from vinetrack.inference.trace_errors import (
+    as_recorded,
+    trace_error_penalty,
+    trace_error_step,
+    with_fitted_trace_errors,
+)
 
 SEED = 20602
 
@@ -47,7 +52,7 @@ def test_what_is_left_is_the_noise_of_the_positions_and_each_error_is_of_the_siz
     told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
     assert told.size > 12
     assert 0.4 < np.sqrt(np.mean(told**2)) < 1.6
-    assert penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
+    assert trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
 
 
 def test_an_error_that_a_trace_has_is_found(fit: vt.Fit):
@@ -86,8 +91,8 @@ def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
     data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
     predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
     free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
-    assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * penalty(fit.predictor.data))
-    assert penalty(fit.predictor.data) > 1.0
+    assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * trace_error_penalty(fit.predictor.data))
+    assert trace_error_penalty(fit.predictor.data) > 1.0
 
 
 def test_what_was_recorded_is_kept(fit: vt.Fit):

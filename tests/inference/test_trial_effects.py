@@ -11,7 +11,7 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import trial_effects
-from vinetrack.inference.assemble import _beside_smooth_errors, log_likelihood
+from vinetrack.inference.assemble import _with_smooth_errors_removed, log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState
@@ -224,7 +224,7 @@ def test_deviations_that_a_straight_line_promises_without_end_are_stated_as_far_
     effects[0], effects[1] = 2000.0, -2000.0
     there = replace(fitted.solution, state=replace(fitted.solution.state, trial_effects=effects))
     smooth = SmoothErrors(there, 0.0, tuple(trial.whitened for trial in fitted.trials), ())
-    high, low, *others = _beside_smooth_errors(fitted.trials, smooth)
+    high, low, *others = _with_smooth_errors_removed(fitted.trials, smooth)
     assert high.damping_deviation == pytest.approx(math.expm1(LARGEST_DEVIATION))
     assert low.damping_deviation == pytest.approx(math.expm1(-LARGEST_DEVIATION))
     assert (high.pressure_deviation, low.pressure_deviation) == (LARGEST_DEVIATION, -LARGEST_DEVIATION)

@@ -39,7 +39,7 @@ FIT = {
         },
     ],
     "spreads": {"B": {"value": 0.03, "estimated": True}, "pressure": {"value": 0.01, "estimated": False}},
-    "messages": ["P_y: the trajectories say no more than the sheet does"],
+    "messages": ["P_y: the trajectories do not constrain it beyond the value in the sheet"],
     "warnings": ["Trial a: the tail would have to push."],
     "left_out": {"b": "its leading edge never moves"},
 }

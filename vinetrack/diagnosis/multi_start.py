@@ -28,7 +28,7 @@ from vinetrack.inference.optimiser import STAGNATION_DECREASE, FixedTerms, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.inference.solving import SLOW_NOISE
-from vinetrack.inference.starts import align, one_of_each_condition
+from vinetrack.inference.starts import align, one_trial_per_condition
 from vinetrack.inference.trace_errors import as_recorded
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
@@ -187,7 +187,7 @@ def _subset(data: Sequence[FitTrial]) -> list[int]:
 
     Every vine keeps at least one trial.
     """
-    candidates = one_of_each_condition(data)
+    candidates = one_trial_per_condition(data)
     if len(candidates) <= MAX_SUBSET_TRIALS:
         return candidates
     vines = {data[i].trial.vine for i in candidates}

@@ -19,7 +19,7 @@ from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.explorer.campaign import Campaign, ExplorerTrial
-from vinetrack.inference.left_out import TOLD_APART, scaled_least_squares
+from vinetrack.inference.left_out import LEAST_EIGENVALUE, scaled_least_squares
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
 GRID_POINTS = 500
@@ -184,7 +184,7 @@ def _step(slope: Floats, residual: Floats, *, free_origin: bool) -> tuple[float,
         square = float(slope @ slope)
         return (float(slope @ residual) / square if square > 0 else 0.0), 0.0
     design = np.column_stack([slope, np.ones(slope.size)])
-    shift, rise = scaled_least_squares(design, residual, math.sqrt(TOLD_APART))
+    shift, rise = scaled_least_squares(design, residual, math.sqrt(LEAST_EIGENVALUE))
     return float(shift), float(rise)
 
 

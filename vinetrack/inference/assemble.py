@@ -1,8 +1,7 @@
-"""From the end of the iterations to a `Fit`: values with their errors, each trial's own numbers, words of warning."""
+"""Assemble a `Fit` from a solution: values with errors and intervals, trial effects, messages."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model, values_by_key
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_messages import SPREAD_NAMES, fit_messages
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
 from vinetrack.inference.goodness_of_fit import chi2_per_dof
 from vinetrack.inference.intervals import Precision, first_parameters, near_bound, precision, profile_interval, student
@@ -25,33 +24,10 @@ from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import too_few_clusters, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.trace_errors import penalty, trace_correction_Pa
+from vinetrack.inference.trace_errors import trace_error_penalty
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
-
-HARD_TO_TELL_APART = 0.98
-"""Correlation of two fitted numbers from which the fit warns. Chosen: at 0.98 the error of each is five times what it
-would be with the other known (1/√(1 − 0.98²)); it decides a warning alone."""
-
-ADDS_NOTHING = 0.95
-"""Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it. Chosen: at 0.95
-they add a tenth of the information; wording alone depends on it."""
-
-WIDENED = 1.05
-"""The same ratio from which it is said why the fitted error exceeds the stated one. Chosen; wording alone depends on
-it."""
-
-MISSES = 2.0
-"""χ² per degree of freedom from which the fit warns that it misses the data. Chosen: half of it would warn of every
-sound fit (χ² per degree of freedom is 1 there), twice would keep silent about visible misfit; it decides a warning
-alone."""
-
-DISAGREE = 1.0
-"""Standard deviation between trials, in errors of the number shared, from which the fit says that trials disagree.
-Derived: of two trials that scatter by more than their noise it is √2, of trials that agree mostly 0; wording alone."""
-
-SPREAD_NAMES = ("pressure", "B")
 
 
 def assemble(
@@ -62,7 +38,7 @@ def assemble(
     *,
     profile: bool,
 ) -> Fit:
-    """Assemble a `Fit` from where the iterations ended: numbers with errors and intervals, trial effects, messages.
+    """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages.
 
     Parameters
     ----------
@@ -82,46 +58,43 @@ def assemble(
     Fit
     """
     layout, state = predictor.layout, solution.state
-    plain = log_likelihood(solution) - 0.5 * penalty(predictor.data)
+    plain = log_likelihood(solution) - 0.5 * trace_error_penalty(predictor.data)
     smooth = smooth_errors(predictor, solution, options.get("held"))
-    wide = smooth.solution if smooth else solution
-    by_noise = precision(wide)
+    extended = smooth.solution if smooth else solution
+    by_noise = precision(extended)
     trials = _trial_fits(predictor, solution, first_parameters(by_noise, len(layout.free)))
-    pooled = _pooled(predictor, solution, options)
+    pooled = _pooled_if_few(predictor, solution, options)
     if pooled is not None:
-        wide, by_noise = pooled.solution, replace(by_noise, covariance=_with_unknown(pooled.covariance, by_noise))
+        extended, by_noise = (
+            pooled.solution,
+            replace(by_noise, covariance=_with_undetermined(pooled.covariance, by_noise)),
+        )
     if smooth is not None:
-        trials = _beside_smooth_errors(trials, smooth)
-    known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None, pooled)
-    by_noise, known = (first_parameters(each, len(layout.free)) for each in (by_noise, known))
-    numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
-    between = _outside(layout, numbers, _between(pooled, len(numbers)))
+        trials = _with_smooth_errors_removed(trials, smooth)
+    precision_of_fit = widened_covariance(predictor, solution, trials, by_noise, extended if smooth else None, pooled)
+    by_noise, precision_of_fit = (first_parameters(each, len(layout.free)) for each in (by_noise, precision_of_fit))
+    numbers = _numbers(predictor, solution, extended.state.theta, by_noise, precision_of_fit, profile=profile)
+    between = _in_SI_units(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
-    beside = smooth.solution.state if smooth else state
-    variance = float(np.average(beside.variance, weights=weights)) / (1 - beside.rho**2)
-    felt = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
+    variance_state = smooth.solution.state if smooth else state
+    variance = float(np.average(variance_state.variance, weights=weights)) / (1 - variance_state.rho**2)
+    has_deviations = [bool(solution.problem.has_deviation[:, k].any()) for k in range(2)]
     return Fit(
         model=_fitted_model(layout, numbers),
         numbers=numbers,
-        covariance=_outside(layout, numbers, known.covariance),
+        covariance=_in_SI_units(layout, numbers, precision_of_fit.covariance),
         spreads={
-            name: BetweenTrialSpread(beside.spread[k], solution.estimable[k])
+            name: BetweenTrialSpread(variance_state.spread[k], solution.estimable[k])
             for k, name in enumerate(SPREAD_NAMES)
-            if felt[k]
+            if has_deviations[k]
         },
         noise_m=math.sqrt(variance),
-        noise_correlation=beside.rho,
+        noise_correlation=variance_state.rho,
         chi2_per_dof=chi2,
         log_likelihood=plain + smooth.gain if smooth else plain,
         trials=trials,
-        messages=(
-            *_messages(layout, solution, numbers, known, chi2),
-            *_disagreements(numbers, between),
-            *_weighted(predictor.data),
-            *_smoothed(predictor.data),
-            *_mended(predictor.data),
-        ),
+        messages=fit_messages(predictor, solution, numbers, precision_of_fit, between, chi2),
         left_out=dict(left_out),
         converged=solution.converged,
         iterations=solution.iterations,
@@ -133,11 +106,11 @@ def assemble(
     )
 
 
-def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
-    """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube.
+def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
+    """Trials with the deviations and residuals of the fit that includes smooth errors of position.
 
-    The deviations come from one linear step, which is unbounded where a fit is far off: they are limited as the fit's
-    own are (LARGEST_DEVIATION). The residuals are those of the step itself.
+    The deviations come from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit
+    are (LARGEST_DEVIATION). The residuals are those of the step itself.
     """
     effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return tuple(
@@ -151,10 +124,10 @@ def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> t
     )
 
 
-def _pooled(predictor: Predictor, solution: Solution, options: Mapping[str, Any]) -> Pooled | None:
-    """The trials weighed by how much they disagree, where the fit itself knows of no disagreement.
+def _pooled_if_few(predictor: Predictor, solution: Solution, options: Mapping[str, Any]) -> Pooled | None:
+    """The fit with trials weighted by their disagreement, where the fit itself has no term for it.
 
-    That is where trials are few, or have nothing of their own: B and pressure are what a vine's trials may differ by.
+    That is where trials are few, or have neither B nor pressure, which are what trials of a vine may differ by.
     """
     held = options.get("held")
     if held is not None and held.noise is not None:
@@ -168,26 +141,13 @@ def _between(pooled: Pooled | None, count: int) -> Floats:
     return np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
 
 
-def _disagreements(numbers: Sequence[Number], between: Floats) -> list[str]:
-    """Numbers that trials disagree about by more than the error of their mean, in words."""
-    sd = np.sqrt(np.diag(between))
-    disagreements = [
-        f"{n.title} by ± {sd[k] * display_unit(n.unit)[1]:.2g} {display_unit(n.unit)[0]}".rstrip()
-        for k, n in enumerate(numbers)
-        if sd[k] > DISAGREE * n.sigma and math.isfinite(n.sigma)
-    ]
-    if not disagreements:
-        return []
-    return [f"trials disagree by more than their noise, in {', '.join(disagreements)}: they count nearly alike"]
-
-
-def _with_unknown(covariance: Floats, known: Precision) -> Floats:
-    unknown = ~np.isfinite(np.diag(known.covariance))
+def _with_undetermined(covariance: Floats, precision_of_fit: Precision) -> Floats:
+    unknown = ~np.isfinite(np.diag(precision_of_fit.covariance))
     return np.where(np.diag(unknown), math.inf, covariance)
 
 
 def log_likelihood(solution: Solution) -> float:
-    """Marginal ln L, spreads at their best for it (not the restricted one, which cannot compare models).
+    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models.
 
     Parameters
     ----------
@@ -219,14 +179,14 @@ def _numbers(
     solution: Solution,
     theta: Floats,
     by_noise: Precision,
-    known: Precision,
+    precision_of_fit: Precision,
     *,
     profile: bool,
 ) -> tuple[Number, ...]:
-    """The free numbers at `theta`, which holds them first, with their errors and intervals."""
+    """The free parameters, the first entries of `theta`, with their errors and intervals."""
     layout, problem = predictor.layout, solution.problem
-    sigma = np.sqrt(np.diag(known.covariance))
-    dof = known.degrees
+    sigma = np.sqrt(np.diag(precision_of_fit.covariance))
+    dof = precision_of_fit.degrees
     reach = student(dof)
     doubtful = near_bound(solution, sigma)
     numbers = []
@@ -235,7 +195,7 @@ def _numbers(
         if not math.isfinite(sigma[k]):
             low, high, method = problem.lower[k], problem.upper[k], "none"
         elif doubtful[k] and profile:
-            # The likelihood knows of the noise alone: it is followed as much further as the error is wider.
+            # The likelihood accounts for the noise alone; the interval is widened by the ratio of the errors.
             narrow = math.sqrt(by_noise.covariance[k, k])
             low, high = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
             method = "profile"
@@ -249,49 +209,49 @@ def _numbers(
                 unit=number.unit,
                 value=number.from_scaled(float(theta[k])),
                 sigma=float(sigma[k]) * number.derivative(number.from_scaled(float(theta[k]))),
-                low=_bound_outside(number, low),
-                high=_bound_outside(number, high),
+                low=_bound_in_SI_units(number, low),
+                high=_bound_in_SI_units(number, high),
                 dof=float(dof[k]),
                 method=method,
-                bound=_bound_outside(number, at[0]) if at else math.nan,
-                lower=_bound_outside(number, problem.lower[k]),
-                upper=_bound_outside(number, problem.upper[k]),
+                bound=_bound_in_SI_units(number, at[0]) if at else math.nan,
+                lower=_bound_in_SI_units(number, problem.lower[k]),
+                upper=_bound_in_SI_units(number, problem.upper[k]),
             )
         )
     return tuple(numbers)
 
 
-def _bound_outside(number: FreeParameter, theta: float) -> float:
+def _bound_in_SI_units(number: FreeParameter, theta: float) -> float:
     return number.from_scaled(float(theta)) if math.isfinite(theta) else math.inf * theta
 
 
-def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
+def _in_SI_units(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
     slopes = np.array([free.derivative(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     return np.asarray(covariance * slopes[:, None] * slopes)
 
 
-def _own_sigma(solution: Solution, known: Precision) -> Floats:
-    """Standard errors of each trial's own numbers, shape (n_trials, 4), those of the shared numbers included."""
+def _trial_effect_sigma(solution: Solution, precision_of_fit: Precision) -> Floats:
+    """Standard errors of the trial effects, including those of the shared parameters, shape (n_trials, 4)."""
     problem, state = solution.problem, solution.state
     white = at_correlation(solution.cross_products, state.rho) / state.variance[:, None, None]
     precision_own = trial_effect_prior(problem, state)[1]
     square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision_own[:, :, None] * np.eye(N_TRIAL_EFFECTS)
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(N_TRIAL_EFFECTS)
-    inverse = np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :]
-    lever = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
+    scaled = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(N_TRIAL_EFFECTS)
+    inverse = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+    response = inverse @ white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
     shared = np.zeros((state.theta.size + 1,) * 2)
-    shared[:-1, :-1] = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
-    mine = shared[problem.index[:, :, None], problem.index[:, None, :]]
-    total = inverse + lever @ mine @ np.swapaxes(lever, 1, 2)
+    shared[:-1, :-1] = np.where(np.isfinite(precision_of_fit.covariance), precision_of_fit.covariance, 0.0)
+    shared_of_trial = shared[problem.index[:, :, None], problem.index[:, None, :]]
+    total = inverse + response @ shared_of_trial @ np.swapaxes(response, 1, 2)
     sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
     for k, column in enumerate((PRESSURE, DAMPING_DEVIATION)):
         sigma[~problem.has_deviation[:, k], column] = 0.0
     return np.asarray(sigma)
 
 
-def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
-    state, sigma = solution.state, _own_sigma(solution, known)
+def _trial_fits(predictor: Predictor, solution: Solution, precision_of_fit: Precision) -> tuple[TrialFit, ...]:
+    state, sigma = solution.state, _trial_effect_sigma(solution, precision_of_fit)
     moved = predictor.trajectories_at(state.theta, state.trial_effects)
     return tuple(
         trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
@@ -310,20 +270,20 @@ def trial_fit(
     rho: float,
     variance: float,
 ) -> TrialFit:
-    """One trial with its own numbers and what the model says of it.
+    """One trial with its trial effects and the predictions of the model.
 
     Parameters
     ----------
     trial_data
-        The trial as the fit sees it.
+        The data of the trial.
     trial_effects : array, shape (4,)
         Release, s; origin, m; deviations of pressure and ln B.
     sigma : array, shape (4,)
         Their standard errors.
     position_m : array, shape (n_points,), m
-        Positions by the model, from an origin of 0.
+        Predicted positions, from an origin of 0.
     velocity_m_s : array, shape (n_points,), m/s
-        Speed of the leading edge by the model.
+        Predicted speed of the leading edge.
     rho : float
         Lag-one correlation of the noise.
     variance : float
@@ -354,89 +314,3 @@ def trial_fit(
         noise_m=math.sqrt(variance / (1 - rho**2)),
         imprecise_rest=trial_data.imprecise_rest,
     )
-
-
-def _messages(
-    layout: ParameterMap, solution: Solution, numbers: Sequence[Number], known: Precision, chi2: float
-) -> list[str]:
-    """What to beware of, in words."""
-    messages = []
-    if not solution.converged:
-        messages.append(
-            f"the fit did not settle in {solution.iterations} iterations: its numbers are not to be trusted"
-        )
-    for k, number in enumerate(numbers):
-        free = layout.free[k]
-        if known.insensitive[k]:
-            messages.append(
-                f"{number.title} ({number.key}) never moved the trajectories: it stays at {number.value:.4g}"
-            )
-        elif math.isfinite(number.bound):
-            messages.append(
-                f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data want it beyond"
-            )
-        elif math.isfinite(free.prior_sd) and number.sigma > ADDS_NOTHING * free.prior_sd:
-            wider = number.sigma > WIDENED * free.prior_sd
-            why = "; they disagree by more than their noise, so its error exceeds the sheet's" if wider else ""
-            messages.append(f"{number.title}: the trajectories say no more than the sheet does{why}")
-    if known.collinear.any():
-        titles = [f"{n.title} ({n.key})" for n, collinear in zip(numbers, known.collinear, strict=True) if collinear]
-        messages.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
-    messages += _close_pairs(numbers, known)
-    for k, name in enumerate(SPREAD_NAMES):
-        if solution.problem.has_deviation[:, k].any() and not solution.estimable[k]:
-            messages.append(
-                f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %"
-            )
-    if chi2 > MISSES:
-        messages.append(
-            f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks{_free_in_trials(solution)}:"
-            " something is missing, or tracks err slowly by more than their noise"
-        )
-    return messages
-
-
-def _free_in_trials(solution: Solution) -> str:
-    """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
-    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.has_deviation[:, k].any()]
-    return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
-
-
-def _smoothed(data: Sequence[FitTrial]) -> list[str]:
-    """What is said of positions that somebody smoothed."""
-    return list(dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None))
-
-
-def _mended(data: Sequence[FitTrial]) -> list[str]:
-    """What is said of recorded pressures that the motion told better than their gauge."""
-    moved = [float(np.max(np.abs(trace_correction_Pa(each)))) for each in data if each.trace_error_sizes is not None]
-    if not moved:
-        return []
-    trials = f"{len(moved)} trials" if len(moved) > 1 else "one trial"
-    return [
-        f"recorded pressures of {trials} are corrected by up to {max(moved) / 1e3:.2g} kPa, as far as the noise of the"
-        " gauge leaves them open and the motion tells them"
-    ]
-
-
-def _weighted(data: Sequence[FitTrial]) -> list[str]:
-    """What is to be said of points that do not count alike."""
-    weighted = [trial_data for trial_data in data if trial_data.relative_sd is not None]
-    if not weighted:
-        return []
-    if weighted[0].blur_s > 0:
-        blur_us = 1e6 * weighted[0].blur_s
-        return [f"the noise of positions grows with speed, by {blur_us:.2g} µs × speed: points are weighted by it"]
-    return ["points are weighted by the standard deviations that their files state"]
-
-
-def _close_pairs(numbers: Sequence[Number], known: Precision) -> list[str]:
-    pairs = []
-    variance = np.diag(known.covariance)
-    usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
-    for i, j in itertools.combinations(usable.tolist(), 2):
-        correlation = known.covariance[i, j] / math.sqrt(variance[i] * variance[j])
-        if abs(correlation) > HARD_TO_TELL_APART:
-            first, second = numbers[i].title, numbers[j].title
-            pairs.append(f"{first} and {second} can hardly be told apart (correlation {correlation:.3f})")
-    return pairs

@@ -1,8 +1,8 @@
-"""By how much the numbers of a fit would move if the film weighed a little other than the sheet says.
+"""Sensitivity of fitted numbers to the mass of the film.
 
-The mass of the film is computed from its thickness and density, which no sheet knows better than to a few per cent.
-It is no part of the stated errors: it can be weighed, and then it is nothing. In a campaign of two dozen quiet trials
-it may be more than everything that is part of them, and then the fit says so.
+The mass of the film is computed from its thickness and density, which no sheet states to better than a few per cent. It
+is not part of the stated errors, because it can be weighed and is then negligible. In a campaign of two dozen precise
+trials it may exceed all stated errors, and the fit then says so.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from vinetrack.inference.robust_covariance import parameter_shifts
 from vinetrack.inference.systematics import FILM_ERROR, film_errors
 
 FILM = "film_mass"
-"""The effect that makes the mass of the film a number of the fit."""
+"""The effect that makes the mass of the film a free parameter."""
 
 MATTERS = 1.0
-"""Movement of a number, in its stated errors, from which the film is mentioned. Derived: with the film in it the error
-of the number would then be √2 times as large; at half 1.12 times, at twice 2.2 times. Wording alone depends on it."""
+"""Change of a number, in its stated errors, from which the film is mentioned. Derived: with the film included, the
+error of the number would be √2 times as large; at half 1.12 times, at twice 2.2 times. It decides wording alone."""
 
 MOST_NAMED = 4
-"""Numbers named with their movements at most, those moved furthest first. Chosen: two lines; at half n may stand alone,
-at twice it fills four. Wording alone."""
+"""Largest number of changes listed, the largest first. Chosen: two lines; at half n may be listed alone, at twice it
+fills four. Wording alone."""
 
 
 def film_influence(fit: Fit) -> Floats:
-    """Standard deviation that film of an unknown mass, each vine's by 2 %, adds to each number of a fit.
+    """Standard deviation of each fitted number due to an unknown film mass, independent by 2 % for each vine.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def film_influence(fit: Fit) -> Floats:
 
 
 def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
-    """What is to be said of the film beside the errors of a fit: one sentence, or none where it matters less than they.
+    """A message on the film mass where it matters as much as the stated errors, else none.
 
     Parameters
     ----------
@@ -73,17 +73,17 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
     tuple of str
     """
     sigma = np.array([number.sigma for number in numbers])
-    times = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
-    named = [k for k in np.argsort(-times, kind="stable").tolist() if times[k] >= MATTERS]
-    if not named:
+    ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))
+    affected = [k for k in np.argsort(-ratio, kind="stable").tolist() if ratio[k] >= MATTERS]
+    if not affected:
         return ()
     parts = []
-    for k in named[:MOST_NAMED]:
+    for k in affected[:MOST_NAMED]:
         unit, factor = display_unit(numbers[k].unit)
         parts.append(f"{numbers[k].title} by {factor * moved[k]:.2g} {unit}".rstrip())
-    more = len(named) - len(parts)
+    more = len(affected) - len(parts)
     listed = ", ".join(parts) + (f", and {more} more" if more else "")
     return (
-        f"these errors take the mass of the film as stated; were it off by {100 * FILM_ERROR:g} % in each vine, that"
-        f" would move {listed}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3 by it",
+        f"these errors assume the stated film mass; an error of {100 * FILM_ERROR:g} % in each vine would change"
+        f" {listed}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3",
     )

@@ -1,4 +1,4 @@
-"""What a fit found: numbers with errors and intervals, what each trial has of its own, and what to beware of."""
+"""The result of a fit: numbers with errors and intervals, trial effects, and messages."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 class Number:
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval.
 
-    `vine` is blank where the number holds for all. `method` tells where the interval comes from: `linear`, `profile`
-    where a bound is near, `none` where the data leave it open. `bound` is the bound it sits at, NaN elsewhere;
-    `lower` and `upper` are those that it was kept within.
+    `vine` is blank if the number applies to all. `method` tells how the interval was found: `linear`, `profile` near a
+    bound, `none` if the data do not determine it. `bound` is the bound at which the number is, NaN elsewhere; `lower`
+    and `upper` are the bounds of the fit.
     """
 
     key: str
@@ -50,12 +50,12 @@ class Number:
 
     @property
     def name(self) -> str:
-        """`effect.parameter`, with the vine in brackets where it has one of its own."""
+        """`effect.parameter`, with the vine in brackets if it belongs to one."""
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
     @property
     def title(self) -> str:
-        """Symbol, and the vine where it has one of its own."""
+        """Symbol, with the vine in brackets if it belongs to one."""
         return f"{self.symbol} ({self.vine})" if self.vine else self.symbol
 
     def to_json(self) -> dict[str, Any]:
@@ -108,7 +108,7 @@ class Number:
 
     @property
     def ends_at(self) -> str:
-        """Which ends of the 95 % interval are bounds and no findings: `lower`, `upper`, `lower and upper`, or blank."""
+        """Ends of the 95 % interval that are bounds, not estimates: `lower`, `upper`, `lower and upper`, or blank."""
         slack = 1e-6 * max(abs(self.high - self.low), 1e-12 * max(abs(self.low), abs(self.high)))
         ends = [("lower", self.low - self.lower <= slack), ("upper", self.upper - self.high <= slack)]
         return " and ".join(name for name, is_bound in ends if is_bound)
@@ -116,7 +116,7 @@ class Number:
 
 @dataclass(frozen=True)
 class BetweenTrialSpread:
-    """Standard deviation from trial to trial, relative; `estimated` tells whether from these data."""
+    """Between-trial standard deviation, relative; `estimated` tells whether it is from these data."""
 
     value: float
     estimated: bool
@@ -126,10 +126,10 @@ class BetweenTrialSpread:
 class TrialFit:
     """One trial under the model; arrays have shape (n_points,), at the points that were used.
 
-    `whitened` are residuals freed of their correlation and of smooth errors of position, in standard deviations.
-    Deviations are relative, of the set pressure and of the vine's B. `band_m`, of a trial that was not in the fit, is
-    the half width of the 95 % band of its position about the prediction. `imprecise_rest` is the rest before the motion
-    where its points were left out.
+    `whitened` are whitened residuals, without smooth errors of position, in standard deviations. Deviations are
+    relative to the set pressure and to the vine's B. `band_m`, for a trial that was not in the fit, is the half width
+    of the 95 % prediction band of its position. `imprecise_rest` replaces a rest before the motion whose points were
+    left out.
     """
 
     trial: Trial
@@ -153,7 +153,7 @@ class TrialFit:
 
     @property
     def within_band(self) -> float:
-        """Part of the positions that lie within the band; NaN where there is none."""
+        """Fraction of the positions within the band; NaN without a band."""
         if self.band_m is None:
             return math.nan
         return float(np.mean(np.abs(self.residual_m) <= self.band_m))
@@ -170,13 +170,13 @@ class TrialFit:
 
 
 class NumberTable:
-    """What a fit in memory and one that was read back have in common: the numbers with their covariance."""
+    """Access to the numbers of a fit and their covariance, common to a fit in memory and one read from a file."""
 
     numbers: tuple[Number, ...]
     covariance: Floats
 
     def __getitem__(self, name: str) -> Number:
-        """The number of that name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
+        """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
 
         Raises
         ------
@@ -205,7 +205,7 @@ class NumberTable:
         return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
 
     def table(self) -> pd.DataFrame:
-        """A row a number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`; SI."""
+        """One row per number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`; SI."""
         import pandas as pd
 
         return pd.DataFrame(
@@ -218,15 +218,15 @@ class NumberTable:
 class Fit(NumberTable):
     """A model fitted to trajectories. Printed, it is a table.
 
-    `model` carries the fitted values. `covariance` is that of `numbers`, SI, in their order. `noise_m` is the standard
-    deviation of a position and `noise_correlation` its lag-one correlation, found with the model;
-    `chi2_per_dof` holds what the model leaves against the noise of the tracks alone: 1 where nothing is missed.
-    `log_likelihood` is the marginal one, every trial's own numbers integrated out, spreads and noise at their best:
-    what hypotheses are compared by. `left_out` gives trials that could not be used, and why; `pairs`
-    are the trials with their tracks, empty for a fit to part of another fit's trials. `between`, of the shape
-    of `covariance`, is by how much the numbers of a trial differ from the shared ones, beyond its deviations of
-    pressure and B (`vinetrack.inference.pooling`): all zeros where the trials agree, or are many. `smooth` is the
-    state of the solution with smooth errors of position beside it, None where positions have none.
+    `model` has the fitted values. `covariance` is that of `numbers`, SI, in their order. `noise_m` is the standard
+    deviation of a position and `noise_correlation` its lag-one correlation, estimated with the model; `chi2_per_dof`
+    compares the residuals with the noise of the tracks alone: 1 without misfit. `log_likelihood` is the marginal one,
+    trial effects integrated out, at its maximum over noise and between-trial standard deviations: hypotheses are
+    compared by it. `left_out` are the trials that could not be used, with the reason; `pairs` are the trials with their
+    tracks, empty for a fit to a subset of another fit's trials. `between`, of the shape of `covariance`, is the
+    between-trial covariance of the numbers beyond the deviations of pressure and B (`vinetrack.inference.pooling`):
+    zero where the trials agree, or are many. `smooth` is the state of the solution with smooth errors of position
+    included, None where positions have none.
     """
 
     model: Model
@@ -251,10 +251,10 @@ class Fit(NumberTable):
 
     @property
     def state(self) -> FitState:
-        """Numbers of the solution with noise and spreads as they are beside smooth errors of position.
+        """State of the solution, with the variance components of the fit that includes smooth errors of position.
 
-        A solution is iterated without smooth errors. What a lens bends then passes for deviations of single trials, and
-        spreads and noise take it up.
+        The iterations are without smooth errors, so that the displacement by a lens is taken for deviations of single
+        trials and enlarges noise and standard deviations.
         """
         state, smooth = self.solution.state, self.smooth
         if smooth is None:
@@ -281,7 +281,7 @@ class Fit(NumberTable):
         return self.model.names
 
     def positions(self) -> pd.DataFrame:
-        """Measured and predicted positions of all trials, one row a point.
+        """Measured and predicted positions of all trials, one row per point.
 
         Returns
         -------
@@ -305,7 +305,7 @@ class Fit(NumberTable):
         return pd.concat(parts, ignore_index=True)
 
     def plot(self, name: str = "model_comparison", **options: Any) -> Figure:
-        """Return a figure of the report for this model: `model_comparison` or `model_residuals`.
+        """A figure of the report for this model: `model_comparison` or `model_residuals`.
 
         Parameters
         ----------
@@ -335,7 +335,7 @@ class Fit(NumberTable):
 
 
 def numbers_text(fit: Any) -> list[str]:
-    """Return the numbers of a fit and of its noise as lines of text, and what to beware of.
+    """The numbers of a fit, its noise and its messages as lines of text.
 
     Parameters
     ----------
@@ -358,7 +358,7 @@ def numbers_text(fit: Any) -> list[str]:
 
 
 def number_row(number: Number) -> tuple[str, ...]:
-    """Return a number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit.
+    """A number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit.
 
     Parameters
     ----------
@@ -379,7 +379,7 @@ def number_row(number: Number) -> tuple[str, ...]:
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of (name, value, error, interval, unit) as lines of text in columns; values to the right, the rest left.
+    """Rows of (name, value, error, interval, unit) as aligned lines of text; values to the right, others to the left.
 
     Parameters
     ----------
@@ -402,5 +402,5 @@ def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def _spread_line(name: str, spread: BetweenTrialSpread) -> str:
-    how = "" if spread.estimated else " (held: too few trials to estimate it, or told)"
-    return f"spread of {name} from trial to trial {100 * spread.value:.2g} %{how}"
+    how = "" if spread.estimated else " (fixed: given, or too few trials to estimate it)"
+    return f"between-trial standard deviation of {name} {100 * spread.value:.2g} %{how}"

@@ -1,7 +1,7 @@
-"""A fit as `fit.json` holds it: everything that is quoted from a fit, without what it was computed with.
+"""The summary of a fit that `fit.json` stores: all quoted results, without the data and state behind them.
 
-`vinetrack.inference.summary_of_fit` takes it from a fit in memory and `FitSummary.from_json` from a file, so the keys
-of the file stand here alone.
+`vinetrack.inference.summary_of_fit` makes it from a fit in memory and `FitSummary.from_json` from a file, so that the
+keys of the file are defined here alone.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ class TrialEstimates:
 
 @dataclass(frozen=True, repr=False)
 class FitSummary(NumberTable):
-    """The quoted part of a fit: see `vinetrack.inference.fit_result.Fit` for what each field means.
+    """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field.
 
     `names` are those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the
-    audit. `refused` is the reason why the model was not fitted, blank where it was: all else is empty then.
-    `moved_by_film`, shape (n_numbers,), is what a film of a mass 2 % off would add to the errors, beside them.
+    audit. `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
+    `moved_by_film`, shape (n_numbers,), is the further standard deviation of each number if the film mass is uncertain
+    by 2 %.
     """
 
     names: tuple[str, ...]
@@ -69,7 +70,7 @@ class FitSummary(NumberTable):
         return values_by_key((number.key, number.vine, number.value) for number in self.numbers)
 
     def trial_table(self) -> pd.DataFrame:
-        """A row a trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
+        """One row per trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
         import pandas as pd
 
         columns = ["trial", *(entry.name for entry in fields(TrialEstimates))]

@@ -1,9 +1,9 @@
-"""How far the data pin the numbers of a fit: covariance, degrees of freedom, intervals, profiles.
+"""Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
 
-Errors follow from the information of the linear mixed model. As spreads are estimated from a handful of trials, 95 %
-intervals take Student's t with Satterthwaite's degrees of freedom (Giesbrecht & Burns, Biometrics 41, 477, 1985).
-Where a bound is near, a straight line says little: there the interval is that of the profile, the values that a
-constrained fit cannot reject.
+The covariance is the inverse information of the linearised mixed model. As between-trial standard deviations are
+estimated from a few trials, 95 % intervals use Student's t with Satterthwaite degrees of freedom (Giesbrecht & Burns,
+Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the profile
+likelihood: the values that a constrained fit does not reject.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import FixedTerms, Solution, solve
 from vinetrack.inference.sensitivity import Predictor
 
-SINGULAR = 1e-10
-"""Smallest eigenvalue of an information matrix of unit diagonal at which two numbers can still be told apart."""
+SINGULAR_EIGENVALUE = 1e-10
+"""Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined."""
 
 LEAST_INFORMATION = 1e-6
-"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number.
-Chosen far below anything of weight: a Δχ² of 1e-6 is an interval of a thousand scales."""
+"""Information below which a parameter has no influence on the trajectories: χ² would change by this over the whole
+scale of the parameter. Chosen far below anything relevant: a Δχ² of 1e-6 gives an interval of a thousand scales."""
 
-NEAR_A_BOUND = 3.5
-"""Standard errors within which a bound makes the interval a profile. Derived: beyond 3.5 the normal interval of 95 %
-and the profile agree to a thousandth."""
+NEAR_BOUND_SIGMAS = 3.5
+"""Standard errors from a bound within which the interval is a profile interval. Derived: beyond 3.5 the normal 95 %
+interval and the profile interval agree to a thousandth."""
 
 LOG_STEP = 0.1
-"""Step of a profile in the logarithm of a positive number. Chosen: 10 % a step; only time depends on it, the end of
+"""Step of derivatives in the logarithm of a positive number. Chosen: 10 % a step; only time depends on it, the end of
 the interval is interpolated."""
 
 
 @dataclass(frozen=True)
 class Precision:
-    """Covariance of the free numbers as the fit holds them, shape (n_free, n_free), infinite where nothing is known.
+    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones.
 
-    `degrees`, shape (n_free,), are those of freedom of the errors. `insensitive` marks numbers that move no trajectory,
-    `collinear` those that only a sum or product with others fixes.
+    `degrees`, shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without
+    influence on the trajectories, `collinear` those of which only a combination with others is determined.
     """
 
     covariance: Floats
@@ -51,12 +51,12 @@ class Precision:
     collinear: np.ndarray
 
 
-def first_parameters(known: Precision, count: int) -> Precision:
-    """What is known of the first `count` numbers, the others being integrated out.
+def first_parameters(precision_of_all: Precision, count: int) -> Precision:
+    """The precision of the first `count` parameters, the others integrated out.
 
     Parameters
     ----------
-    known : covariance of all numbers.
+    precision_of_all : of all parameters.
     count : int
         How many are kept.
 
@@ -65,12 +65,15 @@ def first_parameters(known: Precision, count: int) -> Precision:
     Precision
     """
     return Precision(
-        known.covariance[:count, :count], known.degrees[:count], known.insensitive[:count], known.collinear[:count]
+        precision_of_all.covariance[:count, :count],
+        precision_of_all.degrees[:count],
+        precision_of_all.insensitive[:count],
+        precision_of_all.collinear[:count],
     )
 
 
 def precision(solution: Solution) -> Precision:
-    """Covariance at the end of a fit, by the model of the noise and the scatter.
+    """Covariance at the end of a fit, from the model of noise and between-trial variation.
 
     Parameters
     ----------
@@ -88,7 +91,7 @@ def precision(solution: Solution) -> Precision:
 def _covariance(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, np.ndarray, np.ndarray]:
-    """Covariance of the free numbers, which of them are insensitive, and which are collinear."""
+    """Covariance of the free parameters, which of them are insensitive, and which are collinear."""
     information = normal_equations(part, problem, state, spread)[0]
     diagonal = np.diag(information)
     insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
@@ -98,7 +101,7 @@ def _covariance(
     if k.size:
         scale = 1 / np.sqrt(diagonal[k])
         values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
-        singular = values < SINGULAR
+        singular = values < SINGULAR_EIGENVALUE
         for column in np.flatnonzero(singular):
             collinear[k] |= np.abs(vectors[:, column]) > 0.1
         inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
@@ -109,7 +112,7 @@ def _covariance(
 
 
 def degrees_of_freedom(solution: Solution) -> Floats:
-    """Satterthwaite's degrees of freedom of every free number, shape (n_free,); infinite where no spread matters.
+    """Satterthwaite degrees of freedom of every free parameter; infinite if no between-trial variance matters.
 
     Source: Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted
     likelihood in the logarithms of the between-trial standard deviations.
@@ -129,7 +132,7 @@ def degrees_of_freedom(solution: Solution) -> Floats:
         return np.full(size, math.inf)
     part = marginal(solution.cross_products, problem, state)
 
-    def moved(shifts: Floats) -> tuple[float, float]:
+    def spread_at(shifts: Floats) -> tuple[float, float]:
         spread = list(state.spread)
         for k, shift in zip(active, shifts, strict=True):
             spread[k] *= math.exp(shift)
@@ -137,14 +140,14 @@ def degrees_of_freedom(solution: Solution) -> Floats:
 
     steps = LOG_STEP * np.eye(len(active))
     slopes = [
-        (_variances(part, problem, state, moved(step)) - _variances(part, problem, state, moved(-step)))
+        (_variances(part, problem, state, spread_at(step)) - _variances(part, problem, state, spread_at(-step)))
         / (2 * LOG_STEP)
         for step in steps
     ]
-    curvature = _curvature(lambda shifts: 0.5 * deviance(part, problem, state, moved(shifts)), len(active))
+    curvature = _curvature(lambda shifts: 0.5 * deviance(part, problem, state, spread_at(shifts)), len(active))
     values, vectors = np.linalg.eigh(curvature)
-    seen = values > 1e-3
-    spread_covariance = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    determined = values > 1e-3
+    spread_covariance = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
     gradient = np.column_stack(slopes)
     uncertainty = np.einsum("pi,ij,pj->p", gradient, spread_covariance, gradient)
     variances = _variances(part, problem, state, state.spread)
@@ -158,7 +161,7 @@ def _variances(part: Marginal, problem: MixedProblem, state: FitState, spread: t
 
 
 def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
-    """Second derivatives of a function of `size` numbers at zero."""
+    """Second derivatives of a function of `size` variables at zero, by central differences."""
     step, unit = LOG_STEP, LOG_STEP * np.eye(size)
     centre = function(np.zeros(size))
     matrix = np.empty((size, size))
@@ -172,7 +175,7 @@ def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
 
 
 def student(dof: Floats) -> Floats:
-    """Half width of 95 % in standard errors.
+    """Half width of a 95 % interval in standard errors.
 
     Parameters
     ----------
@@ -189,7 +192,7 @@ def student(dof: Floats) -> Floats:
 
 
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
-    """Which numbers have a bound within reach of their error, shape (n_free,).
+    """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors.
 
     Parameters
     ----------
@@ -203,23 +206,23 @@ def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
     """
     problem, theta = solution.problem, solution.state.theta
     room = np.minimum(theta - problem.lower, problem.upper - theta)
-    return np.isfinite(sigma) & (room < NEAR_A_BOUND * sigma)
+    return np.isfinite(sigma) & (room < NEAR_BOUND_SIGMAS * sigma)
 
 
 def profile_interval(
     predictor: Predictor, solution: Solution, place: int, sigma: float, reach: float
 ) -> tuple[float, float]:
-    """Interval of one number as the fit holds it: where a fit constrained to a value lies `reach`² above the best.
+    """Profile-likelihood interval of one parameter: constrained fits whose −2 ln L lies within `reach`² of the best.
 
-    Spreads and noise stay those of the best fit, so that for a straight line this is the interval ± `reach` · `sigma`.
-    A side that meets a bound first ends there.
+    Between-trial standard deviations and noise stay those of the best fit, so that for a linear model this is the
+    interval ± `reach` · `sigma`. A side that meets a bound first ends there.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
     place : int
-        Place of the number among the free ones.
+        Index of the parameter.
     sigma : float
         Its standard error, scaled.
     reach : float
@@ -232,31 +235,35 @@ def profile_interval(
     """
     problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))
-    best = _lowest(solution)
+    best = _deviance(solution)
     ends = []
     for side, bound in ((-1, problem.lower[place]), (1, problem.upper[place])):
-        value, tried = float(state.theta[place]), [(0.0, 0.0)]
-        away = reach * sigma
+        value, evaluated = float(state.theta[place]), [(0.0, 0.0)]
+        distance = reach * sigma
         for _ in range(6):
-            away = min(away, abs(bound - value))
-            if away <= 1e-12:
+            distance = min(distance, abs(bound - value))
+            if distance <= 1e-12:
                 break
-            rise = _rise(predictor, solution, held, place, value + side * away, best)
-            tried.append((away, math.copysign(math.sqrt(abs(rise)), rise)))
-            if abs(tried[-1][1] - reach) < 0.03 * reach or (away >= abs(bound - value) and tried[-1][1] < reach):
+            rise = _deviance_increase(predictor, solution, held, place, value + side * distance, best)
+            evaluated.append((distance, math.copysign(math.sqrt(abs(rise)), rise)))
+            if abs(evaluated[-1][1] - reach) < 0.03 * reach or (
+                distance >= abs(bound - value) and evaluated[-1][1] < reach
+            ):
                 break
-            away = _next_guess(tried, reach)
-        ends.append(value + side * min(away, abs(bound - value)))
+            distance = _next_distance(evaluated, reach)
+        ends.append(value + side * min(distance, abs(bound - value)))
     return ends[0], ends[1]
 
 
-def _lowest(solution: Solution) -> float:
+def _deviance(solution: Solution) -> float:
     part = marginal(solution.cross_products, solution.problem, solution.state)
     return deviance(part, solution.problem, solution.state, solution.state.spread, restricted=False)
 
 
-def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int, value: float, best: float) -> float:
-    """By how much −2 ln L rises when one number is held at `value` and all others are fitted again."""
+def _deviance_increase(
+    predictor: Predictor, solution: Solution, held: FixedTerms, place: int, value: float, best: float
+) -> float:
+    """Increase of −2 ln L if one parameter is fixed at `value` and all others are fitted again."""
     free = solution.problem.free.copy()
     free[place] = False
     theta = solution.state.theta.copy()
@@ -264,8 +271,8 @@ def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int
     part = marginal(solution.cross_products, solution.problem, solution.state)
     covariance = _covariance(part, solution.problem, solution.state, solution.state.spread)[0]
     if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
-        along = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
-        theta = np.clip(theta + along * step, solution.problem.lower, solution.problem.upper)
+        direction = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
+        theta = np.clip(theta + direction * step, solution.problem.lower, solution.problem.upper)
     theta[place] = value
     problem = replace(solution.problem, free=free)
     try:
@@ -274,13 +281,13 @@ def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int
         )
     except SimulationError:
         return 1e6
-    return _lowest(constrained) - best
+    return _deviance(constrained) - best
 
 
-def _next_guess(tried: list[tuple[float, float]], reach: float) -> float:
-    """Where the root of the rise reaches its aim, by the chord through the two points nearest to it."""
-    below = max((hypothesis for hypothesis in tried if hypothesis[1] <= reach), key=lambda point: point[0])
-    above = min((hypothesis for hypothesis in tried if hypothesis[1] > reach), key=lambda point: point[0], default=None)
+def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
+    """Distance at which the root of the increase reaches its target, by a chord through the two nearest points."""
+    below = max((point for point in evaluated if point[1] <= reach), key=lambda point: point[0])
+    above = min((point for point in evaluated if point[1] > reach), key=lambda point: point[0], default=None)
     if above is None:
         return below[0] * float(np.clip(reach / max(below[1], 0.2), 1.2, 3.0))
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])

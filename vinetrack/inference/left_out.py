@@ -1,4 +1,4 @@
-"""What a fitted model says of trials it has not seen: their release and origin are found, nothing else."""
+"""Predictions of a fitted model for trials outside the fit: only their release and origin are fitted."""
 
 from __future__ import annotations
 
@@ -31,28 +31,24 @@ from vinetrack.inference.whitening import all_products, at_correlation
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
 
-TOLD_APART = 1e-4
-"""Least eigenvalue, of a matrix of unit diagonal, at which release and origin are both found."""
+LEAST_EIGENVALUE = 1e-4
+"""Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined. Chosen:
+at 1e-4 their correlation is 0.9999."""
 
 MOST_STEPS = 20
-"""Steps of the alignment at most, and the shift in frames that counts as settled. Chosen: a thousandth of a frame is a
-hundredth of a good tracker's error."""
+"""Maximum number of Gauss–Newton steps for release and origin. Chosen as a safeguard."""
 
 SETTLED_FRAMES = 1e-3
-"""Shift of the release below which the alignment has settled, frames. Chosen: a hundredth of what a good tracker
-resolves; half takes one more step, twice is still not seen."""
+"""Step of the release below which it has converged, frames. Chosen: a hundredth of the resolution of a good tracker;
+half takes one more step, twice is still invisible."""
 
 FEWEST_AT_REST = 5
-"""Frames before the motion that tell where a vine started, to half the noise of one. Derived: the mean of five frames
-errs by 0.45 of one frame's noise."""
+"""Frames at rest that determine where a vine started, to half the noise of one. Derived: the mean of five frames errs
+by 0.45 of one frame's noise."""
 
 
 def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
-    """Trials with their own release and origin, deviations zero; see `vinetrack.inference.fit.predict`.
-
-    With `from_rest` the origin is where a vine is seen at rest before it moves, and release (and the origin where no
-    rest was filmed) are where the root mean square is least. Else both weigh errors with the correlation that the fit
-    found, which where a model fails is nearly 1, and leaves the origin to the misfit.
+    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`.
 
     Parameters
     ----------
@@ -60,7 +56,9 @@ def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[T
     pairs : iterable of (Trial, Track)
         Trials to predict.
     from_rest : bool
-        Whether the origin is where the vine rests.
+        Take the origin from the frames at rest, and fit the release (and the origin where no rest was recorded) by
+        ordinary least squares. By default both are fitted with the noise correlation of the fit, which is nearly 1
+        where a model fails, so that the origin then depends on the misfit.
 
     Returns
     -------
@@ -75,7 +73,7 @@ def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[T
 
 
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
-    """As `predict_trials`, for trials that were laid out for a fit already.
+    """As `predict_trials`, for trials whose data are already prepared.
 
     Parameters
     ----------
@@ -83,7 +81,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     data : sequence of FitTrial
         Trials to predict.
     from_rest : bool
-        Whether the origin is where the vine rests.
+        Whether the origin is taken from the frames at rest.
 
     Returns
     -------
@@ -92,7 +90,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     Raises
     ------
     FitError
-        If a vine was not in the fit and B is one per vine, or the model cannot be followed.
+        If a vine was not in the fit and B is one per vine, or the model cannot be simulated.
     """
     rho = 0.0 if from_rest else fit.noise_correlation
     variance = fit.noise_m**2 * (1 - rho**2)
@@ -101,7 +99,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     try:
         moved = predictor.run(predictor.jobs(np.empty(0), trial_effects))
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed: {error}") from error
+        raise FitError(f"The model cannot be simulated: {error}") from error
     sigma = np.zeros((len(data), N_TRIAL_EFFECTS))
     sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
     return [
@@ -119,52 +117,51 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
 
 
 def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
-    """The fitted model laid on trials: see `predict_prepared`.
+    """Fit release and origin of trials to a fitted model.
 
     Parameters
     ----------
     fit : a fit.
     data : sequence of FitTrial
-        Trials to lay it on.
     from_rest : bool
-        Whether the origin is where the vine rests.
+        Whether the origin is taken from the frames at rest.
 
     Returns
     -------
     predictor : Predictor
-        Of these trials with nothing free.
+        Of these trials, without free parameters.
     trial_effects : array, shape (n_trials, 4)
-        Release and origin found; deviations 0.
+        Release and origin; zero deviations.
     square : array, shape (n_trials, 2, 2)
-        Whitened products of release and origin.
+        Whitened cross products of release and origin.
 
     Raises
     ------
     FitError
         As `predict_prepared`.
     """
-    data = [_known_yield(fit, trial_data) for trial_data in data]
-    predictor = Predictor(_nothing_free(fit, data), data, fit.predictor.host)
+    data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
+    predictor = Predictor(_without_free_parameters(fit, data), data, fit.predictor.host)
     try:
         trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
-        trial_effects, square = _settle(
+        trial_effects, square = _fit_release_and_origin(
             predictor, trial_effects, 0.0 if from_rest else fit.noise_correlation, from_rest
         )
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed: {error}") from error
+        raise FitError(f"The model cannot be simulated: {error}") from error
     return predictor, trial_effects, square
 
 
 def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
-    """Least squares of columns brought to one length, shape (n_columns,); what is hardly told apart is left alone.
+    """Least squares with columns scaled to unit length; directions that are hardly determined get zero.
 
-    At constant speed a later release and a higher origin are one. `least` is the least singular value that counts.
+    At constant speed a later release and a higher origin are collinear.
 
     Parameters
     ----------
     design : array, shape (n_points, n_columns)
     left : array, shape (n_points,)
-        What the columns have to explain.
+        Right-hand side.
     least : float
         Least singular value that counts, relative to the largest.
 
@@ -177,7 +174,7 @@ def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
 
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
-    """Trials filmed long enough at rest to say where they began, shape (n_trials,).
+    """Trials with enough frames at rest to determine where they started.
 
     Parameters
     ----------
@@ -194,7 +191,7 @@ def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
 
 
 def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
-    """Trials laid out for a prediction.
+    """Prepare the data of trials for a prediction.
 
     Parameters
     ----------
@@ -215,8 +212,8 @@ def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
     return data
 
 
-def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:
-    """The trial with the yield pressure that the fit found for its vine, where it found one."""
+def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
+    """The trial with the fitted yield pressure of its vine, if the fit has one."""
     stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
     for number in fit.numbers:
         if number.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated):
@@ -224,7 +221,7 @@ def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:
     return trial_data
 
 
-def _nothing_free(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
+def _without_free_parameters(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     try:
         base = np.array([fit.model.parameters_of(trial_data.trial) for trial_data in data])
     except EffectError as error:
@@ -233,54 +230,57 @@ def _nothing_free(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     return ParameterMap(fit.model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
-def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:
-    """Newton's steps in release and origin, no longer than two frames; the own numbers, and their information.
+def _fit_release_and_origin(
+    predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool
+) -> tuple[Floats, Floats]:
+    """Gauss–Newton steps in release and origin, of at most two frames; the trial effects and their information.
 
-    A trial that has settled is left alone: it costs as much to simulate as one that has not.
+    Trials that have converged are not simulated again.
     """
     data = predictor.data
     frames = np.array([trial_data.frame_s for trial_data in data])
-    held = rest_is_seen(data) & from_rest
+    origin_fixed = rest_is_seen(data) & from_rest
     trial_effects, square = trial_effects.copy(), np.zeros((len(data), 2, 2))
     trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
     pressurised_in_recording = np.array([trial_data.pressurised_in_recording for trial_data in data], dtype=bool)
-    for i in np.flatnonzero(held).tolist():
+    for i in np.flatnonzero(origin_fixed).tolist():
         trial_effects[i, ORIGIN] = data[i].rest_origin_m
-    moving = np.arange(len(data))
+    active = np.arange(len(data))
     for _ in range(MOST_STEPS):
-        sums = _sums(predictor, trial_effects, moving, rho)
-        square[moving] = sums[:, :2, :2]
-        sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
-        sums[pressurised_in_recording[moving], RELEASE, :] = sums[pressurised_in_recording[moving], :, RELEASE] = 0.0
-        # At constant speed a later release and a higher origin are one: brought to a unit diagonal that is seen.
+        sums = _cross_products_of(predictor, trial_effects, active, rho)
+        square[active] = sums[:, :2, :2]
+        sums[origin_fixed[active], ORIGIN, :] = sums[origin_fixed[active], :, ORIGIN] = 0.0
+        sums[pressurised_in_recording[active], RELEASE, :] = sums[pressurised_in_recording[active], :, RELEASE] = 0.0
+        # At constant speed release and origin are collinear, which shows at a unit diagonal.
         scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
-        scale[held[moving], ORIGIN] = scale[pressurised_in_recording[moving], RELEASE] = 0.0
-        even = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
-        inverse = np.linalg.pinv(even, rcond=TOLD_APART, hermitian=True) * scale[:, :, None] * scale[:, None, :]
+        scale[origin_fixed[active], ORIGIN] = scale[pressurised_in_recording[active], RELEASE] = 0.0
+        scaled = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.pinv(scaled, rcond=LEAST_EIGENVALUE, hermitian=True) * scale[:, :, None] * scale[:, None, :]
         step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
-        reach = 2 * frames[moving]
-        step[:, RELEASE] = np.clip(step[:, RELEASE], -reach, reach)
-        trial_effects[moving, :2] += step
-        moving = moving[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[moving]]
-        if not moving.size:
+        largest_step = 2 * frames[active]
+        step[:, RELEASE] = np.clip(step[:, RELEASE], -largest_step, largest_step)
+        trial_effects[active, :2] += step
+        active = active[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[active]]
+        if not active.size:
             break
     return trial_effects, square
 
 
-def _sums(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
-    """Whitened products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
+def _cross_products_of(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
+    """Whitened cross products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
     jobs = predictor.jobs(np.empty(0), trial_effects)
-    later = [row for row in rows.tolist() if not predictor.release_is_shift[row]]
-    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
-    moved = predictor.run(
-        [jobs[row] for row in rows] + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in later]
+    differenced = [row for row in rows.tolist() if not predictor.release_is_shift[row]]
+    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in differenced}
+    trajectories = predictor.run(
+        [jobs[row] for row in rows]
+        + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in differenced]
     )
-    shifted = dict(zip(later, moved[rows.size :], strict=True))
+    shifted = dict(zip(differenced, trajectories[rows.size :], strict=True))
     columns = []
-    for row, plain in zip(rows.tolist(), moved, strict=False):
-        answer = -plain.lead_velocity_m_s
+    for row, trajectory in zip(rows.tolist(), trajectories, strict=False):
+        sensitivity = -trajectory.lead_velocity_m_s
         if row in shifted:
-            answer = (shifted[row].observed_position_m - plain.observed_position_m) / steps[row]
-        residual = predictor.data[row].lead_position_m - trial_effects[row, ORIGIN] - plain.observed_position_m
-        columns.append(np.column_stack([answer, np.ones_like(answer), residual]))
+            sensitivity = (shifted[row].observed_position_m - trajectory.observed_position_m) / steps[row]
+        residual = predictor.data[row].lead_position_m - trial_effects[row, ORIGIN] - trajectory.observed_position_m
+        columns.append(np.column_stack([sensitivity, np.ones_like(sensitivity), residual]))
     return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)

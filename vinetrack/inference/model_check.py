@@ -1,7 +1,7 @@
-"""The dynamic model checks the damping fits: B and n from steady windows against B and n from whole trajectories.
+"""Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole trajectories.
 
-Both stand on the same recordings, but not on the same part of them: a steady window says how fast a vine ends up, a
-trajectory also how it gets there. Where they differ by more than their errors, the model lacks something.
+Both use the same recordings, but not the same part of them: steady windows show the final speed of a vine, trajectories
+also the approach to it. If they differ by more than their errors, the model lacks an effect.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory",
 
 
 def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
-    """A row a vine, as `model_check.csv` holds it.
+    """One row per vine, as `model_check.csv` holds it.
 
     Parameters
     ----------
@@ -34,19 +34,19 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        `z` is the distance between the two pairs (n, ln B) of a vine, given as the number of standard errors at which
-        a single number would be as unlikely. Errors are added as if the two were independent, though they share their
-        noise: z errs to the small side. NaN where a vine is missing in either.
+        `z` is the difference between the two pairs (n, ln B) of a vine, as the normal deviate with the same p-value.
+        Errors are added as if the two were independent; as they share their noise, z is too small rather than too
+        large. NaN where a vine is missing in either.
 
     Raises
     ------
     FitError
-        If the fit has no exponent of its own.
+        If the exponent was not estimated in the fit.
     """
     import pandas as pd
 
     if EXPONENT not in [number.key for number in fit.numbers]:
-        raise FitError("The exponent n was held in this fit: there is nothing to check the steady windows against.")
+        raise FitError("The exponent n was fixed in this fit: there is nothing to check the steady windows against.")
     n = fit[EXPONENT]
     rows = []
     for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
@@ -62,8 +62,8 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
             "z": math.nan,
         }
         if steady and B and n_steady is not None:
-            apart = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
-            row["z"] = _deviate(apart, _steady_covariance(damping, vine) + _trajectory_covariance(fit, B.name))
+            difference = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
+            row["z"] = _deviate(difference, _steady_covariance(damping, vine) + _trajectory_covariance(fit, B.name))
         rows.append(row)
     return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
 
@@ -82,13 +82,13 @@ def _trajectory_covariance(fit: Fit, name: str) -> Floats:
     return np.asarray(fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes)
 
 
-def _deviate(apart: Floats, covariance: Floats) -> float:
-    """The normal deviate as unlikely as this distance of two numbers: χ² with two degrees of freedom."""
+def _deviate(difference: Floats, covariance: Floats) -> float:
+    """Normal deviate as unlikely as this difference of two parameters, from χ² with two degrees of freedom."""
     from scipy.stats import norm
 
     if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
         return math.nan
-    square = float(apart @ np.linalg.solve(covariance, apart))
+    square = float(difference @ np.linalg.solve(covariance, difference))
     # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
     log_tail = -square / 2 - math.log(2)
     if log_tail > -700:

@@ -1,8 +1,8 @@
-"""Which numbers of a model a fit may move, and how a vector of them reaches every trial.
+"""The free parameters of a fit, and their mapping to the parameters of each trial.
 
-A number is named `effect.parameter`; the yield pressure, which the sheet brings along for each vine, is
-`yield_pressure.P_y`. Inside, each is divided by its scale, so that all are of the order of one; but B enters as ln B:
-then what a trial shares with the other trials and what it has of its own add up exactly, and so do ln B and n ln v.
+A parameter is named `effect.parameter`; the yield pressure, which the sheet states for each vine, is
+`yield_pressure.P_y`. Internally each is divided by its scale, so that all are of order one, except B, which enters as
+ln B: the value of the vine and the deviation of the trial then add up exactly, and so do ln B and n ln v.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ LEAST_DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class BetweenTerm:
-    """A difference between trials that is part of the model: deviation_j = Σ_g a_g z_j over the groups of trials.
+    """A systematic difference between trials as part of the model: deviation_j = Σ_g a_g z_j over the groups of trials.
 
-    It is added to the deviation that trial j has of its set pressure or of its ln B, before the random deviation.
+    It is added to the set pressure (relative) or ln B of trial j, before the random deviation.
 
     Parameters
     ----------
@@ -40,12 +40,12 @@ class BetweenTerm:
     pressure
         Whether the pressure deviates (relative), else ln B.
     groups
-        For each trial the group whose coefficient it feels, blank where it feels none.
+        For each trial the group whose coefficient applies, blank if none does.
     regressor
         z_j, shape (n_trials,), relative deviation per unit of the coefficient.
     prior_sd
-        Standard deviation of the coefficients, their unit, where they are a random effect of the group; infinite where
-        they are fixed effects. Those with a prior are integrated out of the likelihood (`mixed_effects.deviance`).
+        Standard deviation of the coefficients, in their unit, if they are a random effect of the group; infinite if
+        they are fixed effects. Random ones are integrated out of the likelihood (`marginal_likelihood.deviance`).
     """
 
     key: str
@@ -60,9 +60,9 @@ class BetweenTerm:
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """One number that a fit moves, SI. `vine` is whose it is, a vine's or a day's; blank where it is that of all.
+    """One free parameter of a fit, SI. `vine` is the vine or day to which it belongs; blank if it applies to all.
 
-    `prior_sd` is infinite where only the data speak. A prior's mean is `start`.
+    `prior_sd` is infinite without a prior; the mean of a prior is `start`.
     """
 
     key: str
@@ -74,16 +74,16 @@ class FreeParameter:
     upper: float
     scale: float
     prior_sd: float = math.inf
-    tries: tuple[float, ...] = ()  #: other values to begin from
+    further_starts: tuple[float, ...] = ()  #: other values to begin from
     logarithmic: bool = False
 
     @property
     def name(self) -> str:
-        """`effect.parameter`, with the vine in brackets where it has one of its own."""
+        """`effect.parameter`, followed by the vine in brackets if it belongs to one."""
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
     def to_scaled(self, value: float) -> float:
-        """The value as the fit holds it.
+        """The scaled value.
 
         Parameters
         ----------
@@ -98,12 +98,12 @@ class FreeParameter:
         return value / self.scale
 
     def from_scaled(self, theta: float) -> float:
-        """The value, SI, of what the fit holds.
+        """The value, SI, of a scaled value.
 
         Parameters
         ----------
         theta : float
-            As the fit holds it.
+            Scaled.
 
         Returns
         -------
@@ -112,7 +112,7 @@ class FreeParameter:
         return math.exp(theta) if self.logarithmic else theta * self.scale
 
     def derivative(self, value: float) -> float:
-        """By how much the value changes for a change of one in what the fit holds.
+        """Derivative of the value with respect to the scaled value.
 
         Parameters
         ----------
@@ -127,10 +127,11 @@ class FreeParameter:
 
 @dataclass(frozen=True)
 class ParameterMap:
-    """The free numbers in order, and which of them each trial feels.
+    """The free parameters in order, and which of them apply to each trial.
 
-    `index`, shape (n_trials, n_keys), gives the place among `free` of each key for each trial, -1 where a trial does
-    not feel it. Every trial sees as many columns as there are keys, however many vines there are.
+    `index`, shape (n_trials, n_keys), gives the place among `free` of each key for each trial, -1 where it does not
+    apply. Every trial has as many columns as there are keys, however many vines there are. `base`, shape (n_trials,
+    n_parameters), are the parameters of the model before the free ones are set.
     """
 
     model: Model
@@ -155,16 +156,16 @@ class ParameterMap:
 
     @property
     def prior_precision(self) -> Floats:
-        """1/sd² of the priors in scaled units, shape (n_free,); 0 where there is none."""
+        """Prior precisions of the scaled parameters, shape (n_free,); 0 without a prior."""
         return np.array([(number.scale / number.prior_sd) ** 2 for number in self.free])
 
     def values(self, theta: Floats) -> Floats:
-        """Values in SI, shape (n_free,).
+        """Values, SI, of scaled parameters.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            As the fit holds them.
+            Scaled.
 
         Returns
         -------
@@ -173,18 +174,18 @@ class ParameterMap:
         return np.array([number.from_scaled(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
-        """Model parameters (n_trials, n_parameters) and yield pressures (n_trials,), Pa, for scaled values `theta`.
+        """Model parameters and yield pressures of every trial for scaled parameters.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            As the fit holds them.
+            Scaled.
 
         Returns
         -------
         rows : array, shape (n_trials, n_parameters), SI
         yields : array, shape (n_trials,), Pa
-            NaN where the sheet's value holds.
+            NaN where the value in the sheet applies.
         """
         rows = self.base.copy()
         values = self.values(theta)
@@ -198,7 +199,7 @@ class ParameterMap:
         return rows, yields
 
     def term(self, key: str) -> BetweenTerm | None:
-        """The difference between trials that this key is the coefficient of; None for a parameter of the model.
+        """The difference between trials of which this key is the coefficient; None for a parameter of the model.
 
         Parameters
         ----------
@@ -213,17 +214,17 @@ class ParameterMap:
 
     @property
     def random(self) -> NDArray[np.bool_]:
-        """Which free numbers are random effects of a group of trials, shape (n_free,)."""
+        """Free parameters that are random effects of a group of trials, shape (n_free,)."""
         keys = {term.key for term in self.between if math.isfinite(term.prior_sd)}
         return np.array([number.key in keys for number in self.free], dtype=bool)
 
     def shifts(self, theta: Floats) -> Floats:
-        """Deviations of pressure (relative) and of ln B by the differences between trials, shape (n_trials, 2).
+        """Deviations of pressure (relative) and ln B by the systematic differences between trials.
 
         Parameters
         ----------
         theta : array, shape (n_free,)
-            As the fit holds them.
+            Scaled.
 
         Returns
         -------
@@ -247,23 +248,23 @@ def make_layout(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] = (),
 ) -> ParameterMap:
-    """Decide which numbers are free.
+    """Choose the free parameters of a fit and map them to the trials.
 
-    By default every parameter of every effect is, but those that are `held` (g); and the yield pressure of each vine
-    within the error the sheet gives it. A model of gravity alone then has no free number: a g that adapts itself would
-    take up the drag of a falling body.
+    By default every parameter of every effect is free, except those that are `held` (g), and so is the yield pressure
+    of each vine within the error in the sheet. A model of gravity alone then has no free parameter: a free g would
+    absorb the drag of a falling body.
 
     Parameters
     ----------
     model : sum of effects with its values.
     data : sequence of FitTrial
     fixed, free : iterable of str
-        Names to hold at the value of the model, or to find although held. The parameter's own name will do where it is
-        the only one of that name.
+        Parameters to keep at the value of the model, or to estimate although held. The short name of a parameter is
+        accepted if it is unique.
     shared : mapping, optional
-        `"all"`, `"vine"` or `"day"` by name, in place of what the effect says.
+        `"all"`, `"vine"` or `"day"` by name, in place of the effect's default.
     between : sequence of BetweenTerm
-        Differences between trials that are fitted along.
+        Systematic differences between trials to estimate.
 
     Returns
     -------
@@ -274,43 +275,47 @@ def make_layout(
     FitError
         If a name is not that of any parameter.
     """
-    known = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
-    names = [*known, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
-    held = {_find_name(name, names) for name in fixed}
-    wanted = {_find_name(name, names) for name in free}
-    sharing = {_find_name(name, names): how for name, how in (shared or {}).items()}
-    for name, how in sharing.items():
+    parameters = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
+    names = [*parameters, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
+    fixed_names = {_find_name(name, names) for name in fixed}
+    freed_names = {_find_name(name, names) for name in free}
+    sharing_by_name = {_find_name(name, names): how for name, how in (shared or {}).items()}
+    for name, how in sharing_by_name.items():
         if how not in ("all", "vine", "day"):
             raise FitError(f"{name} is shared by {how!r}: say 'all', 'vine' or 'day'.")
-    chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
+    free_names = [
+        name for name in parameters if name not in fixed_names and (name in freed_names or not parameters[name].held)
+    ]
     trials = [trial_data.trial for trial_data in data]
     base = np.array([model.parameters_of(trial) for trial in trials])
     base = base.reshape(len(data), len(model.parameter_names))
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
-    for name in chosen:
-        how = sharing.get(name, known[name].shared)
+    for name in free_names:
+        how = sharing_by_name.get(name, parameters[name].shared)
         groups, members = groups_of(trials, how), group_names(trials, how)
         places = {group: len(numbers) + i for i, group in enumerate(members)}
-        numbers += [_number(name, known[name], group, base[groups.index(group)], model) for group in members]
+        numbers += [
+            _free_parameter(name, parameters[name], group, base[groups.index(group)], model) for group in members
+        ]
         index = np.column_stack([index, [places[group] for group in groups]])
-    keys = list(chosen)
-    if YIELD_PRESSURE in names and YIELD_PRESSURE not in held:
+    keys = list(free_names)
+    if YIELD_PRESSURE in names and YIELD_PRESSURE not in fixed_names:
         yield_numbers, column = _yield_pressures(data, len(numbers))
         if yield_numbers:
             numbers, keys, index = [*numbers, *yield_numbers], [*keys, YIELD_PRESSURE], np.column_stack([index, column])
     for term in between:
         members = [group for group in dict.fromkeys(term.groups) if group]
         place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
-        numbers += [_coefficient(term, group) for group in members]
+        numbers += [_between_coefficient(term, group) for group in members]
         keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
     return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
 
 
 def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
-    """For each trial the name of those that share a number with it; blank for all.
+    """For each trial the name of the group with which it shares a parameter; blank if all trials share it.
 
-    Days count where the sheet states several, and one for every trial.
+    With `day`, all trials share it unless the sheet states several days, and one for every trial.
 
     Parameters
     ----------
@@ -329,7 +334,7 @@ def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
 
 
 def group_names(trials: Sequence[Trial], shared: str) -> list[str]:
-    """Names of the groups of trials that share a number.
+    """Names of the groups of trials that share a parameter.
 
     Parameters
     ----------
@@ -340,13 +345,13 @@ def group_names(trials: Sequence[Trial], shared: str) -> list[str]:
     Returns
     -------
     list of str
-        Vines in the order of the trials, days in their own: 2 before 10.
+        Vines in the order of the trials; days sorted, 2 before 10.
     """
     names = list(dict.fromkeys(groups_of(trials, shared)))
     return sorted(names, key=lambda name: (len(name), name)) if shared == "day" else names
 
 
-def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
+def _between_coefficient(term: BetweenTerm, group: str) -> FreeParameter:
     return FreeParameter(
         key=term.key,
         vine=group,
@@ -361,12 +366,12 @@ def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
 
 
 def _find_name(name: str, names: Sequence[str]) -> str:
-    """The full name among `names` that `name` stands for.
+    """The full name among `names` for a full or short name.
 
     Raises
     ------
     FitError
-        If it stands for none, or for several; the message suggests.
+        If there is none, or several; the message suggests names.
     """
     if name in names:
         return name
@@ -377,11 +382,11 @@ def _find_name(name: str, names: Sequence[str]) -> str:
     raise FitError(f"No parameter of the model is named {name!r}: say {' or '.join(near)}.")
 
 
-def _number(name: str, parameter: Parameter, vine: str, values: Floats, model: Model) -> FreeParameter:
+def _free_parameter(name: str, parameter: Parameter, vine: str, values: Floats, model: Model) -> FreeParameter:
     value = float(values[model.parameter_names.index(name)])
     low, high = parameter.plausible or parameter.bounds
     width = high - low if math.isfinite(high - low) else max(abs(parameter.default), 1.0)
-    tries = (low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else ()
+    further_starts = (low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else ()
     return FreeParameter(
         key=name,
         vine=vine,
@@ -391,13 +396,13 @@ def _number(name: str, parameter: Parameter, vine: str, values: Floats, model: M
         lower=parameter.bounds[0],
         upper=parameter.bounds[1],
         scale=max(abs(value), 0.3 * width) or 1.0,
-        tries=tries,
+        further_starts=further_starts,
         logarithmic=name == DAMPING,
     )
 
 
 def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreeParameter], NDArray[np.int_]]:
-    """One yield pressure for each vine and stated value, known to the error of the sheet."""
+    """One yield pressure for each vine and stated value, with the error in the sheet as prior."""
     numbers: list[FreeParameter] = []
     places: dict[tuple[str, float], int] = {}
     column = np.full(len(data), -1)

@@ -1,4 +1,4 @@
-"""The parts of a fit that belong to some of its trials: free numbers, predictor, state, frame."""
+"""Restriction of a fit to a subset of its trials: free parameters, predictor, state and problem."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Indices = NDArray[np.int_]
 
 
 def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
-    """Places of the free numbers that some of these trials feel, in their order.
+    """Indices of the free parameters that apply to some of these trials, in order.
 
     Parameters
     ----------
-    layout : free numbers of all trials.
+    layout : free parameters of all trials.
     rows : array of int
-        Places of the trials.
+        Indices of the trials.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
 
 
 def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
-    """The layout of these trials with these numbers; names, scales and priors stay."""
+    """The layout of these trials and parameters; names, scales and priors are unchanged."""
     moved = np.full(len(layout.free) + 1, -1)
     moved[places] = np.arange(places.size)
     index = moved[layout.index[rows]]
@@ -52,13 +52,13 @@ def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> Para
 
 
 def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
-    """A predictor of these trials, with the steps that the other has found for its differences.
+    """A predictor of these trials, with the finite-difference steps of the other.
 
     Parameters
     ----------
     predictor : of all trials.
     rows, places : arrays of int
-        Places of the trials, and of the free numbers that they feel.
+        Indices of the trials and of their free parameters.
 
     Returns
     -------
@@ -72,13 +72,13 @@ def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Pr
 
 
 def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
-    """The state of these trials and numbers.
+    """The state of these trials and parameters.
 
     Parameters
     ----------
     state : of all trials.
     rows, places : arrays of int
-        Places of the trials, and of the free numbers that they feel.
+        Indices of the trials and of their free parameters.
 
     Returns
     -------
@@ -90,14 +90,14 @@ def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
 
 
 def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
-    """The frame of these trials and numbers; `layout` is theirs already.
+    """The problem of these trials and parameters.
 
     Parameters
     ----------
     problem : of all trials.
-    layout : free numbers of these trials.
+    layout : free parameters of these trials.
     rows, places : arrays of int
-        Places of the trials, and of the free numbers that they feel.
+        Indices of the trials and of their free parameters.
 
     Returns
     -------

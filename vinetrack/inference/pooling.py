@@ -1,23 +1,23 @@
-"""Few trials that disagree: a between-trial variance of the shared numbers, which decides how much each trial weighs.
+"""Pooling of few trials that disagree: a between-trial variance of the shared parameters that determines their weights.
 
-A fit gives every trial a noise of its own, and some a deviation of B and pressure. Where trials differ in a number that
-they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the smaller noise
-decides the number, and what it misses in the others passes for their noise, which makes them weigh still less. So:
+A fit gives every trial a noise of its own, and some a deviation of B and pressure. Where trials differ in a parameter
+that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the smaller noise
+determines it, and the misfit of the others passes for their noise, which reduces their weights further. So:
 
-1. The noise of a trial is what is left once its own B, n, C_D ... have been fitted too.
-2. The numbers θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M). Assumed: the between-trial covariance is
-   proportional to M, the covariance of all numbers that one typical trial leaves by its noise (that of all trials
-   together times the number of trials that tell of a number). So there is one unknown, τ², instead of k(k + 1)/2, which
-   a handful of trials could not tell: numbers scatter in the directions in which a trial says little, and by the same
-   multiple of their errors. Where trials differ in one well-known number alone, M is wrong, and τ² too large for the
-   others. With A_i the information and g_i the score of a trial at the current numbers, its estimate has the
-   covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood of several numbers at once (multivariate
+1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too.
+2. The parameters θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M). Assumed: the between-trial covariance is
+   proportional to M, the covariance of all parameters from the noise of one typical trial (that of all trials together
+   times the number of trials that depend on a parameter). So there is one unknown, τ², instead of k(k + 1)/2, which a
+   handful of trials could not determine: parameters scatter in the directions in which a trial is imprecise, and by the
+   same multiple of their errors. Where trials differ in one precisely known parameter alone, M is wrong, and τ² too
+   large for the others. With A_i the information and g_i the score of a trial at the current parameters, its estimate
+   has the covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood of several parameters at once (multivariate
    random-effects meta-analysis by REML: van Houwelingen, Arends & Stijnen, Statistics in Medicine 21, 589, 2002, and
-   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one number: DerSimonian & Laird,
+   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one parameter: DerSimonian & Laird,
    Controlled Clinical Trials 7, 177, 1986, and Viechtbauer, J. Educ. Behav. Stat. 30, 261, 2005).
-3. A step in θ with these weights, trajectories anew, until nothing moves.
+3. A step in θ with these weights, new trajectories, and so on to convergence.
 
-With τ² = 0 the weights are those of the noise; with a large τ² all trials count alike.
+With τ² = 0 the weights are those of the noise; with a large τ² all trials have nearly equal weights.
 """
 
 from __future__ import annotations
@@ -44,29 +44,30 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes, with_shapes
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 
-MOST_STEPS, SETTLED = 12, 0.05
-"""Steps at most, and the length of a step in standard errors at which they end. Chosen: a twentieth of an error; the
-two drops of the tests take four steps."""
+MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05
+"""Maximum number of steps, and the length of a step in standard errors at which they have converged. Chosen: a
+twentieth of an error; the two drops of the tests take four steps."""
 
 LARGEST_TAU2 = 1e6
-"""Largest τ², in variances of one trial by its noise. Chosen: trials a thousand of their errors apart weigh alike."""
+"""Largest τ², in variances of one trial by its noise. Chosen: trials a thousand of their errors apart have equal
+weights."""
 
 LONGEST_STEP = 3.0
-"""Longest step of a number in standard deviations of what trials scatter by. Chosen: beyond it a straight line says
-little; half takes a few more steps."""
+"""Longest step of a parameter, in standard deviations of the scatter of trials. Chosen: the linear model is inaccurate
+beyond it; half takes a few more steps."""
 
-KNOWN = 1e-12
-"""Part of the information of a trial that what it tells in a direction must have to count. Derived: ten thousand
-roundings of a double."""
+LEAST_RELATIVE_INFORMATION = 1e-12
+"""Least information of a trial on a direction that counts, relative to its largest. Derived: ten thousand roundings of
+a double."""
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """Shared numbers with trials weighed by noise and by how much they disagree, as the fit holds them.
+    """Shared parameters with trials weighted by noise and disagreement, scaled.
 
-    `solution` stands at these numbers, smooth errors of position behind them. `information`, shape (n_trials, n_free,
-    n_free), and `scores`, shape (n_trials, n_free), are those of the trials with τ² in them; `between`, shape (n_free,
-    n_free), is τ² M, the covariance of a trial's numbers about the shared ones.
+    `solution` is the state at these parameters, with the smooth errors of position as further ones. `information`,
+    shape (n_trials, n_free, n_free), and `scores`, shape (n_trials, n_free), are those of the trials with τ² included;
+    `between`, shape (n_free, n_free), is τ² M, the covariance of a trial's parameters about the shared ones.
     """
 
     solution: Solution
@@ -77,24 +78,25 @@ class Pooled:
 
 
 FARTHEST_DEVIATION = 3.0
-"""Deviation of a trial's ln B, or relative one of its pressure, at which a step has left where the model is nearly
-linear. Chosen: twenty times B; at half as at twice the steps that end there are the same, those that diverge."""
+"""Deviation of a trial's ln B, or relative one of its pressure, at which a step has left the region in which the model
+is nearly linear. Chosen: twenty times B; at half as at twice the steps that end there are the same, those that
+diverge."""
 
 
 def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
-    """Weigh the trials of a fit by noise and disagreement.
+    """Estimate the shared parameters with trials weighted by noise and disagreement.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the fit ended.
     shared : int
-        How many of its free numbers may scatter between trials: the first ones.
+        Number of its free parameters that may differ between trials: the first ones.
 
     Returns
     -------
     Pooled or None
-        None for a single trial, or where the trajectories cannot be followed.
+        None for a single trial, or if it diverges or a simulation fails.
     """
     if len(predictor.data) < 2:
         return None
@@ -104,21 +106,22 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
     state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
     columns: Sequence[Floats] = solution.columns
     for _ in range(MOST_STEPS):
-        wide = _with_shapes(columns, shapes, state.theta[shared:])
-        cross_products = predictor.products(wide)
+        extended = _with_shapes(columns, shapes, state.theta[shared:])
+        cross_products = predictor.products(extended)
         rho, variance = estimate_noise(cross_products, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
-        pooled = _weighed(
-            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(wide)), shared
+        pooled = _with_weights(
+            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(extended)),
+            shared,
         )
-        step = pooled.covariance @ _slope(pooled, problem, state)
+        step = pooled.covariance @ _gradient(pooled, problem, state)
         scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
         errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
-        if float(np.max(np.abs(step) / errors, initial=0.0)) < SETTLED:
+        if float(np.max(np.abs(step) / errors, initial=0.0)) < CONVERGED_STEP_SIGMAS:
             return pooled
         step = step * min(1.0, LONGEST_STEP / longest)
-        state = _moved(pooled.solution, state, step)
+        state = _state_after_step(pooled.solution, state, step)
         if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > FARTHEST_DEVIATION:
             return None
         try:
@@ -145,74 +148,76 @@ def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Flo
     ]
 
 
-def _slope(pooled: Pooled, problem: MixedProblem, state: FitState) -> Floats:
+def _gradient(pooled: Pooled, problem: MixedProblem, state: FitState) -> Floats:
     return np.asarray(pooled.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
 
 
-def _moved(solution: Solution, state: FitState, step: Floats) -> FitState:
-    """The state a step further, releases, origins and deviations of the trials following to first order."""
+def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:
+    """The state after a step, with the effects of the trials following to first order."""
     problem = solution.problem
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     change = np.append(theta - state.theta, 0.0)[problem.index]
-    turned = solution.cross_products.copy()
-    # The residual once the numbers have moved: r − X δ.
-    turned[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
-    trial_effects = state.trial_effects + trial_effect_step(turned, problem, state)
+    moved_products = solution.cross_products.copy()
+    # The residual after the step: r − X δ.
+    moved_products[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
+    trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)
     return replace(state, theta=theta, trial_effects=trial_effects)
 
 
-def _weighed(solution: Solution, shared: int) -> Pooled:
-    """Weights of the trials at a state, τ² at its most likely value."""
+def _with_weights(solution: Solution, shared: int) -> Pooled:
+    """The pooled fit at a state, with τ² at its most likely value."""
     problem, state = solution.problem, solution.state
     size = problem.prior_mean.size
     information, scores = trial_information(solution)
     total = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    root = _typical_root(inverse_of_block(total, live), information, shared)
+    estimated = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
+    root = _typical_root(inverse_of_block(total, estimated), information, shared)
     values, vectors = np.linalg.eigh(information)
-    half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    information_roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     # With J = H Hᵀ and Hᵀ R = U S Vᵀ, R the root of M, (J⁻¹ + τ²M)⁻¹ = H U (1 + τ²S²)⁻¹ Uᵀ Hᵀ for any τ²: J − J(…)J
-    # would lose every digit of a number that trials disagree on.
-    turn, stretch, _ = np.linalg.svd(np.swapaxes(half, 1, 2) @ root)
-    ways = half @ turn
-    known = values > KNOWN * values[:, -1:]
-    along = np.where(known, 1 / np.sqrt(np.where(known, values, 1.0)), 0.0) * np.einsum("nij,ni->nj", vectors, scores)
-    beside = scores - np.einsum("nij,nj->ni", half, along)
-    along = np.einsum("nij,ni->nj", turn, along)
-    flat = np.swapaxes(ways, 1, 2).reshape(-1, size)
+    # would lose all digits of a parameter on which trials disagree to cancellation.
+    rotation, singular_values, _ = np.linalg.svd(np.swapaxes(information_roots, 1, 2) @ root)
+    rotated_roots = information_roots @ rotation
+    determined = values > LEAST_RELATIVE_INFORMATION * values[:, -1:]
+    score_parts = np.where(determined, 1 / np.sqrt(np.where(determined, values, 1.0)), 0.0) * np.einsum(
+        "nij,ni->nj", vectors, scores
+    )
+    score_rest = scores - np.einsum("nij,nj->ni", information_roots, score_parts)
+    score_parts = np.einsum("nij,ni->nj", rotation, score_parts)
+    stacked = np.swapaxes(rotated_roots, 1, 2).reshape(-1, size)
     prior = np.diag(problem.prior_precision)
-    offset = problem.prior_precision * (state.theta - problem.prior_mean) - beside.sum(axis=0)
+    offset = problem.prior_precision * (state.theta - problem.prior_mean) - score_rest.sum(axis=0)
 
     def deviance(tau2: float) -> float:
-        less = 1 / (1 + tau2 * stretch**2)
-        inside_all = ((flat * less.reshape(-1, 1)).T @ flat + prior)[np.ix_(live, live)]
-        slope = ((less * along).ravel() @ flat - offset)[live]
-        scale = 1 / np.sqrt(np.diag(inside_all))
-        even = inside_all * scale[:, None] * scale
-        gained = float((scale * slope) @ np.linalg.lstsq(even, scale * slope, rcond=1e-11)[0])
-        log_det = float(np.linalg.slogdet(inside_all)[1]) - float(np.sum(np.log(less)))
-        return log_det - float(np.sum((1 - less) * along**2)) - gained
+        shrinkage = 1 / (1 + tau2 * singular_values**2)
+        total_information = ((stacked * shrinkage.reshape(-1, 1)).T @ stacked + prior)[np.ix_(estimated, estimated)]
+        slope = ((shrinkage * score_parts).ravel() @ stacked - offset)[estimated]
+        scale = 1 / np.sqrt(np.diag(total_information))
+        scaled = total_information * scale[:, None] * scale
+        decrease = float((scale * slope) @ np.linalg.lstsq(scaled, scale * slope, rcond=1e-11)[0])
+        log_det = float(np.linalg.slogdet(total_information)[1]) - float(np.sum(np.log(shrinkage)))
+        return log_det - float(np.sum((1 - shrinkage) * score_parts**2)) - decrease
 
-    tau2 = _most_likely(deviance) if live.size else 0.0
-    less = 1 / (1 + tau2 * stretch**2)
-    weight = (ways * less[:, None, :]) @ np.swapaxes(ways, 1, 2)
-    score = np.einsum("nij,nj->ni", ways, less * along) + beside
-    covariance = inverse_of_block(weight.sum(axis=0) + prior, live)
+    tau2 = _maximise_likelihood(deviance) if estimated.size else 0.0
+    shrinkage = 1 / (1 + tau2 * singular_values**2)
+    weight = (rotated_roots * shrinkage[:, None, :]) @ np.swapaxes(rotated_roots, 1, 2)
+    score = np.einsum("nij,nj->ni", rotated_roots, shrinkage * score_parts) + score_rest
+    covariance = inverse_of_block(weight.sum(axis=0) + prior, estimated)
     return Pooled(solution, weight, score, covariance, tau2 * root @ root.T)
 
 
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:
-    """What each trial tells of the free numbers, as the fit holds them, all it has of its own integrated out.
+    """Information and scores of each trial on the free parameters, its trial effects integrated out.
 
     Parameters
     ----------
-    solution : where they stand
+    solution : gives the state
 
     Returns
     -------
     information : array, shape (n_trials, n_free, n_free)
-    scores : array, shape (n_trials, n_free), the slopes of ln L
+    scores : array, shape (n_trials, n_free), the gradients of ln L
     """
     problem = solution.problem
     size, p = problem.prior_mean.size, problem.index.shape[1]
@@ -226,15 +231,15 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
 
 
 def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:
-    """A root of M: the covariance of all trials times the number of trials that tell of a number."""
-    telling = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
-    telling[shared:] = 0.0
-    factor = np.sqrt(telling)
+    """A root of M: the covariance of all trials times the number of trials that depend on a parameter."""
+    informative_trials = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
+    informative_trials[shared:] = 0.0
+    factor = np.sqrt(informative_trials)
     values, vectors = np.linalg.eigh(covariance * factor[:, None] * factor)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _most_likely(deviance: Callable[[float], float]) -> float:
+def _maximise_likelihood(deviance: Callable[[float], float]) -> float:
     """The τ² of lowest deviance: 0, or the lowest of a grid, refined."""
     from scipy.optimize import minimize_scalar
 

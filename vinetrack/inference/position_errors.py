@@ -1,13 +1,13 @@
-"""Smooth errors of position that all trials of a camera share, fitted along with a model.
+"""Smooth errors of position that all trials of a camera share, as nuisance parameters of a fit.
 
-An uncalibrated lens displaces the leading edge by a smooth function of where it is. That function is the same in every
-trial, so that neither replicates nor the scatter of trials show it, and whatever effect resembles it would take it up.
-So it is a nuisance: Legendre polynomials of order 1 to 4 over the growth, each less its value where the edge rests and
-with a normal prior of standard deviation σ_s (`position_systematic_mm`).
+An uncalibrated lens displaces the leading edge by a smooth function of its position. That function is the same in every
+trial, so neither replicates nor the scatter of trials reveal it, and an effect that resembles it would absorb it. It is
+modelled by Legendre polynomials of order 1 to 4 over the growth, each minus its value where the edge rests and with a
+normal prior of standard deviation σ_s (`position_systematic_mm`).
 
 About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1) and D_i the shapes times σ_s. With s among the free
-numbers this is the linear mixed model of `vinetrack.inference.mixed_effects` again, with four more columns and four
-priors: its likelihood is that of hypotheses of which none is credited with what a lens could do.
+parameters this is the linear mixed model of `vinetrack.inference.mixed_effects` with four more columns and priors. Its
+likelihood compares hypotheses without crediting any of them with what a lens could explain.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ if TYPE_CHECKING:
 
 ORDERS = (1, 2, 3, 4)
 """Legendre orders of the shapes. Order 0 is the origin, which is free in every trial; a lens to lowest order is orders
-1 to 3 (`effects/lens.py`); chosen: 4 leaves room for what is not quite cubic. With 2 fewer a lens off the middle of the
+1 to 3 (`effects/lens.py`); chosen: 4 allows for deviations from a cubic. With 2 fewer, a lens off the middle of the
 growth is not covered; with 2 more, errors grow further for shapes that no lens makes."""
 
 NO_GROWTH_M = 1e-9
-"""Derived: no camera sees a nanometre; growth below it is none."""
+"""Growth that counts as none. Derived: no camera resolves a nanometre."""
 
-SETTLED, MOST_STEPS = 1e-2, 15
-"""Decrease of −2 ln L of a step at which the linear iteration ends: a hundredth of what matters in a comparison, where
-differences count from 1; and the most steps. Measured on campaigns of 20 trials: 2 to 4 steps."""
+CONVERGED_DECREASE_SMOOTH, MOST_STEPS = 1e-2, 15
+"""Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
+comparison, where differences count from 1; and the maximum number of steps. Measured on campaigns of 20 trials: 2 to 4
+steps."""
 
 
 @dataclass(frozen=True)
 class SmoothErrors:
-    """A fit with smooth errors of position beside it.
+    """A fit with smooth errors of position included.
 
-    `solution` holds the free numbers of the fit and behind them the sizes of the errors in standard deviations of their
-    priors. `gain` is by how much ln L rises, their priors counted; `whitened`, of shape (n_points,), what is left
-    of each trial, freed of its correlation, in standard deviations; `displacement_m`, arrays of shape (n_points,), the
-    smooth error itself.
+    `solution` holds the free parameters of the fit and after them the sizes of the errors in prior standard deviations.
+    `gain` is the increase of ln L, priors included; `whitened`, shape (n_points,) each, are the whitened residuals in
+    standard deviations; `displacement_m`, shape (n_points,) each, is the smooth error itself.
     """
 
     solution: Solution
@@ -67,10 +67,9 @@ class SmoothErrors:
 
 
 def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
-    """What one standard deviation of each shape does to positions, m, arrays of shape (n_points, n_shapes).
+    """Displacement by one standard deviation of each shape, m, for every trial.
 
-    `grown_m` is the growth at each point; a trial whose positions have no systematic error has zeros. The interval of
-    the polynomials is that of all growth, for one camera sees all trials. No shapes where no trial has such an error.
+    The polynomials span the growth of all trials, since one camera records them.
 
     Parameters
     ----------
@@ -81,11 +80,12 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     Returns
     -------
     list of arrays, shape (n_points, n_shapes), m
+        Zeros for a trial without such an error; no columns if no trial has one.
     """
     sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
     if not (sigma_m > 0).any():
         return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
-    # Where a model moves nothing the shapes are zero: their value at rest is taken out.
+    # Without any growth the shapes are zero, since their value at rest is subtracted.
     reach = max(NO_GROWTH_M, *(float(np.max(growth_m)) for growth_m in grown_m))
     select = np.eye(max(ORDERS) + 1)[list(ORDERS)].T
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
@@ -97,14 +97,14 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
 
 
 def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
-    """Fit the smooth errors of position beside the numbers of a fit, to first order; None where there are none.
+    """Fit the smooth errors of position along with the parameters of a fit, to first order; None where there are none.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
     held : FixedTerms, optional
-        Spreads and noise that the fit was told instead of estimating them.
+        Variance components that the fit did not estimate.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
 
     Notes
     -----
-    Trajectories are not followed anew: positions move by tenths of a millimetre, over which they are straight.
+    Trajectories are not simulated again: positions change by tenths of a millimetre, over which they are linear.
     """
     grown = [
         trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
@@ -124,48 +124,52 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     count = shapes[0].shape[1]
     if not count:
         return None
-    wide = [
+    extended = [
         np.column_stack([columns[:, :-1], shape, columns[:, -1]])
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
     held = held or FixedTerms()
-    still = replace(solution.problem, free=solution.problem.free & _moves(solution))
-    problem = with_shapes(still, count)
+    fixed_insensitive = replace(solution.problem, free=solution.problem.free & _sensitive(solution))
+    problem = with_shapes(fixed_insensitive, count)
     start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
-    state, cross_products, moved, level = _iterated(predictor, solution, wide, problem, start, held)
-    # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
-    # without the shapes, and is not theirs.
-    bare = _iterated(predictor, solution, solution.columns, still, solution.state, held)[3]
-    left = [values[:, -1] - values[:, :-1] @ change for values, change in zip(wide, moved, strict=True)]
+    state, cross_products, moved, log_likelihood = _newton_on_fixed_columns(
+        predictor, solution, extended, problem, start, held
+    )
+    # A poor fit is not at its minimum, and the linear model overestimates the gain. That part is the same without the
+    # shapes, so it is subtracted.
+    without_shapes = _newton_on_fixed_columns(
+        predictor, solution, solution.columns, fixed_insensitive, solution.state, held
+    )[3]
+    residuals = [values[:, -1] - values[:, :-1] @ change for values, change in zip(extended, moved, strict=True)]
     return SmoothErrors(
         solution=replace(
             solution,
             state=state,
             problem=with_shapes(solution.problem, count),
             cross_products=cross_products,
-            columns=tuple(_with_residual(wide, left)),
+            columns=tuple(_with_residual(extended, residuals)),
         ),
-        gain=max(level - bare, 0.0),
+        gain=max(log_likelihood - without_shapes, 0.0),
         whitened=tuple(
             whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
-            for values, trial_data, variance in zip(left, predictor.data, state.variance, strict=True)
+            for values, trial_data, variance in zip(residuals, predictor.data, state.variance, strict=True)
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
 
 
-def _moves(solution: Solution) -> NDArray[np.bool_]:
-    """Free numbers that move some trajectory.
+def _sensitive(solution: Solution) -> NDArray[np.bool_]:
+    """Free parameters that influence some trajectory.
 
-    The column of one that does not is rounding. A step along it is millions of scales long and promises a likelihood
-    that no trajectory keeps; columns that stay would let it be taken.
+    The column of a parameter without influence is rounding error. With fixed columns, a step along it would be millions
+    of scales long and predict a likelihood that no trajectory confirms.
     """
     part = marginal(solution.cross_products, solution.problem, solution.state)
     information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
     return np.asarray(np.diag(information) > LEAST_INFORMATION)
 
 
-def _iterated(
+def _newton_on_fixed_columns(
     predictor: Predictor,
     solution: Solution,
     columns: Sequence[Floats],
@@ -173,32 +177,32 @@ def _iterated(
     state: FitState,
     held: FixedTerms,
 ) -> tuple[FitState, Floats, Floats, float]:
-    """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L.
+    """Newton steps at fixed sensitivities: state, cross products there, total change of each trial's unknowns, ln L.
 
     Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
     along the direction in which they cancel; no trajectory is simulated here that would reject it.
     """
     cross_products = predictor.products(columns)
-    moved = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
+    total_change = np.zeros((len(cross_products), cross_products.shape[-1] - 1))
     state = _variances(predictor, problem, cross_products, state, solution, held)
-    level = _level(cross_products, problem, state, solution)
+    level = _log_likelihood(cross_products, problem, state, solution)
     for _ in range(MOST_STEPS):
         step, own_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, 0.0)
         change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
-        there = _moved(cross_products, change)
+        products = _products_after_step(cross_products, change)
         before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
-        after = _variances(predictor, problem, there, before, solution, held)
-        reached = _level(there, problem, after, solution)
-        if reached < level - SETTLED:
+        after = _variances(predictor, problem, products, before, solution, held)
+        new_level = _log_likelihood(products, problem, after, solution)
+        if new_level < level - CONVERGED_DECREASE_SMOOTH:
             break
-        cross_products, moved, state, level = there, moved + change, after, reached
-        if predicted_decrease < SETTLED and variance_change(before, state) < CONVERGED_VARIANCES:
+        cross_products, total_change, state, level = products, total_change + change, after, new_level
+        if predicted_decrease < CONVERGED_DECREASE_SMOOTH and variance_change(before, state) < CONVERGED_VARIANCES:
             break
-    return state, cross_products, moved, level
+    return state, cross_products, total_change, level
 
 
-def _level(cross_products: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
-    """Marginal ln L at a state, spreads at their best for it."""
+def _log_likelihood(cross_products: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
+    """Marginal ln L at a state, maximised over the between-trial standard deviations."""
     part = marginal(cross_products, problem, state)
     spread = estimate_between_trial_sd(part, problem, state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, problem, state, spread, restricted=False)
@@ -209,7 +213,7 @@ def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> lis
 
 
 def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
-    """The problem with the sizes of the shapes as further free numbers, each with a normal prior of mean 0 and sd 1.
+    """The problem with the sizes of the shapes as further free parameters, each with a standard normal prior.
 
     Parameters
     ----------
@@ -222,7 +226,7 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
     MixedProblem
     """
     places = problem.prior_mean.size + np.arange(count)
-    # A trial's column that belongs to no free number has the place −1: the last of an appended zero.
+    # A column that belongs to no free parameter has index −1, the appended zero.
     index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
     return replace(
         problem,
@@ -244,10 +248,9 @@ def _variances(
     solution: Solution,
     held: FixedTerms,
 ) -> FitState:
-    """Noise and spreads anew, where the fit was not told them.
+    """Estimate noise and between-trial standard deviations, unless they are fixed.
 
-    What smooth errors leave cannot be slower than what there was before: noise of a correlation near 1, which a fit far
-    off was kept from, would make anything likely.
+    The noise correlation may not exceed that of the fit: noise of correlation near 1 would make anything likely.
     """
     estimable = solution.estimable
     if held.noise is None:
@@ -262,18 +265,20 @@ def _variances(
     return state
 
 
-def _moved(cross_products: Floats, change: Floats) -> Floats:
-    """Products of the columns once the unknowns of each trial, shape (n_trials, n_columns − 1), have moved by so much.
+def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
+    """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1).
 
     The residual becomes r − C·change, the other columns stay.
     """
-    turn = np.broadcast_to(np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])).copy()
-    turn[:, :-1, -1] = -change
-    return np.asarray(np.swapaxes(turn, 1, 2)[:, None] @ cross_products @ turn[:, None])
+    transformation = np.broadcast_to(
+        np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])
+    ).copy()
+    transformation[:, :-1, -1] = -change
+    return np.asarray(np.swapaxes(transformation, 1, 2)[:, None] @ cross_products @ transformation[:, None])
 
 
 def with_smooth_errors(fit: Fit) -> Solution:
-    """Where a fit ended, the smooth errors of position among its numbers where there are any.
+    """The solution of a fit, with the smooth errors of position among its parameters where there are any.
 
     Parameters
     ----------

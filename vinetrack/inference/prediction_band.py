@@ -1,21 +1,21 @@
-"""How far a trial that was not in a fit may lie from its prediction: the 95 % band of its position at each time.
+"""The 95 % prediction band of a trial that was not in the fit, for its position at each time.
 
-About the prediction, with release and origin of the trial fitted to it,
+With release and origin of the trial fitted to it, the deviation from the prediction is
 
     e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
 
-δθ is the error of the shared numbers, u what the numbers of a trial differ by from those (`inference.pooling`), d its
-deviations of pressure and B, s errors that replicates do not show (smooth errors of position, 30 Pa of a set pressure)
-and ε noise of covariance K, which holds what the model misses along each trial: the noise of a fit is what is left of
-it. The variance at a time is the diagonal of
+δθ is the error of the shared parameters, u the difference of the trial's parameters from those (`inference.pooling`), d
+its deviations of pressure and B, s errors that replicates do not show (smooth errors of position, 30 Pa of a set
+pressure) and ε noise of covariance K, which includes the misfit of the model along each trial, since the noise of a fit
+is that of its residuals. The variance at a time is the diagonal of
 
     M (X (C + T) Xᵀ + Z D Zᵀ + S Sᵀ) Mᵀ + K − A (AᵀK⁻¹A)⁻¹ Aᵀ + δ² ℓ²
 
-with ℓ the travel of the trial. δ is the discrepancy of the model from one trial to the next (Kennedy & O'Hagan, J. R.
-Stat. Soc. B 63, 425, 2001), taken as one standard deviation all along the way: that with which the trials of the fit,
-each left out of it in turn to first order, miss as much as their bands say (Paule & Mandel, J. Res. NBS 87, 377, 1982);
-0 where they miss less. With it a misfit that differs between trials widens the band of the next. The half width is so
-many of these standard deviations that nine positions in ten lie within, of 95 % of trials that deviate so, and of 95 %
+with ℓ the travel of the trial. δ is the discrepancy of the model between trials (Kennedy & O'Hagan, J. R. Stat. Soc. B
+63, 425, 2001), one standard deviation along the whole motion. It is chosen so that the trials of the fit, each left out
+in turn to first order, have the residuals that their bands predict (Paule & Mandel, J. Res. NBS 87, 377, 1982); 0 where
+they have less. With it a misfit that differs between trials widens the band of the next. The half width is so many of
+these standard deviations that nine positions in ten lie within, for 95 % of trials with these deviations and for 95 %
 of the left-out trials (jackknife prediction intervals: Barber et al., Ann. Stat. 49, 486, 2021); at least Student's t.
 """
 
@@ -42,13 +42,13 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, 
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
 
-TOLD_BY_OTHERS = 1e-6
-"""Part of the information on a number that must come from other trials for one to be predicted from them. Chosen: far
-below what one of a hundred trials tells, far above rounding."""
+LEAST_INFORMATION_OF_OTHERS = 1e-6
+"""Part of the information on a parameter that must come from other trials to predict a trial from them. Chosen: far
+below the share of one of a hundred trials, far above rounding."""
 
-MOSTLY, HOLDS = 0.9, 0.95
-"""A trial counts as held where this part of its positions is, and a band is to hold this part of trials. Chosen: the
-few positions at which release and origin leave a band of no width are not what a band is asked for."""
+COVERED_POSITIONS, COVERAGE = 0.9, 0.95
+"""A trial counts as covered where this part of its positions is, and a band has to cover this part of trials. Chosen:
+bands are not judged by the few positions at which release and origin leave them no width."""
 
 DRAWS = 1000
 """Curves drawn for a simultaneous band. Chosen: its 95 % quantile is then known to 3 %."""
@@ -62,10 +62,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the trials of a fit, each predicted from the others, say of the next one.
+    """Calibration of the bands by the trials of a fit, each predicted from the others.
 
-    `discrepancy` is δ, a part of the travel; `reach` the half width of the band in standard deviations; `degrees` are
-    Student's; `trials` counts those that could be predicted.
+    `discrepancy` is δ, relative to the travel; `reach` the half width of the band in standard deviations; `degrees` are
+    Student's; `trials` is the number of trials that could be predicted.
     """
 
     discrepancy: float
@@ -76,9 +76,9 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Basis:
-    """The fit as predictions use it: numbers as it holds them, smooth errors of position behind them where there are.
+    """The fit as predictions use it: scaled parameters, including smooth errors of position where there are any.
 
-    `information` and `scores` are those of the trials, `between` is the covariance of a trial's numbers.
+    `information` and `scores` are those of the trials, `between` is the between-trial covariance of the parameters.
     """
 
     solution: Solution
@@ -93,45 +93,45 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
     Parameters
     ----------
     fit : the fit, in which the trials were not
-    data : the trials as they were laid out for the prediction
+    data : the data of the trials
     predicted : in the same order
 
     Returns
     -------
     list of TrialFit
-        With `band_m`, array, shape (n_points,); None where the trajectories beside the prediction cannot be followed.
+        With `band_m`, array, shape (n_points,); None where the perturbed trajectories cannot be simulated.
     """
-    basis = _basis(fit)
-    known = _calibrated(fit, basis)
+    basis = _pooled_basis(fit)
+    calibration_of_fit = _calibrated(fit, basis)
     banded = []
     for trial_data, trial in zip(data, predicted, strict=True):
         try:
-            loadings, random = _loadings_of_new(fit, basis, trial_data, trial)
+            loadings, random = _loadings_of_new_trial(fit, basis, trial_data, trial)
         except SimulationError:
             banded.append(trial)
             continue
-        further = (known.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
-        sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + further)
-        reach = max(known.reach, _simultaneous(loadings / sigma[:, None], known.degrees))
+        discrepancy_variance = (calibration_of_fit.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
+        sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + discrepancy_variance)
+        reach = max(calibration_of_fit.reach, _simultaneous(loadings / sigma[:, None], calibration_of_fit.degrees))
         banded.append(replace(trial, band_m=reach * sigma))
     return banded
 
 
 def _simultaneous(loadings: Floats, degrees: float) -> float:
-    """Standard deviations within which `MOSTLY` of the positions of `HOLDS` of trials lie, whichever way they deviate.
+    """Standard deviations within which COVERED_POSITIONS of the positions of COVERAGE of trials lie.
 
-    Of one way to deviate that is Student's t; of several, more, for a trial may deviate by one early and by another
-    late.
+    For a single way to deviate that is Student's t; for several, more, since a trial may deviate by one early and by
+    another late.
     """
     draw = np.random.default_rng(1)
     scale = np.ones(DRAWS) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, DRAWS))
-    every = loadings[:: max(len(loadings) // 60, 1)]
-    curves = np.abs(every @ draw.standard_normal((loadings.shape[1], DRAWS))) * scale
-    return float(np.quantile(np.quantile(curves, MOSTLY, axis=0), HOLDS))
+    thinned = loadings[:: max(len(loadings) // 60, 1)]
+    curves = np.abs(thinned @ draw.standard_normal((loadings.shape[1], DRAWS))) * scale
+    return float(np.quantile(np.quantile(curves, COVERED_POSITIONS, axis=0), COVERAGE))
 
 
 def calibration(fit: Fit) -> Calibration:
-    """What the trials of a fit, each predicted from the others, say of the next one.
+    """Calibration of the prediction bands by the trials of a fit, each predicted from the others.
 
     Parameters
     ----------
@@ -141,10 +141,10 @@ def calibration(fit: Fit) -> Calibration:
     -------
     Calibration
     """
-    return _calibrated(fit, _basis(fit))
+    return _calibrated(fit, _pooled_basis(fit))
 
 
-def _basis(fit: Fit) -> _Basis:
+def _pooled_basis(fit: Fit) -> _Basis:
     count = len(fit.numbers)
     pooled = None
     if fit.between is not None and fit.between.any():
@@ -158,25 +158,25 @@ def _basis(fit: Fit) -> _Basis:
 def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
     solution, data = basis.solution, fit.predictor.data
-    pairs = [_left_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
+    pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
     seen = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not seen:
         return Calibration(0.0, NORMAL_95, math.inf, 0)
-    square = np.array([np.mean(missed**2) for _, missed, _ in seen])
+    square = np.array([np.mean(residual**2) for _, residual, _ in seen])
     mean_variance = np.array([np.mean(variance) for *_, variance in seen])
     travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in seen])
     delta2 = _paule_mandel(square, mean_variance, travel2)
     assumed = delta2 == 0.0 and not basis.between.any() and not any(solution.estimable)
-    # Spreads by restricted likelihood lose a degree of freedom for each fitted number; δ and τ lose one.
+    # Restricted likelihood loses a degree of freedom for each fitted parameter; δ and τ lose one.
     fitted = 1 if delta2 > 0 or basis.between.any() else int(np.count_nonzero(solution.problem.prior_precision == 0))
     degrees = math.inf if assumed else max(float(len(seen) - fitted), 1.0)
     reached = np.sort(
         [
-            np.quantile(np.abs(missed) / np.sqrt(variance + delta2 * scale), MOSTLY)
-            for (_, missed, variance), scale in zip(seen, travel2, strict=True)
+            np.quantile(np.abs(residual) / np.sqrt(variance + delta2 * scale), COVERED_POSITIONS)
+            for (_, residual, variance), scale in zip(seen, travel2, strict=True)
         ]
     )
-    enough = min(math.ceil(HOLDS * (len(seen) + 1)), len(seen))
+    enough = min(math.ceil(COVERAGE * (len(seen) + 1)), len(seen))
     reach = max(float(student(np.array([degrees]))[0]), float(reached[enough - 1]))
     return Calibration(math.sqrt(delta2), reach, degrees, len(seen))
 
@@ -192,10 +192,10 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tuple[Floats, Floats] | None:
-    """What a trial of the fit misses once left out of it, m, and the variance of that, m², to first order.
+def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
+    """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order.
 
-    None where the other trials do not tell all numbers that it feels.
+    None where the other trials do not determine all parameters on which it depends.
     """
     solution = basis.solution
     problem, state = solution.problem, solution.state
@@ -204,67 +204,75 @@ def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tupl
     others = total - basis.information[i]
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
-    felt = free[np.diag(basis.information[i])[free] > 0]
-    if len(basis.scores) < 2 or (np.diag(others)[felt] <= TOLD_BY_OTHERS * np.diag(total)[felt]).any():
+    needed = free[np.diag(basis.information[i])[free] > 0]
+    if len(basis.scores) < 2 or (np.diag(others)[needed] <= LEAST_INFORMATION_OF_OTHERS * np.diag(total)[needed]).any():
         return None
     covariance = inverse_of_block(others, free)
     columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
-    design = _design(columns, problem.index[i], size)
+    design = _design_matrix(columns, problem.index[i], size)
     shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
-    missed = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
-    own_loadings = _own_loadings(_own_spreads(solution, i), columns, trial_data)
+    residual = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
+    own_loadings = _deviation_loadings(_deviation_sd(solution, i), columns, trial_data)
     loadings = np.column_stack([design @ matrix_root(covariance + basis.between), own_loadings])
     noise = float(state.variance[i]) / (1 - state.rho**2)
-    left, random, missed = _aligned(loadings, missed, columns[:, :2], trial_data, weigh, state, noise)
-    return missed, np.sum(left**2, axis=1) + random
+    aligned, random, residual = _with_release_and_origin_fitted(
+        loadings, residual, columns[:, :2], trial_data, fit_correlation, state, noise
+    )
+    return residual, np.sum(aligned**2, axis=1) + random
 
 
-def _design(columns: Floats, index: np.ndarray, size: int) -> Floats:
-    """What the free numbers do to positions of a trial, shape (n_points, size), from the columns of its keys."""
+def _design_matrix(columns: Floats, index: np.ndarray, size: int) -> Floats:
+    """Sensitivities of a trial to all free parameters, shape (n_points, size), from the columns of its keys."""
     design = np.zeros((len(columns), size + 1))
     np.add.at(design.T, index, columns[:, N_TRIAL_EFFECTS:-1].T)
     return design[:, :size]
 
 
-def _own_spreads(solution: Solution, i: int) -> Floats:
+def _deviation_sd(solution: Solution, i: int) -> Floats:
     """Standard deviations of the deviations of pressure and ln B of one trial, shape (2,), 0 where it has none."""
     return np.asarray(
         trial_deviation_sd(solution.problem, solution.state.spread)[i] * solution.problem.has_deviation[i]
     )
 
 
-def _own_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:
-    """What one standard deviation of pressure, of B and of a set pressure does to positions, shape (n_points, 3)."""
+def _deviation_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:
+    """Displacement by one standard deviation of pressure, of B and of a set pressure, shape (n_points, 3)."""
     set_pressure = trial_data.trace is None and spread[0] > 0 and trial_data.trial.pressure_Pa > 0
     misset = PRESSURE_ERROR_PA / trial_data.trial.pressure_Pa if set_pressure else 0.0
     moved = columns[:, [PRESSURE, DAMPING_DEVIATION, PRESSURE]]
     return np.asarray(moved * [spread[0], spread[1], misset])
 
 
-def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
-    """What one standard deviation of each error does to a new trial, m, and the variance of its noise, m²."""
+def _loadings_of_new_trial(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+    """Displacement of a new trial by one standard deviation of each error, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
     theta, places = values_for_trial(fit, layout, trial_data)
     predictor = Predictor(layout, [trial_data], fit.predictor.host)
     trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
     columns = predictor.linearise(theta, trial_effects)[0]
     covariance = _covariance(fit, basis) + basis.between[: len(fit.numbers), : len(fit.numbers)]
-    mine = np.diag(np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0))
+    parameter_covariance = np.diag(
+        np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0)
+    )
     matched = np.flatnonzero(places >= 0)
-    mine[matched, :] = mine[:, matched] = 0.0
-    mine[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
-    design = _design(columns, layout.index[0], theta.size)
+    parameter_covariance[matched, :] = parameter_covariance[:, matched] = 0.0
+    parameter_covariance[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
+    design = _design_matrix(columns, layout.index[0], theta.size)
     state = basis.solution.state
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.has_pressure_deviation[0], predictor.has_damping_deviation[0]]
     shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
-    loadings = np.column_stack([design @ matrix_root(mine), _own_loadings(spread, columns, trial_data), shapes])
+    loadings = np.column_stack(
+        [design @ matrix_root(parameter_covariance), _deviation_loadings(spread, columns, trial_data), shapes]
+    )
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
-    return _aligned(loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise)[:2]
+    return _with_release_and_origin_fitted(
+        loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise
+    )[:2]
 
 
 def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
-    """The numbers of a fit as the layout of one trial holds them.
+    """The parameters of a fit as the layout of one trial holds them.
 
     Parameters
     ----------
@@ -279,7 +287,7 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
     theta : array, shape (n_free,)
         Scaled; those of its vine and its day where each has its own.
     places : array of int, shape (n_free,)
-        Places among the numbers of the fit, -1 for new ones.
+        Indices among the numbers of the fit, -1 for new ones.
     """
     theta, places = layout.start, np.full(len(layout.free), -1)
     trial = trial_data.trial
@@ -293,7 +301,7 @@ def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tu
 
 
 def _covariance(fit: Fit, basis: _Basis) -> Floats:
-    """Covariance of the numbers as the fit holds them, with all that widens their errors."""
+    """Covariance of the parameters, scaled, with everything that widens their errors."""
     problem = basis.solution.problem
     total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
     count = len(fit.numbers)
@@ -303,37 +311,45 @@ def _covariance(fit: Fit, basis: _Basis) -> Floats:
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
     )
     by_noise = np.sqrt(np.maximum(np.diag(plain), 1e-300))
-    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / by_noise, 1.0), 1.0)
-    return np.asarray(plain * wider[:, None] * wider)
+    ratio = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / by_noise, 1.0), 1.0)
+    return np.asarray(plain * ratio[:, None] * ratio)
 
 
-def _aligned(
-    loadings: Floats, missed: Floats, design: Floats, trial_data: FitTrial, weigh: float, state: FitState, noise: float
+def _with_release_and_origin_fitted(
+    loadings: Floats,
+    residual: Floats,
+    design: Floats,
+    trial_data: FitTrial,
+    fit_correlation: float,
+    state: FitState,
+    noise: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """Loadings, variance of the noise at each point, and what is missed, with release and origin fitted to the trial.
+    """Loadings, noise variance at each point, and residual after release and origin are fitted to the trial.
 
-    `design` holds the columns of release and origin, `weigh` is the correlation of the noise with which predictions fit
-    them, `noise` the variance of a position, m².
+    `design` holds the columns of release and origin, `fit_correlation` is the noise correlation with which predictions
+    fit them, `noise` the variance of a position, m².
     """
-    white = whiten(design, trial_data.first, weigh, trial_data.relative_sd)
+    white = whiten(design, trial_data.first, fit_correlation, trial_data.relative_sd)
     fixed = np.array([not trial_data.pressurised_in_recording, True])
     inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
-    points = missed.size
-    whitener = whiten(np.eye(points), trial_data.first, weigh, trial_data.relative_sd)
-    lever = inverse @ (white.T @ whitener)
-    both = np.column_stack([loadings, missed])
-    left = both - design @ (lever @ both)
+    points = residual.size
+    whitener = whiten(np.eye(points), trial_data.first, fit_correlation, trial_data.relative_sd)
+    estimator = inverse @ (white.T @ whitener)
+    columns = np.column_stack([loadings, residual])
+    aligned = columns - design @ (estimator @ columns)
     covariance = noise * _correlation(trial_data, state.rho)
-    through = lever @ covariance
-    taken = 2 * np.einsum("nk,kn->n", design, through) - np.einsum("nk,kl,nl->n", design, through @ lever.T, design)
-    return left[:, :-1], np.maximum(np.diag(covariance) - taken, 0.0), left[:, -1]
+    propagated = estimator @ covariance
+    explained = 2 * np.einsum("nk,kn->n", design, propagated) - np.einsum(
+        "nk,kl,nl->n", design, propagated @ estimator.T, design
+    )
+    return aligned[:, :-1], np.maximum(np.diag(covariance) - explained, 0.0), aligned[:, -1]
 
 
 def _correlation(trial_data: FitTrial, rho: float) -> Floats:
-    """Covariance of the noise of a trial's points over its variance, shape (n_points, n_points); stretches apart."""
+    """Noise covariance of a trial's points over its variance, shape (n_points, n_points); stretches are independent."""
     points = np.arange(trial_data.time_s.size)
     stretch = np.cumsum(trial_data.first)
-    together = stretch[:, None] == stretch
+    same_stretch = stretch[:, None] == stretch
     sd = trial_data.point_sd
-    apart = np.power(rho, np.arange(points.size))[np.abs(points[:, None] - points)]
-    return np.asarray(np.where(together, apart, 0.0) * sd[:, None] * sd)
+    correlation = np.power(rho, np.arange(points.size))[np.abs(points[:, None] - points)]
+    return np.asarray(np.where(same_stretch, correlation, 0.0) * sd[:, None] * sd)

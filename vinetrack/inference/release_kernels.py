@@ -1,7 +1,7 @@
-"""A compiled loop over the releases that a trial may have: the trajectory shifted, its columns whitened and multiplied.
+"""Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
 
-Every look for other releases asks some forty of each trial, and a fit looks a few times; as array operations that was
-three quarters of the time of a fit that is taken up where another ended.
+A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was three
+quarters of the time of a fit that continues from another.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ def products_at_releases(
     curves: Floats,
     rho: float,
 ) -> Floats:
-    """Whitened products of the columns of a trial and of its residual, its trajectory begun at each of these releases.
+    """Whitened cross products of the columns and residual of a trial for each candidate release.
 
-    As `whitening.whiten` and a product of matrices for each release; curves are joined by straight lines, and stay what
-    they are at either end of the grid beyond it.
+    Equivalent to `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and
+    constant beyond the ends of the grid.
 
     Parameters
     ----------
     time_s, position_m : arrays, shape (n_points,)
-        The trial, s and m; the origin taken off the positions.
+        The trial, s and m; positions relative to the origin.
     first : array of bool, shape (n_points,)
         Points that begin a stretch.
     relative_sd : array, shape (n_points,)
-        Noise of every point relative to that of the trial.
+        Noise of each point relative to that of the trial.
     releases_s : array, shape (n_releases,), s
     grid_s : array, shape (n_grid,), s
-        Instants since release, increasing from 0.
+        Times since release, increasing from 0.
     curves : array, shape (n_columns, n_grid)
-        How positions there answer to each column; the last is the position itself.
+        Sensitivities at these times; the last row is the position itself.
     rho : float
         Lag-one correlation of the noise.
 

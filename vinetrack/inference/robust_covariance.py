@@ -1,8 +1,9 @@
-"""Errors of fitted numbers beyond those of the noise model: how much trials scatter, and what they err by together.
+"""Robust covariance of the parameters of a fit, from the scatter of trials and from shared systematic errors.
 
-The information matrix holds only if noise and scatter are what the model of them says. The scores of single trials
-tell otherwise by how much they scatter (White, Econometrica 48, 817, 1980, with trials as clusters), and what trials
-have in common (`vinetrack.inference.systematics`) moves numbers without any scatter. Both only ever widen an error.
+The inverse information is the covariance only if noise and between-trial variation are as modelled. The scatter of the
+scores of single trials gives a cluster-robust (sandwich) covariance (White, Econometrica 48, 817, 1980, with trials as
+clusters). Errors that trials share (`vinetrack.inference.systematics`) move parameters without any scatter. Both only
+ever widen an error.
 """
 
 from __future__ import annotations
@@ -23,26 +24,27 @@ from vinetrack.inference.systematics import Systematics, systematics_of
 from vinetrack.inference.whitening import products
 
 FEWEST_CLUSTERS = 8
-"""Trials from which their scatter says more than the model of the noise. Chosen: with fewer clusters a sandwich is
-known to worse than 50 %."""
+"""Trials from which the sandwich is better than the model of the noise. Chosen: with fewer clusters a sandwich variance
+is known to worse than 50 %."""
 
 FEWEST_DEGREES = 4
-"""And this many more than there are numbers. Chosen: with four the variance is known to a factor of about 1.7."""
+"""Trials beyond the number of parameters that a sandwich needs. Chosen: with four the variance is known to a factor of
+about 1.7."""
 
 LARGEST_SHARE = 0.99
-"""Chosen: share of the information on a direction from which one trial is as good as alone to tell of it. At 0.98 its
-score is enlarged by 7 instead of 10; what is left of it then is rounding more than scatter."""
+"""Share of the information on a direction from which one trial is practically the only one to determine it. Chosen: at
+0.98 its score is enlarged by 7 instead of 10; beyond, what remains of it is rounding more than scatter."""
 
 
 def cluster_variance(single: Floats, degrees: float) -> Floats:
-    """Variance of sums over trials from how single trials, shape (n_trials, n), scatter; 0 where they are too few.
+    """Variance of sums over trials, estimated from the scatter of single trials; 0 where they are too few.
 
-    Priors' parts belong to no trial: the mean is taken out.
+    The contributions of priors belong to no trial: the mean is subtracted.
 
     Parameters
     ----------
     single : array, shape (n_trials, n)
-        What each trial adds.
+        Contribution of each trial.
     degrees : float
         Degrees of freedom of the scatter.
 
@@ -57,7 +59,7 @@ def cluster_variance(single: Floats, degrees: float) -> Floats:
 
 
 def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
-    """Whether trials are too few for a sandwich over them.
+    """Whether there are too few trials for a sandwich covariance.
 
     Parameters
     ----------
@@ -76,11 +78,11 @@ def widened_covariance(
     predictor: Predictor,
     solution: Solution,
     trials: Sequence[TrialFit],
-    known: Precision,
-    wide: Solution | None = None,
+    model_precision: Precision,
+    extended: Solution | None = None,
     pooled: Pooled | None = None,
 ) -> Precision:
-    """Covariance and degrees of freedom at the end of a fit, widened where trials say that they should be.
+    """Covariance and degrees of freedom at the end of a fit, widened by the scatter of trials and by systematic errors.
 
     Parameters
     ----------
@@ -88,47 +90,48 @@ def widened_covariance(
     solution : where the iterations ended.
     trials : sequence of TrialFit
         In the order of the fit.
-    known : covariance by the noise model.
-    wide : Solution, optional
-        The fit with smooth errors of position among its numbers, to which `known` then belongs.
+    model_precision : covariance by the model of noise and between-trial variation.
+    extended : Solution, optional
+        The fit with smooth errors of position among its parameters, to which `model_precision` then belongs.
     pooled : Pooled, optional
-        Numbers with trials weighed by how much they disagree; its covariance is then widened.
+        The fit with trials weighted by their disagreement; its covariance is then widened.
 
     Returns
     -------
     Precision
     """
-    systematics = systematics_of(predictor, solution, trials, positions=wide is None)
-    plain, robust, moved = _sandwich(predictor, wide or solution, systematics)
+    systematics = systematics_of(predictor, solution, trials, positions=extended is None)
+    plain, robust, moved = _sandwich(predictor, extended or solution, systematics)
     diagonal = np.diag(plain)
-    live = diagonal > 0
+    estimated = diagonal > 0
     ratio = np.ones(diagonal.size)
-    spare = len(trials) - np.count_nonzero(live)
-    at_most = known.degrees
+    spare = len(trials) - np.count_nonzero(estimated)
+    at_most = model_precision.degrees
     if pooled is not None:
         diagonal = np.diag(pooled.covariance)
-        live = diagonal > 0
-        variance, few = _few_trials(pooled.information, pooled.scores, wide or solution, pooled.covariance)
-        ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
+        estimated = diagonal > 0
+        variance, few = _few_trial_variances(pooled.information, pooled.scores, extended or solution, pooled.covariance)
+        ratio[estimated] = np.sqrt(np.maximum(variance[estimated] / diagonal[estimated], 1.0))
         at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
     elif len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
-        ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
+        ratio[estimated] = np.sqrt(np.maximum(np.diag(robust)[estimated] / diagonal[estimated], 1.0))
         clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
         few = np.full(diagonal.size, float(min(int(spare), clusters - 1)))
     else:
-        variance, few = _few_trials(*trial_information(wide or solution), wide or solution, plain)
-        ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
+        variance, few = _few_trial_variances(*trial_information(extended or solution), extended or solution, plain)
+        ratio[estimated] = np.sqrt(np.maximum(variance[estimated] / diagonal[estimated], 1.0))
     degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
     covariance = (
-        np.where(np.isfinite(known.covariance), known.covariance, 0.0) * ratio[:, None] * ratio + moved @ moved.T
+        np.where(np.isfinite(model_precision.covariance), model_precision.covariance, 0.0) * ratio[:, None] * ratio
+        + moved @ moved.T
     )
-    unknown = np.flatnonzero(~np.isfinite(np.diag(known.covariance)))
+    unknown = np.flatnonzero(~np.isfinite(np.diag(model_precision.covariance)))
     covariance[unknown, unknown] = np.inf
-    return replace(known, covariance=covariance, degrees=degrees)
+    return replace(model_precision, covariance=covariance, degrees=degrees)
 
 
 def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
-    """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials.
+    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials.
 
     Parameters
     ----------
@@ -138,7 +141,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     Returns
     -------
     plain, robust : arrays, shape (n_free, n_free)
-        Scaled as the fit holds the numbers.
+        Of scaled parameters.
     """
     nothing = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
     plain, robust, _ = _sandwich(predictor, solution, nothing)
@@ -146,30 +149,32 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
 
 
 def parameter_shifts(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
-    """How far one standard deviation of each systematic error moves each free number, to first order.
+    """Change of each free parameter by one standard deviation of each systematic error, to first order.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
     systematics : Systematics
-        What each error does to positions.
+        Effect of each error on positions.
 
     Returns
     -------
     array, shape (n_free, count)
-        Scaled as the fit holds the numbers.
+        Of scaled parameters.
     """
     return _sandwich(predictor, solution, systematics)[2]
 
 
-def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: Floats) -> tuple[Floats, Floats]:
-    """Variances of the free numbers from how trials disagree, unbiased for few of them; and their degrees of freedom.
+def _few_trial_variances(
+    information: Floats, scores: Floats, solution: Solution, plain: Floats
+) -> tuple[Floats, Floats]:
+    """Variances of the free parameters from the disagreement of few trials, without bias, and their degrees of freedom.
 
-    Each trial pulls the fit towards itself, by its share K_i of the information, and so shows less than it errs by: in
+    Each trial pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in
     units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i) (CR2: Bell &
-    McCaffrey, Survey Methodology 28, 169, 2002). What one trial alone tells of has no scatter: there the model's
-    stands. Degrees of freedom are Satterthwaite's; two trials have one.
+    McCaffrey, Survey Methodology 28, 169, 2002). A direction that only one trial determines has no scatter: there the
+    model's variance is used. Degrees of freedom are Satterthwaite's; two trials have one.
 
     Parameters
     ----------
@@ -178,28 +183,30 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
 
     Returns
     -------
-    variance, degrees : arrays, shape (n_free,), numbers as the fit holds them
+    variance, degrees : arrays, shape (n_free,), of scaled parameters
     """
     variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
-    live = np.flatnonzero(np.diag(plain) > 0)
-    if not live.size or len(scores) < 2:
+    estimated = np.flatnonzero(np.diag(plain) > 0)
+    if not estimated.size or len(scores) < 2:
         return variance, degrees
-    root = matrix_root(plain[np.ix_(live, live)])
-    score = (scores - scores.mean(axis=0))[:, live] @ root
-    shares, mended = [], []
-    constant = root.T @ np.diag(solution.problem.prior_precision[live]) @ root
+    root = matrix_root(plain[np.ix_(estimated, estimated)])
+    score = (scores - scores.mean(axis=0))[:, estimated] @ root
+    shares, adjustments = [], []
+    constant = root.T @ np.diag(solution.problem.prior_precision[estimated]) @ root
     for single in information:
-        share = root.T @ single[np.ix_(live, live)] @ root
+        share = root.T @ single[np.ix_(estimated, estimated)] @ root
         values, vectors = np.linalg.eigh(share)
-        seen = values < LARGEST_SHARE
-        mended.append((vectors[:, seen] / np.sqrt(1 - np.maximum(values[seen], 0.0))) @ vectors[:, seen].T)
-        constant = constant + (vectors[:, ~seen] * values[~seen]) @ vectors[:, ~seen].T
+        below_limit = values < LARGEST_SHARE
+        adjustments.append(
+            (vectors[:, below_limit] / np.sqrt(1 - np.maximum(values[below_limit], 0.0))) @ vectors[:, below_limit].T
+        )
+        constant = constant + (vectors[:, ~below_limit] * values[~below_limit]) @ vectors[:, ~below_limit].T
         shares.append(share)
-    for k, place in enumerate(live.tolist()):
-        lever = np.array([mend @ root[k] for mend in mended])
-        scatter = float(np.sum(np.einsum("nk,nk->n", lever, score) ** 2))
-        moved = np.einsum("nij,nj->ni", np.array(shares), lever)
-        expected = np.diag(np.einsum("ni,ni->n", lever, moved)) - moved @ moved.T
+    for k, place in enumerate(estimated.tolist()):
+        weights_of_score = np.array([adjustment @ root[k] for adjustment in adjustments])
+        scatter = float(np.sum(np.einsum("nk,nk->n", weights_of_score, score) ** 2))
+        moved = np.einsum("nij,nj->ni", np.array(shares), weights_of_score)
+        expected = np.diag(np.einsum("ni,ni->n", weights_of_score, moved)) - moved @ moved.T
         squares = float(np.sum(expected**2))
         variance[place] = scatter + float(root[k] @ constant @ root[k])
         if squares > 0 and scatter > 0:
@@ -208,12 +215,12 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
 
 
 def matrix_root(square: Floats) -> Floats:
-    """A matrix whose product with its own transpose is a symmetric positive one.
+    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix.
 
     Parameters
     ----------
     square : array, shape (n, n)
-        Symmetric, no eigenvalue below zero but by rounding.
+        Symmetric, no eigenvalue below zero except by rounding.
 
     Returns
     -------
@@ -224,7 +231,7 @@ def matrix_root(square: Floats) -> Floats:
 
 
 def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
-    """Scores of the free numbers by trial, shape (n_trials, size); the prior's part, which is no trial's, taken out."""
+    """Scores of the free parameters by trial, shape (n_trials, size), with the mean, that of the prior, subtracted."""
     single = np.zeros((len(rows), size + 1))
     for i, row in enumerate(rows):
         np.add.at(single[i], index[i], row)
@@ -232,9 +239,9 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
 
 
 def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Covariance by the noise model and by the scatter of trials, shape (n_free, n_free) each, and `parameter_shifts`.
+    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and `parameter_shifts`.
 
-    Numbers at a bound stay there.
+    Parameters at a bound are fixed there.
     """
     problem, state = solution.problem, solution.state
     cross_products = solution.cross_products
@@ -250,26 +257,26 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics
     blocks = trial_effects_eliminated(cross_products, p, problem, state)
     square = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    live = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
-    plain = inverse_of_block(square, live)
-    single = _scores(blocks[:, :p, p], problem.index, size)
+    estimated = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
+    plain = inverse_of_block(square, estimated)
+    scores = _scores(blocks[:, :p, p], problem.index, size)
     trials = len(blocks)
-    # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.
+    # The prior does not scatter from trial to trial, but its uncertainty contributes as well.
     prior = np.diag(problem.prior_precision)
-    meat = single.T @ single * trials / max(trials - live.size, 1) + prior
+    meat = scores.T @ scores * trials / max(trials - estimated.size, 1) + prior
     robust = plain @ meat @ plain
     groups = coarsest_groups([trial_data.trial for trial_data in predictor.data])
     if len(set(groups)) < trials:
-        by_group = plain @ (group_scatter(single, groups, live.size) + prior) @ plain
+        by_group = plain @ (group_scatter(scores, groups, estimated.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    # What a trial does not feel, number or error, is counted in a last row and column, and left out.
+    # Parameters and errors that a trial does not depend on are collected in a last row and column, and dropped.
     cross = np.zeros((size + 1, systematics.count + 1))
     np.add.at(cross, (problem.index[:, :, None], systematics.places[:, None, :]), blocks[:, :p, p + 1 :])
     return plain, robust, plain @ cross[:size, : systematics.count]
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
-    """The clusters of trials whose errors may be alike: specimens, else days, else single trials.
+    """The clusters of trials whose errors may be correlated: specimens, else days, else single trials.
 
     Parameters
     ----------
@@ -278,8 +285,8 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
     Returns
     -------
     list
-        A name for each trial. Fewer than `FEWEST_CLUSTERS` specimens or days say too little of their scatter: then the
-        next finer groups are taken.
+        A name for each trial. With fewer than `FEWEST_CLUSTERS` specimens or days, their scatter is too uncertain and
+        the next finer groups are used.
     """
     for column in ("specimen", "day"):
         names = [f"{trial.vine}, {trial.specimen}" if column == "specimen" else trial.day for trial in trials]
@@ -289,15 +296,15 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
 
 
 def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
-    """Variance of the sum of scores from how the sums of groups scatter, corrected for few groups.
+    """Variance of the sum of scores from the scatter of sums over groups, corrected for few groups.
 
     The correction is G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015).
 
     Parameters
     ----------
-    single : scores of single trials, shape (n_trials, n_free), their mean taken out.
+    single : scores of single trials, shape (n_trials, n_free), their mean subtracted.
     groups : name of the group of each trial.
-    fitted : how many numbers were fitted, p.
+    fitted : number of fitted parameters, p.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Where a fit begins: release and origin from the rest frames, B and n from a coarse look at all trajectories."""
+"""Starting values of a fit: release and origin from the frames at rest, B and n from a coarse grid search."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
 
 EXPONENTS = (0.15, 0.37, 0.65, 1.0)
-"""Exponents tried. Chosen around the published 0.37, from nearly constant friction to linear damping."""
+"""Exponents of the grid. Chosen around the published 0.37, from nearly constant friction to linear damping."""
 
 DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
-"""Tried against the B that would hold the speed reached; a vine that still accelerates has less. Chosen: the coarse
-grid only has to come within a factor of two."""
+"""Factors of the grid, relative to the B that would balance the drive at the observed speed; a vine that still
+accelerates has less. Chosen: the grid only has to come within a factor of two."""
 
-POINTS_LOOKED_AT = 60
-"""Points of a trial that the coarse search looks at. Chosen for time."""
+POINTS_USED = 60
+"""Points of each trial that the grid search uses. Chosen for time."""
 
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
-    """Release and origin of every trial from its rest frames, shape (n_trials, 4); deviations 0.
+    """Release and origin of every trial from its frames at rest; zero deviations.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
 def candidates(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor
 ) -> list[tuple[float, Floats, Floats]]:
-    """Starting points, best first: misfit, scaled values and own numbers of the trials.
+    """Starting values, best first: misfit, scaled parameters and trial effects.
 
-    For each exponent, and each further value worth a try, every vine takes the B that misses its trials least; the
-    release of each trial is scanned along.
+    For each exponent and each further starting value, every vine takes the B with the least misfit of its trials; the
+    release of each trial is scanned at the same time.
 
     Parameters
     ----------
-    layout : free numbers of the fit.
+    layout : free parameters of the fit.
     data : sequence of FitTrial
     predictor : of these trials.
 
@@ -73,25 +73,28 @@ def candidates(
         Shapes (), (n_free,), (n_trials, 4).
     """
     trial_effects = initial_trial_effects(data)
-    tries = [sorted({number.start, *number.tries}) if number.tries else [number.start] for number in layout.free]
-    combined = list(itertools.islice(itertools.product(*tries), 12))
+    start_values = [
+        sorted({number.start, *number.further_starts}) if number.further_starts else [number.start]
+        for number in layout.free
+    ]
+    combined = list(itertools.islice(itertools.product(*start_values), 12))
     starts_found: list[tuple[Floats, Floats]] = []
     for values in combined:
         theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
-        starts = _scan(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
+        starts = _scan_damping(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
         starts_found += [(start, trial_effects) for start in starts]
     scored = []
-    for theta, begin in starts_found:
+    for theta, initial in starts_found:
         try:
-            releases, misfit = align(data, predictor, theta, begin)
+            releases, misfit = align(data, predictor, theta, initial)
         except SimulationError:
             continue
         scored.append((float(np.sum(misfit)), theta, releases))
     return sorted(scored, key=lambda scored_start: scored_start[0])
 
 
-def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
-    """Places of one trial of every condition, the one with the most points.
+def one_trial_per_condition(data: Sequence[FitTrial]) -> list[int]:
+    """Indices of one trial of every condition, the one with the most points.
 
     Parameters
     ----------
@@ -109,22 +112,22 @@ def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
     return sorted(best.values())
 
 
-def _scan(
+def _scan_damping(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> list[Floats]:
     """For each exponent the best B of every vine."""
     speed = np.array([middle_speed(trial_data) for trial_data in data])
-    drive = np.array([_drive(trial_data) for trial_data in data])
+    drive = np.array([_driving_force_N(trial_data) for trial_data in data])
     free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
     key = layout.keys.index(DAMPING)
-    place = layout.index[:, key]
+    damping_index = layout.index[:, key]
     starts = []
-    for n in EXPONENTS if free_n else (_held_exponent(layout),):
+    for n in EXPONENTS if free_n else (_fixed_exponent(layout),):
         values = theta.copy()
         values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
         guess = {
-            k: float(np.exp(np.mean(np.log(drive[place == k]) - n * np.log(speed[place == k]))))
-            for k in np.unique(place)
+            k: float(np.exp(np.mean(np.log(drive[damping_index == k]) - n * np.log(speed[damping_index == k]))))
+            for k in np.unique(damping_index)
         }
         best: dict[int, tuple[float, float]] = {}
         for factor in DAMPING_FACTORS:
@@ -136,7 +139,7 @@ def _scan(
             except SimulationError:
                 continue
             for k in guess:
-                score = float(np.sum(misfit[place == k]))
+                score = float(np.sum(misfit[damping_index == k]))
                 if k not in best or score < best[k][0]:
                     best[k] = (score, float(values[k]))
         values = values.copy()
@@ -146,13 +149,13 @@ def _scan(
     return starts
 
 
-def _held_exponent(layout: ParameterMap) -> float:
+def _fixed_exponent(layout: ParameterMap) -> float:
     names = layout.model.parameter_names
     return float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
 
 
 def middle_speed(trial_data: FitTrial) -> float:
-    """Speed of the tail from 40 to 85 % of the growth that was seen.
+    """Mean speed of the tail from 40 to 85 % of the observed growth.
 
     Parameters
     ----------
@@ -171,8 +174,8 @@ def middle_speed(trial_data: FitTrial) -> float:
     return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
 
 
-def _drive(trial_data: FitTrial) -> float:
-    """Force on the tip less what it takes to begin, N; what the trace says where there is one."""
+def _driving_force_N(trial_data: FitTrial) -> float:
+    """Force on the tip above the yield force, N, from the recorded pressure where there is one."""
     trial = trial_data.trial
     pressure_Pa = float(np.median(trial_data.trace[1])) if trial_data.trace is not None else trial.pressure_Pa
     over_Pa = pressure_Pa - np.nan_to_num(trial.yield_pressure_Pa)
@@ -182,33 +185,33 @@ def _drive(trial_data: FitTrial) -> float:
 def align(
     data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> tuple[Floats, Floats]:
-    """Own numbers with the release at which each trial fits best, and the logarithm of its relative misfit.
+    """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
 
-    One trajectory a trial is simulated, at a subset of its frames, and shifted by interpolation.
+    One trajectory per trial is simulated, at a subset of its frames, and shifted in time by interpolation.
 
     Parameters
     ----------
     data : sequence of FitTrial
     predictor : of these trials.
     theta : array, shape (n_free,)
-        Free numbers, scaled.
+        Free parameters, scaled.
     trial_effects : array, shape (n_trials, 4)
-        Where to look from.
+        Centre of the scan.
 
     Returns
     -------
     trial_effects : array, shape (n_trials, 4)
     misfit : array, shape (n_trials,)
-        ln of the root mean square as part of the travel.
+        ln of the root mean square relative to the travel.
     """
-    thin = [_thinned(trial_data) for trial_data in data]
+    subsets = [_thinned(trial_data) for trial_data in data]
     jobs = predictor.jobs(theta, trial_effects)
     durations = [
         trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
         for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
-    grids = [np.linspace(0.0, duration, 4 * POINTS_LOOKED_AT) for duration in durations]
-    moved = simulate_many(
+    grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
+    trajectories = simulate_many(
         predictor.layout.model,
         [trial_data.trial for trial_data in data],
         grids,
@@ -220,7 +223,7 @@ def align(
         host=predictor.host,
     )
     best, misfit = trial_effects.copy(), np.zeros(len(data))
-    for i, (trial_data, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
+    for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
         if trial_data.pressurised_in_recording:
             shifts = np.zeros(1)
         elif trial_data.shows_rest:
@@ -228,10 +231,10 @@ def align(
         else:
             shifts = -np.geomspace(0.25 * trial_data.frame_s, durations[i], 30)
         since = time_s[None, :] - trial_effects[i, RELEASE] - shifts[:, None]
-        predicted = np.interp(since, grids[i], moved[i].observed_position_m)
-        gap = y[None, :] - predicted
-        origin = gap.mean(axis=1)
-        square = np.mean((gap - origin[:, None]) ** 2, axis=1)
+        predicted = np.interp(since, grids[i], trajectories[i].observed_position_m)
+        residual_m = y[None, :] - predicted
+        origin = residual_m.mean(axis=1)
+        square = np.mean((residual_m - origin[:, None]) ** 2, axis=1)
         k = int(np.argmin(square))
         best[i, RELEASE], best[i, ORIGIN] = trial_effects[i, RELEASE] + shifts[k], origin[k]
         misfit[i] = 0.5 * np.log(square[k] / np.ptp(y) ** 2 + 1e-8)
@@ -241,5 +244,5 @@ def align(
 def _thinned(trial_data: FitTrial) -> tuple[Floats, Floats]:
     """At most sixty points, most of them in motion."""
     begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
-    take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_LOOKED_AT).astype(int))
+    take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_USED).astype(int))
     return trial_data.time_s[take], trial_data.lead_position_m[take]

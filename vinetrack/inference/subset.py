@@ -1,7 +1,8 @@
-"""Fits to part of the trials of a fit, begun where that one ended.
+"""Fits to a subset of the trials of a fit, starting from its solution.
 
-Leaving out a condition, or looking at one vine or pressure alone, is the same model on fewer data: nothing is read,
-prepared or compiled anew. Numbers that none of the trials kept feels (B of a vine that is gone) drop out.
+Leaving out a condition, or fitting one vine or pressure alone, uses the same model on fewer data: nothing is read,
+prepared or compiled again. Parameters that apply to none of the remaining trials (B of a vine that is left out) are
+dropped.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def fit_subset(
     hold_noise: bool = False,
     most_iterations: int = MOST_ITERATIONS,
 ) -> Fit:
-    """Fit the same model to some of the trials, from where a fit ended.
+    """Fit the same model to some of the trials of a fit, starting from its solution.
 
     Parameters
     ----------
@@ -66,26 +67,27 @@ def fit_subset(
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
     problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
-    # The numbers of a fit include what smooth errors of position moved them by; its state does not.
+    # The numbers of a fit include their change by smooth errors of position; its state does not.
     reported = {number.name: number.value for number in fit.numbers}
-    stays = [
-        number.to_scaled(reported[number.name]) if not moves and number.name in reported else theta
-        for number, moves, theta in zip(predictor.layout.free, free, state.theta, strict=True)
+    theta_with_fixed = [
+        number.to_scaled(reported[number.name]) if not is_free and number.name in reported else theta
+        for number, is_free, theta in zip(predictor.layout.free, free, state.theta, strict=True)
     ]
-    state = replace(state, theta=np.array(stays, dtype=float))
-    told = _told(fit, rows)
-    told = FixedTerms(
-        state.spread if hold_spreads else told.spread, (state.rho, state.variance) if hold_noise else told.noise
+    state = replace(state, theta=np.array(theta_with_fixed, dtype=float))
+    fixed_terms = _fixed_terms_of(fit, rows)
+    fixed_terms = FixedTerms(
+        state.spread if hold_spreads else fixed_terms.spread,
+        (state.rho, state.variance) if hold_noise else fixed_terms.noise,
     )
     try:
-        solution = solve(predictor, problem, state, told, warm=True, most_iterations=most_iterations)
+        solution = solve(predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations)
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed on part of the trials: {error}") from error
-    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": told}, profile=False)
+        raise FitError(f"The model cannot be simulated for these trials: {error}") from error
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
 
 
 def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
-    """Places of the trials kept, in the order of the fit."""
+    """Indices of the trials to keep, in the order of the fit."""
     wanted = list(keep)
     names = [trial.name for trial in fit.trials]
     if wanted and all(isinstance(entry, (bool, np.bool_)) for entry in wanted):
@@ -102,10 +104,10 @@ def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) ->
     return rows
 
 
-def _told(fit: Fit, rows: Indices) -> FixedTerms:
-    """What the user told the fit, for these trials."""
-    told: FixedTerms = fit.options.get("held", FixedTerms())
-    if told.noise is None:
-        return told
-    rho, variance = told.noise
-    return replace(told, noise=(rho, variance[rows]))
+def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
+    """The variance components that the user fixed, for these trials."""
+    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
+    if fixed_terms.noise is None:
+        return fixed_terms
+    rho, variance = fixed_terms.noise
+    return replace(fixed_terms, noise=(rho, variance[rows]))

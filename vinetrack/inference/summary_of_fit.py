@@ -1,4 +1,4 @@
-"""What is quoted from a fit in memory, as `fit.json` holds it."""
+"""The summary of a fit in memory, in the form in which `fit.json` stores it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 
 
 def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
-    """Return what is quoted from a fit.
+    """The summary of a fit.
 
     Parameters
     ----------
     fit : the fit.
     warnings : of the audit.
-    further_messages : beside those of the fit.
+    further_messages : in addition to those of the fit.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""What is never known exactly: a payload's mass, a set pressure, the place a camera gives an edge, a noisy gauge.
+"""Systematic errors of a campaign: payloads, set pressures, film mass, position errors of the camera, gauge noise.
 
-Most of it is shared by trials and does not average out over them, so that their scatter does not tell of it; left out,
-it passes for a small effect as soon as pressures and B scatter little. What the noise of a gauge leaves of a recorded
-pressure is each trial's alone, and bends its motion all along.
+Most of them are shared by several trials and do not average out, so that the scatter of trials does not reveal them. If
+neglected, they look like a small effect as soon as pressures and B vary little between trials. The error that gauge
+noise leaves in a recorded pressure belongs to a single trial and bends its whole motion.
 """
 
 from __future__ import annotations
@@ -29,56 +29,56 @@ PRESSURE_ERROR_PA = 30.0
 """Standard deviation of a set pressure beside what the sheet states: read to a tenth of a kilopascal."""
 
 FILM_ERROR = 0.02
-"""Standard deviation of the mass of a vine's film, as part of it, that no sheet goes below. Chosen: a micrometer reads
-50 to 150 µm to one or two. Film that is 4 % off costs a hypothesis 4 in −2 ln L; at half this 16, at twice 1. Measured
-on a drag with film 1.5 % off (`film_air_drag` 20712 of the laboratories): it gains 42, 49 and 49 at a quarter of this,
-at this and at five times."""
+"""Least standard deviation of the mass of a vine's film, relative. Chosen: a micrometer reads 50 to 150 µm to one or
+two. Film that is 4 % off costs a hypothesis 4 in −2 ln L; at half this 16, at twice 1. Measured on a drag with film 1.5
+% off (`film_air_drag` 20712 of the laboratories): it gains 42, 49 and 49 at a quarter of this, at this and at five
+times."""
 
 PAYLOAD_STEP = 1e-2
 """Relative step of a payload's mass for its derivative. Derived: positions are linear in it to 1e-4."""
 
-WAVES = 6
-"""Half waves along the growth, at most, in which a tracker may be off by its slow error in all trials alike, each by
-all of it: √3 times as much together, since a vine is not quite in the plane of its board either. Chosen: six half waves
-describe what lens and pixel texture leave; more pass for noise, half leave steps of a door. Measured: with the slow
-error shared out among the six, a vine nearer to the camera at one end passed for `quadratic_length_friction`
+HALF_WAVES = 6
+"""Largest number of half waves along the growth in the slow error of a tracker that all trials share. Each has the full
+size, √3 times as much together, since a vine is not exactly in the plane of its board either. Chosen: six half waves
+describe what lens and pixel texture leave; more look like noise, half leave the steps at a door. Measured: with the
+slow error divided among the six, a vine nearer to the camera at one end was taken for `quadratic_length_friction`
 (`perspective` 959 of `benchmarks/filmed_verdicts.py`)."""
 
-BEGIN = 0.015
-"""Part of the growth after which a slow error that is larger at the start may be another. Chosen: the tip passes a door
-in it. At half or twice doors are taken to hide it for so long."""
+START_FRACTION = 0.015
+"""Fraction of the growth over which a slow error that is larger at the start may decay. Chosen: the tip passes a door
+within it. At half or twice, a door is assumed to hide it for so long."""
 
-ENDS = ((0.1, 2.0), (0.03, 4.0))
-"""Parts of the growth before its end, and how many times its slow error an edge may be off at the end over each.
-Measured: in the last 5 per cent 2.2 times as much as in the middle, in the 15 before 1.9 (37 recordings of the tuning
-seeds of `benchmarks/tracking_accuracy.py`; 0.8 and 1.8 in 15 of another renderer); in the last two frames, in which
-film stops dead, several times. Without the second `perspective` 959 of `benchmarks/filmed_verdicts.py` is called
+END_SHAPES = ((0.1, 2.0), (0.03, 4.0))
+"""Fractions of the growth before its end, and how many times the usual slow error the error at the end may be over
+each. Measured: in the last 5 per cent 2.2 times as much as in the middle, in the 15 before 1.9 (37 recordings of the
+tuning seeds of `benchmarks/tracking_accuracy.py`; 0.8 and 1.8 in 15 of another renderer); in the last two frames, in
+which film stops dead, several times. Without the second, `perspective` 959 of `benchmarks/filmed_verdicts.py` is called
 `quadratic_length_friction`."""
 
 
 @dataclass(frozen=True)
 class Systematics:
-    """What one standard deviation of each error does to positions.
+    """Displacement of the positions of each trial by one standard deviation of each systematic error.
 
-    An error of one payload or of one set pressure is felt by its own trials alone, and there are as many as conditions:
-    a trial has columns for those that it feels, and not for all.
+    An error of one payload or of one set pressure affects its own trials alone, and there are as many as conditions: a
+    trial has columns only for those that affect it.
 
     Parameters
     ----------
     columns : list of arrays, shape (n_points, n_columns), m
-        One a trial.
+        One per trial.
     places : array of int, shape (n_trials, n_columns)
-        Which error each column belongs to, `count` where a trial does not feel one of that kind.
+        Which error each column belongs to, `count` for a column without error.
     count : int
         Number of errors of the campaign.
-    told : list of arrays, shape (n_points,), m
-        What errors that the fit found already move each trial by.
+    estimated_m : list of arrays, shape (n_points,), m
+        Displacement of each trial by errors that the fit has estimated already.
     """
 
     columns: list[Floats]
     places: NDArray[np.int_]
     count: int
-    told: list[Floats] | None = None
+    estimated_m: list[Floats] | None = None
 
     @classmethod
     def none(cls, points: Sequence[int]) -> Systematics:
@@ -96,7 +96,7 @@ class Systematics:
         return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
 
     def at_zero_errors(self, columns: Sequence[Floats]) -> list[Floats]:
-        """Columns of a fit with what the errors explain so far in the residual, the last column, again.
+        """Columns of a fit with the residual, the last column, taken at zero errors instead of the estimated ones.
 
         Parameters
         ----------
@@ -106,18 +106,17 @@ class Systematics:
         Returns
         -------
         list of arrays, of the same shapes
-            With errors of mean 0 beside them they are what was measured, whatever the fit found of the errors.
         """
-        if self.told is None:
+        if self.estimated_m is None:
             return list(columns)
         whole = [of_fit.copy() for of_fit in columns]
-        for of_fit, told_m in zip(whole, self.told, strict=True):
-            of_fit[:, -1] += told_m
+        for of_fit, trial_estimate_m in zip(whole, self.estimated_m, strict=True):
+            of_fit[:, -1] += trial_estimate_m
         return whole
 
     @property
     def n_columns(self) -> int:
-        """Columns of each trial."""
+        """Number of columns of each trial."""
         return self.places.shape[1]
 
 
@@ -129,7 +128,7 @@ def systematics_of(
     positions: bool = True,
     film: bool = False,
 ) -> Systematics:
-    """What trials err by: payloads, set and recorded pressures, the tracker's slow errors, smooth errors of position.
+    """All systematic errors of a fit.
 
     Parameters
     ----------
@@ -138,9 +137,9 @@ def systematics_of(
     trials : sequence of TrialFit
         In the order of the fit.
     positions : bool
-        Whether smooth errors of position are among them; a fit estimates those along with its numbers.
+        Whether to include smooth errors of position; a fit may estimate those along with its parameters.
     film : bool
-        Whether the mass of film is among them, which else is a hypothesis of its own.
+        Whether to include the mass of film, which otherwise is a hypothesis of its own.
 
     Returns
     -------
@@ -148,14 +147,14 @@ def systematics_of(
     """
     points = [trial.time_s.size for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    dense = [_tracker(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
+    dense = [_tracker_errors(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
     recorded = recorded_pressures(predictor, solution)
     parts = [
-        _payloads(predictor, solution, trials),
-        _set_pressures(predictor, solution),
+        _payload_errors(predictor, solution, trials),
+        _set_pressure_errors(predictor, solution),
         recorded,
         *([film_errors(predictor, solution, trials)] if film else []),
-        *(_felt_by_all(columns) for columns in dense),
+        *(_of_every_trial(columns) for columns in dense),
     ]
     columns = [np.empty((size, sum(part.n_columns for part in parts))) for size in points]
     places = np.empty((len(points), sum(part.n_columns for part in parts)), dtype=int)
@@ -166,17 +165,17 @@ def systematics_of(
         for column, felt in zip(columns, part.columns, strict=True):
             column[:, beside] = felt
         count, begin = count + part.count, begin + part.n_columns
-    return Systematics(columns, places, total, recorded.told)
+    return Systematics(columns, places, total, recorded.estimated_m)
 
 
-def _felt_by_all(columns: list[Floats]) -> Systematics:
-    """Errors that every trial feels."""
+def _of_every_trial(columns: list[Floats]) -> Systematics:
+    """Errors that affect every trial."""
     count = columns[0].shape[1]
     return Systematics(columns, np.tile(np.arange(count), (len(columns), 1)), count)
 
 
-def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
-    """The relative error of each payload of the campaign. Trials with the same payload had the same body."""
+def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
+    """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
     nothing = Systematics.none([trial.time_s.size for trial in trials])
     loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
     if not loaded:
@@ -191,11 +190,11 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
     for i, before, after in zip(loaded, plain, heavier, strict=True):
         columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
     names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
-    return _one_each(columns, [names.get(i) for i in range(len(trials))])
+    return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
 
 
 def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
-    """The error of the mass of each vine's film, `FILM_ERROR`.
+    """Error of the film mass of each vine, `FILM_ERROR`.
 
     Parameters
     ----------
@@ -207,7 +206,7 @@ def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[Trial
     Returns
     -------
     Systematics
-        Without errors where no trial feels its film, or one cannot be simulated with another mass of it.
+        Without errors if the film affects no trial, or one cannot be simulated with another film mass.
     """
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     felt = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
@@ -221,7 +220,7 @@ def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[Trial
         columns[i][:, 0] = position_change(plain[i], moved[i])
     if not felt:
         return Systematics.none([trial.time_s.size for trial in trials])
-    return _one_each(columns, [trial.trial.vine if i in felt else None for i, trial in enumerate(trials)])
+    return _one_per_group(columns, [trial.trial.vine if i in felt else None for i, trial in enumerate(trials)])
 
 
 def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
@@ -229,8 +228,8 @@ def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
     return replace(trial_data, trial=replace(trial, film_density_kg_m3=(1 + FILM_ERROR) * trial.film_density_kg_m3))
 
 
-def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
-    """The error of the pressure that was set for a condition; its replicates have it together."""
+def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematics:
+    """Error of the set pressure of each condition, shared by its replicates."""
     data = [trial_data.trial for trial_data in predictor.data]
     feels = predictor.has_pressure_deviation & np.array([trial_data.trace is None for trial_data in predictor.data])
     if not feels.any():
@@ -239,18 +238,18 @@ def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     for column, trial, sensitivities, felt in zip(columns, data, solution.columns, feels, strict=True):
         if felt:
             column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
-    return _one_each(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
+    return _one_per_group(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
 
 
 def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
-    """What the noise of the gauge leaves wrong in each recorded pressure beside its mean, which the fit has.
+    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
     curves_only : bool
-        Whether traces that are made of straight lines are left out.
+        Whether traces that consist of local lines are left out.
 
     Returns
     -------
@@ -281,15 +280,15 @@ def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only:
                 places[i, k] = begins[i] + k
     except SimulationError:
         return nothing
-    told = [np.zeros(trial_data.time_s.size) for trial_data in data]
-    for told_m, column, trial_data in zip(told, columns, data, strict=True):
+    estimated_m = [np.zeros(trial_data.time_s.size) for trial_data in data]
+    for trial_estimate_m, column, trial_data in zip(estimated_m, columns, data, strict=True):
         if trial_data.trace_error_sizes is not None:
-            told_m += column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
-    return Systematics(columns, places, sum(counts), told)
+            trial_estimate_m += column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
+    return Systematics(columns, places, sum(counts), estimated_m)
 
 
 def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:
-    """A trial whose recorded pressure has its k-th error, a standard deviation of it; as it is where it has fewer."""
+    """A trial with its recorded pressure changed by one standard deviation of its k-th error, if it has that many."""
     errors_Pa = trial_data.trace_errors_Pa
     if trial_data.trace is None or errors_Pa is None or errors_Pa.shape[1] <= k:
         return trial_data
@@ -297,34 +296,34 @@ def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:
     return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa[:, k]))
 
 
-def _one_each(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:
-    """Errors of which a trial feels the one of its name, or none."""
+def _one_per_group(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:
+    """Errors that are shared by the trials of a group; a trial with the name None has none."""
     places = {name: k for k, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
     return Systematics(columns, np.array([[places.get(name, len(places))] for name in names]), len(places))
 
 
-def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
-    """Slow errors of positions read from recordings, as large as the tracks state; none for those from elsewhere."""
+def _tracker_errors(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
+    """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
     stated = [trial_data.slow_m for trial_data in predictor.data]
     if all(slow_m is None for slow_m in stated):
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    # With hopeless parameters no trial moves; all parts of the growth are then zero.
+    # With extreme parameters no trial moves, and all growth fractions are zero.
     reach = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
     return [_slow_shapes(growth_m / reach, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
 
 
 def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
-    """One standard deviation of each slow error of a trial, shape (n_points, WAVES + 4), m.
+    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m.
 
-    Waves along the growth have the usual error of the trial each; what is stated beyond that, near a door or
-    where contrast is low, is an error of its own at the very start and one after it; and two grow towards the end.
+    Waves along the growth have the usual error of the trial each. What is stated beyond that, near a door or at low
+    contrast, is one error at the very start and one after it; two more grow towards the end.
     """
     if slow_m is None:
-        return np.zeros((part.size, WAVES + 2 + len(ENDS)))
+        return np.zeros((part.size, HALF_WAVES + 2 + len(END_SHAPES)))
     usual = np.minimum(slow_m, np.median(slow_m))
     beyond = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
-    waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, WAVES + 1))
-    start = np.exp(-np.maximum(part, 0.0) / BEGIN)
-    ends = [times * usual * np.exp((part - np.max(part)) / reach) for reach, times in ENDS]
+    waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
+    start = np.exp(-np.maximum(part, 0.0) / START_FRACTION)
+    ends = [times * usual * np.exp((part - np.max(part)) / reach) for reach, times in END_SHAPES]
     return np.column_stack([waves, beyond * start, beyond * (1 - start), *ends])

@@ -1,12 +1,11 @@
-"""What the noise of a gauge leaves wrong in a recorded pressure, found along with a fit: the motion tells it too.
+"""Errors that gauge noise leaves in a recorded pressure, estimated as random effects along with a fit.
 
-Of a curve through noisy readings a few ways are known in which it may be wrong, a standard deviation each
-(`gauge_noise.QuietTrace.errors_Pa`). A light vine follows its pressure at once, so that a wrong curve moves it by
-several times what its positions err by: left to the noise of positions, that would pass for whatever differs between
-trials. So the sizes of these errors, a ~ N(0, 1) in each trial, are random effects beside those of
-`vinetrack.inference.mixed_effects`. They are told by its linear model with the shared numbers and the trial's own all
-free at once, put into the trace, and the model is fitted again, until nothing moves. −2 ln L is taken at the likeliest
-a, with Σ a² for their prior.
+The remaining errors of a curve through noisy readings are known, one standard deviation each
+(`gauge_noise.DenoisedTrace.errors_Pa`). A light vine follows its pressure immediately, so that an error of the curve
+moves it by several times the noise of its positions and would look like a difference between trials. So the sizes of
+these errors, a ~ N(0, 1) in each trial, are random effects besides those of `vinetrack.inference.mixed_effects`. The
+linearised model estimates them with the parameters and trial effects all free at once; they are added to the trace, and
+the model is fitted again, until they converge. −2 ln L is evaluated at the most likely a, with Σ a² for their prior.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures
 
-MOST_ROUNDS, SETTLED = 4, 0.1
-"""Rounds at most, and by how many of its standard deviations an error may still move. Measured: nine fits settle after
-one to three rounds (`trace_clock` of the laboratories, tuning seed 20600); at half some would not, twice as many are
-never asked. Chosen: −2 ln L is quadratic about the likeliest, and 0.1 in one error is 0.01 of it; at half a round more
-is asked now and then, at twice 0.04."""
+MOST_ROUNDS, CONVERGED_SIGMAS = 4, 0.1
+"""Maximum number of rounds, and the change of an error, in its standard deviations, at which they have converged.
+Measured: nine fits converge after one to three rounds (`trace_clock` of the laboratories, tuning seed 20600); at half
+some would not, twice as many are never used. Chosen: −2 ln L is quadratic about its minimum, and 0.1 in one error is
+0.01 of it; at half a further round is needed now and then, at twice 0.04."""
 
 
 def with_fitted_trace_errors(
@@ -48,22 +47,22 @@ def with_fitted_trace_errors(
     watch: Watch | None = None,
     search: bool = False,
 ) -> tuple[Predictor, Solution]:
-    """A solution with the errors of the recorded pressures found along, and the predictor of the pressures so mended.
+    """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures.
 
-    A model far off would bend the pressures to it: its trials keep those that were recorded. So do those whose trace is
-    no curve: of lines through neighbouring samples it is not known in which ways they are wrong.
+    A poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve:
+    the errors of local lines are not known in detail.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
-    held : spreads and noise that are not estimated.
+    held : variance components that are not estimated.
     most_iterations : int
-        Steps of each fit at most.
+        Maximum number of steps of each fit.
     watch : callable, optional
-        Called with each step.
+        Called with every step.
     search : bool
-        Whether the fit is one of many, see `optimiser.solve`.
+        Whether the fit is one of many candidates, see `optimiser.solve`.
 
     Returns
     -------
@@ -74,24 +73,24 @@ def with_fitted_trace_errors(
     for _ in range(MOST_ROUNDS):
         if is_poor_fit(predictor, solution):
             break
-        moved = trace_error_step(predictor, solution)
-        if not np.max(np.abs(moved), initial=0.0) > SETTLED:
+        step = trace_error_step(predictor, solution)
+        if not np.max(np.abs(step), initial=0.0) > CONVERGED_SIGMAS:
             break
-        mended = [_mended(trial_data, more) for trial_data, more in zip(predictor.data, moved, strict=True)]
-        after = Predictor(predictor.layout, mended, predictor.host)
+        corrected = [_corrected(trial_data, more) for trial_data, more in zip(predictor.data, step, strict=True)]
+        corrected_predictor = Predictor(predictor.layout, corrected, predictor.host)
         try:
             solution = solve_onward(
-                after, solution, solution.state.theta, held,
+                corrected_predictor, solution, solution.state.theta, held,
                 most_iterations=most_iterations, watch=watch, search=search,
             )  # fmt: skip
         except SimulationError:
             break
-        predictor = after
+        predictor = corrected_predictor
     return predictor, solution
 
 
-def penalty(data: Sequence[FitTrial]) -> float:
-    """What the priors of the errors that were found add to −2 ln L.
+def trace_error_penalty(data: Sequence[FitTrial]) -> float:
+    """Contribution of the priors of the estimated errors to −2 ln L.
 
     Parameters
     ----------
@@ -109,7 +108,7 @@ def penalty(data: Sequence[FitTrial]) -> float:
 
 
 def trace_correction_Pa(trial_data: FitTrial) -> Floats:
-    """By how much a fit moved the recorded pressure of a trial.
+    """Correction of the recorded pressure of a trial by a fit.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def trace_correction_Pa(trial_data: FitTrial) -> Floats:
 
 
 def as_recorded(trial_data: FitTrial) -> FitTrial:
-    """A trial with its pressure as it was recorded, whatever a fit found of its errors.
+    """A trial with its pressure as recorded, without the correction by a fit.
 
     Parameters
     ----------
@@ -139,29 +138,29 @@ def as_recorded(trial_data: FitTrial) -> FitTrial:
     """
     if trial_data.trace_error_sizes is None:
         return trial_data
-    return replace(_mended(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
+    return replace(_corrected(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
 
 
 def _has_errors(trial_data: FitTrial) -> bool:
-    """Whether the trial has a recorded pressure whose errors can be found."""
+    """Whether the trial has a recorded pressure whose errors can be estimated."""
     return trial_data.trace is not None and trial_data.trace_errors_Pa is not None and trial_data.trace_is_curve
 
 
-def _mended(trial_data: FitTrial, more: Floats) -> FitTrial:
-    """A trial whose recorded pressure is moved by so many standard deviations of each of its errors."""
+def _corrected(trial_data: FitTrial, step: Floats) -> FitTrial:
+    """A trial with its recorded pressure changed by so many standard deviations of each of its errors."""
     if not _has_errors(trial_data):
         return trial_data
     assert trial_data.trace is not None
     assert trial_data.trace_errors_Pa is not None
     clock_s, pressure_Pa = trial_data.trace
     errors_Pa = trial_data.trace_errors_Pa
-    more = more[: errors_Pa.shape[1]]
-    told = more if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes + more
-    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ more), trace_error_sizes=told)
+    step = step[: errors_Pa.shape[1]]
+    sizes = step if trial_data.trace_error_sizes is None else trial_data.trace_error_sizes + step
+    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ step), trace_error_sizes=sizes)
 
 
 def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
-    """By how many standard deviations each error moves beside what was found before.
+    """Gauss–Newton step of the errors, in standard deviations, from their current estimates.
 
     Parameters
     ----------
@@ -171,13 +170,13 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     Returns
     -------
     array, shape (n_trials, n_errors)
-        0 for errors that a trial does not have, and in all where a trial cannot be simulated with one of them.
+        0 for errors that a trial does not have, and everywhere if a trial cannot be simulated with one of them.
     """
     errors = recorded_pressures(predictor, solution, curves_only=True)
     if not errors.n_columns:
         return np.zeros((len(predictor.data), 0))
-    told = np.zeros((len(predictor.data), errors.n_columns))
-    for row, trial_data in zip(told, predictor.data, strict=True):
+    sizes = np.zeros((len(predictor.data), errors.n_columns))
+    for row, trial_data in zip(sizes, predictor.data, strict=True):
         if trial_data.trace_error_sizes is not None:
             row[: trial_data.trace_error_sizes.size] = trial_data.trace_error_sizes
     problem, state = solution.problem, solution.state
@@ -186,9 +185,9 @@ def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
     )
     p = solution.cross_products.shape[-1] - N_TRIAL_EFFECTS - 1
     blocks = trial_effects_eliminated(cross_products, p, problem, state)
-    # What is left once the errors are eliminated as well, each with its prior of standard deviation 1.
+    # Normal equations with the errors eliminated as well, each with a standard normal prior.
     square = blocks[:, p + 1 :, p + 1 :] + np.eye(errors.n_columns)
-    mixed, slope = blocks[:, p + 1 :, :p], blocks[:, p + 1 :, p] - told
+    mixed, slope = blocks[:, p + 1 :, :p], blocks[:, p + 1 :, p] - sizes
     solved = solve_per_trial(square, np.concatenate([mixed, slope[:, :, None]], axis=2))
     information = sum_matrix_blocks(blocks[:, :p, :p] - np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
     gradient = sum_vector_blocks(blocks[:, :p, p] - np.einsum("nek,ne->nk", mixed, solved[:, :, -1]), problem)
