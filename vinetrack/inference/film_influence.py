@@ -84,6 +84,6 @@ def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
     more = len(affected) - len(parts)
     listed = ", ".join(parts) + (f", and {more} more" if more else "")
     return (
-        f"these errors assume the stated film mass; an error of {100 * FILM_ERROR:g} % in each vine would change"
+        f"these errors assume the stated mass of the film; an error of {100 * FILM_ERROR:g} % in each vine would change"
         f" {listed}. Weigh a piece of each vine, and correct thickness_um or film_density_kg_m3",
     )
