@@ -133,7 +133,7 @@ def spread_px(found: np.ndarray) -> float:
 @pytest.mark.pipeline
 def test_the_report_shows_where_edges_fall_within_a_pixel(filmed: Filmed) -> None:
     assert (filmed.results / "figures" / "pixel_places.svg").exists()
-    assert "Where edges fall within a pixel" in (filmed.results / "report.html").read_text(encoding="utf-8")
+    assert "Positions of edges within a pixel" in (filmed.results / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.pipeline
@@ -192,7 +192,7 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     axis = json.loads((filmed.results / "analysed" / f"{next(iter(GOOD))}.json").read_text())["axis"]
     assert np.hypot(*np.subtract(axis["to_px"], axis["from_px"])) > 100
     assert "ChArUco board" in page
-    assert "kept apart from the random error" in page
+    assert "stated separately from the random error" in page
     assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
 
 
