@@ -148,7 +148,7 @@ def test_a_speed_that_goes_up_and_down_is_rejected_for_it():
     y = 0.5 * time_s + 5e-4 * np.sin(150 * time_s) + ar1(300, 2e-5, 0.0, np.random.default_rng(1000))
     window = gated(make_track(time_s, y))
     assert not window.accepted
-    assert "holds speeds from" in window.reason
+    assert "contains speeds from" in window.reason
 
 
 def test_an_exact_acceleration_is_rejected_as_too_short_a_part():

@@ -1,10 +1,8 @@
-"""Replicates put together: what each condition gave, with errors, for whatever is to be set against size or payload.
+"""Means over replicates of each condition with standard errors: steady speed, final speed, efficiency.
 
-The error of a mean is its standard error, from what replicates differ by; of a single trial it is what is known of
-that trial, and nothing where nothing is. What all trials share (the scale, the yield pressure) is not in it: it moves
-all conditions together.
-
-The end of growth gives the final speed, and how much of the gas's work became motion.
+The standard error of a mean comes from the replicate scatter; for a single trial it is the error of that trial, NaN
+where unknown. Systematic errors that all trials share (scale, yield pressure) are not included: they change all
+conditions together.
 """
 
 from __future__ import annotations
@@ -56,20 +54,20 @@ CONDITION_COLUMNS = (
 def condition_table(
     trials: pd.DataFrame, known: Sequence[Trial], *, final_at_fraction: float, efficiency_at_mm: float
 ) -> pd.DataFrame:
-    """A row a condition, columns `CONDITION_COLUMNS`, in the order of the sheet.
+    """Return a row for each condition, columns `CONDITION_COLUMNS`, in the order of the sheet.
 
     Parameters
     ----------
-    trials : as in `trials.csv`; those that failed or were left out do not count.
+    trials : as in `trials.csv`; trials that failed or were left out do not count.
     known : the trials of the experiment, for their sizes.
-    final_at_fraction, efficiency_at_mm : where the final speed and the efficiency of `trials` were taken.
+    final_at_fraction, efficiency_at_mm : where the final speed and the efficiency of `trials` were evaluated.
 
     Returns
     -------
     DataFrame
-        `x_ss_m_s` is NaN where less than half of a condition's trials were steady: the slower ones would stand for
-        all. `efficiency` is ½ m(x) ẋ² / (P₀ A y), `efficiency_payload` counts the payload's motion alone, and
-        `efficiency_with_weight` counts the work of the weight as spent; `weight_share` is that work over P₀ A y.
+        `x_ss_m_s` is NaN where less than half of a condition's trials are steady, since those are the slower ones.
+        `efficiency` is ½ m(x) ẋ² / (P₀ A y), `efficiency_payload` that of the payload's motion alone, and
+        `efficiency_with_weight` adds the work of the weight to that of the gas; `weight_share` is their ratio.
     """
     import pandas as pd
 
@@ -130,7 +128,7 @@ def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, objec
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
-    """Return the mean of the values that are known, its standard error, and their number.
+    """Return the mean of the known values, its standard error, and their number.
 
     Parameters
     ----------
@@ -139,8 +137,7 @@ def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float
 
     Returns
     -------
-    mean, standard error, number; NaN, NaN, 0 where nothing is known, and an error of NaN for a single value without
-        one.
+    mean, standard error, number; NaN, NaN, 0 without known values, and an error of NaN for a single value without one.
     """
     known = np.isfinite(values)
     count = int(known.sum())
@@ -153,10 +150,7 @@ def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float
 
 
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
-    """Return the velocity with which the leading edge first passes a position, linear in position between points.
-
-    Both arrays have shape (n,), travel counted from rest; between points the velocity is interpolated linearly in
-    position.
+    """Return the velocity with which the leading edge first passes a position, interpolated linearly in position.
 
     Parameters
     ----------
@@ -166,7 +160,7 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 
     Returns
     -------
-    m/s; NaN where the edge never gets there, or is beyond at the first point.
+    m/s; NaN where the edge never gets there, or is beyond it at the first point.
     """
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
@@ -178,10 +172,10 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 
 
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
-    """Kinetic energy over the work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth; NaN where undefined.
+    """Return the ratio of kinetic energy to work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth.
 
-    m(x) is the moving mass, tail and payload, ẋ = r·ẏ. Source: Alvarez et al. (2025), section IV-D, with the moving
-    mass of their Eq. (1).
+    m(x) is the moving mass of tail and payload, ẋ = r·ẏ. NaN where there is no work. Source: Alvarez et al. (2025),
+    section IV-D, with the moving mass of their Eq. (1).
 
     Parameters
     ----------
@@ -201,10 +195,10 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
 
 
 class EfficiencyShares(NamedTuple):
-    """What turns an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants: all are the same speed, counted differently.
+    """Factors that turn an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants.
 
-    `payload` is the payload's part of the moving mass, so that efficiency × `payload` counts the payload alone;
-    `weight` the work of the weight over that of the gas, so that efficiency / (1 + `weight`) counts both as spent.
+    `payload` is the payload's fraction of the moving mass: efficiency × `payload` is that of the payload alone.
+    `weight` is the work of the weight over that of the gas: efficiency / (1 + `weight`) counts both as work.
     """
 
     payload: float
@@ -212,10 +206,10 @@ class EfficiencyShares(NamedTuple):
 
 
 def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
-    """The payload's share of the moving mass, and the weight's share of the work, after `lead_travel_m` of growth.
+    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas.
 
-    The weight works on tail and payload along the tail's own travel x = r·y: g cosθ ∫ m dx, the third term of Eq. (2)
-    of Alvarez et al. (2025). NaN where there is no mass, or no work.
+    The weight does work on tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq.
+    (2) of Alvarez et al. (2025). NaN where there is no mass, or no work.
 
     Parameters
     ----------
@@ -236,7 +230,7 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
 
 
 def _mass_along(trial: Trial, tail_travel_m: float) -> float:
-    """∫ m(x) dx from the release, kg·m: the film runs out in a straight line, until none is left."""
+    """∫ m(x) dx from the release, kg·m: the mass of film decreases linearly until none is left."""
     film_kg = trial.linear_density_kg_m * (trial.length_m if math.isfinite(trial.length_m) else 0.0)
     loss_kg_m = trial.mass_loss_kg_m
     until_m = min(tail_travel_m, film_kg / loss_kg_m) if loss_kg_m > 0 else tail_travel_m

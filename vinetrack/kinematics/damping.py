@@ -1,17 +1,18 @@
 """The damping law F = B·x_ssⁿ: one exponent n for all vines, one coefficient B for each.
 
-Two fits of ln F = ln B_v + n ln x_ss. `log_log` is that of the paper: least squares of the force residuals. But the
-experimenter sets the force and the vine answers with a speed: a vine that damps 3 % more goes 8 % slower, and scatter
-on the abscissa flattens such a fit, by σ_B²/var(ln F) of n. `both_axes` puts every error where it arises: that of a
-measured pressure on F; on x_ss that of the measured speed, the vines' scatter, and the scatter of a pressure that was
-set, for there the true force strays about the stated one and takes the speed along (Berkson). York's estimator then
-gives n (D. York et al., Am. J. Phys. 72, 367, 2004). The scatter is whatever the stated errors leave unexplained.
+Two fits of ln F = ln B_v + n ln x_ss. `log_log` is that of the paper: least squares of the force residuals. However,
+the experimenter sets the force, and the vine responds with a speed: a vine with 3 % more damping is 8 % slower. Scatter
+of the regressor biases such a fit towards zero, by σ_B²/var(ln F) of n (regression dilution). `both_axes` assigns every
+error to the variable where it arises: the error of a measured pressure to F; to x_ss the error of the measured speed,
+the scatter between vines, and the scatter of a pressure that was set, since there the true force deviates from the
+stated one and takes the speed with it (Berkson error). York's estimator then gives n (D. York et al., Am. J. Phys. 72,
+367, 2004). The scatter is estimated as what the stated errors do not explain.
 
-Intervals resample whole trials within each vine, so that nothing is assumed about the scatter. Resampling cannot see
-two things. One is the flattening of `log_log`: its intervals are moved by what its own scatter implies (its estimates
-are not: they are the published method). The other is an error that trials share: the `…_total` intervals add that
-of the yield pressure, common to a vine, and that of the scale, common to all: a scale that is off by ε moves every
-ln x_ss by ε and every ln B by −n·ε, and leaves n alone.
+Intervals come from resampling whole trials within each vine, without assumptions about the scatter. The bootstrap does
+not include two effects. One is the bias of `log_log`: its intervals are shifted by the bias that its own scatter
+implies (its estimates are not: they are the published method). The other are errors that trials share: the `…_total`
+intervals add that of the yield pressure, common to a vine, and that of the scale, common to all trials. A scale error
+of ε changes every ln x_ss by ε and every ln B by −n·ε, and does not change n.
 """
 
 from __future__ import annotations
@@ -28,30 +29,33 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_PER_VINE = 3
-"""Points of a vine that enters the fit of a shared exponent. Derived: two fix its line exactly and show no scatter."""
+"""Fewest points of a vine in the fit of a shared exponent. Derived: two determine its line exactly and show no
+scatter."""
 
 LEAST_FORCE_RATIO = 1.2
-"""Largest over smallest force that a vine must span. Derived: an error of 1 % in one force changes the slope d ln
+"""Least ratio of largest to smallest force of a vine. Derived: an error of 1 % in one force changes the slope d ln
 F/d ln v, n, by about 0.01 n/ln 1.2 = 0.05 n at each end, together 0.1 n; at 1.1 it would be 0.2 n, at 1.4 0.06 n."""
 
 LEAST_STEADY_SHARE = 0.5
-"""Part of a condition's trials that must be steady for any of them to enter a fit. Chosen: the majority; a condition
-where most trials are not steady has its steady ones by selection. At 0.25 such conditions count, at 1 every trial
-must be steady."""
+"""Fraction of a condition's trials that must be steady for any of them to enter a fit. Chosen: the majority, since the
+steady trials of a condition in which most are not are a biased selection. At 0.25 such conditions count, at 1 every
+trial must be steady."""
 
 FEWEST_FOR_RESAMPLING = 10
-"""Below, resamples repeat so few points that their scatter says little: intervals come from Student's t. Chosen; at
-5 the bootstrap of few points is too narrow (its variance is (N − p)/N of the true one), at 20 more intervals are
-Student's."""
-
+"""Fewest points for bootstrap intervals; with fewer, intervals come from Student's t. Chosen: at 5 the bootstrap of few
+points is too narrow (its variance is (N − p)/N of the true one), at 20 more intervals are Student's."""
 
 NO_SLOPE = "its vine carries no slope: "
-"""Begins the reason of a point whose vine is left out of the law."""
+"""Start of the reason of a point whose vine is left out of the law."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """Steady points in logarithms; arrays have shape (n_points,), `vine` counts from 0 in the order of `names`."""
+    """Steady points in logarithms, shape (n_points,); errors are relative, `yield_error` is in N.
+
+    `vine` is the index of the vine of each point in `names`. `force_error` is the error of a measured pressure,
+    `set_error` that of a set one, `scale_error` that of the scale, shared by all points.
+    """
 
     log_speed: Floats
     log_force: Floats
@@ -66,46 +70,45 @@ class Points:
 
     @property
     def member(self) -> Floats:
-        """Shape (n_points, n_vines): 1 where a point belongs to a vine."""
+        """Indicator matrix, shape (n_points, n_vines): 1 where a point belongs to a vine."""
         return np.eye(len(self.names))[self.vine]
 
 
 def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """The law from our windows in both ways, and what the published rule gives, to the letter.
+    """Fit the law to the steady windows by both methods, and exactly as published.
 
     Parameters
     ----------
-    points : a row a trial, as `vinetrack.kinematics.summary` makes them: those with `used` enter `log_log` and
-        `both_axes`, and the vines that `mark_left_out` left out are named there; every trial that could, by its payload
-        and travel ratio, and has a window by the published rule enters `paper` with set pressure, without weight and
-        fitted as published.
-    resamples : resamples of whole trials.
-    seed : of the resampling.
+    points : one row for each trial, from `vinetrack.kinematics.summary`. Rows with `used` enter `log_log` and
+        `both_axes`, which also name the vines that `mark_left_out` left out. Every eligible trial with a window by the
+        published rule enters `paper`, with set pressure, without weight, and fitted as published.
+    resamples : number of bootstrap resamples of whole trials.
+    seed : of the bootstrap.
 
     Returns
     -------
     dict
         `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
     """
-    asked = points["used"]
+    in_law = points["used"]
     if "reason" in points:
-        # Points of vines that carry no slope are left out by the law itself, which says so.
-        asked = asked | points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
-    fits = fit_damping(points[asked], resamples=resamples, seed=seed)
+        # Vines without a slope are passed on, so that `fit_damping` leaves them out with the reason.
+        in_law = in_law | points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
+    fits = fit_damping(points[in_law], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
     return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
 
 
 def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
-    """Take out conditions of which less than half of the trials are steady; `used` and `reason` say so.
+    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`.
 
-    At the pressure where a vine only just reaches a steady speed within its length, the slower trials pass and the
-    faster do not: those that pass have too large a B, and so has the top of the fit.
+    At a pressure where a vine barely reaches a steady speed within its length, only the slower trials are steady. Their
+    B is larger than average, which would bias the upper end of the fit.
 
     Parameters
     ----------
-    points : a row a trial, with `condition`, `eligible`, `used` and `reason`.
+    points : one row for each trial, with `condition`, `eligible`, `used` and `reason`.
 
     Returns
     -------
@@ -125,7 +128,7 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
-    """Say of every point whether the law rests on it: half steady conditions, and vines that carry no slope, do not.
+    """Exclude the points of half-steady conditions and of vines without a slope, in `used` and `reason`.
 
     Parameters
     ----------
@@ -137,18 +140,19 @@ def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
     """
     marked = mark_half_steady(points)
     for vine, why in _admit(marked[marked["used"]])[1].items():
-        mine = marked["used"] & (marked["vine"] == vine)
-        marked.loc[mine, "reason"] = NO_SLOPE + why
-        marked.loc[mine, "used"] = False
+        of_vine = marked["used"] & (marked["vine"] == vine)
+        marked.loc[of_vine, "reason"] = NO_SLOPE + why
+        marked.loc[of_vine, "used"] = False
     return marked
 
 
 def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Fit the law in both ways.
+    """Fit the law by both methods.
 
     Parameters
     ----------
-    points : A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
+    points : one row for each trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N,
+        force_sigma_N,
         yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`) and
         `scale_rel_sigma` (relative error of the scale, which all trials share). Vines with fewer than three trials, or
         a span of forces below 1.2, are left out and named.
@@ -159,8 +163,8 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     dict
         `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
         errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number
-        of trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
-        was found), `left_out`, and `refused`: None, or why there is no fit.
+        of trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (its
+        method), `left_out`, and `refused`: None, or why there is no fit.
     """
     kept, left_out = _admit(points)
     if kept.empty:
@@ -178,7 +182,7 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
 
 
 def _admit(points: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Points of vines that can carry a slope, and why the others cannot."""
+    """Points of vines that determine a slope, and the reasons why others do not."""
     usable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
     left_out = {}
     for vine in dict.fromkeys(points["vine"]):
@@ -239,15 +243,15 @@ def _logarithms(points: pd.DataFrame) -> Points:
 def slope(
     log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
 ) -> tuple[Floats, Floats]:
-    """York's slope with one intercept a vine, for many resamples at once.
+    """York's slope with one intercept for each vine, for many resamples at once.
 
     Parameters
     ----------
     log_force : shape (n_resamples, n_points) or (1, n_points).
     counts : how often each point is drawn, shape (n_resamples, n_points).
     data : the points.
-    speed_variance, force_variance : of the logarithms, shape (n_points,); where the first is 0 this is least squares in
-        F.
+    speed_variance, force_variance : of the logarithms, shape (n_points,); with a speed variance of 0 this is least
+        squares in ln F.
 
     Returns
     -------
@@ -257,8 +261,8 @@ def slope(
     member = data.member
     n = np.full(counts.shape[0], 0.4)
     drawn = counts > 0
-    often = np.where(drawn, counts, 1.0)
-    # A resample of one point over and over has no slope: it runs off to infinity here and is dropped by the caller.
+    multiplicity = np.where(drawn, counts, 1.0)
+    # A resample that repeats a single point has no slope: it diverges here, and the caller drops it.
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for _ in range(60):
             weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
@@ -267,11 +271,11 @@ def slope(
             mean_y = (weight * log_force) @ member / total
             dx = np.where(drawn, data.log_speed - mean_x[:, data.vine], 0.0)
             dy = np.where(drawn, log_force - mean_y[:, data.vine], 0.0)
-            lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / often
+            lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / multiplicity
             update = np.sum(lever * dy, axis=1) / np.sum(lever * dx, axis=1)
-            settled = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
+            has_converged = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
             n = update
-            if settled:
+            if has_converged:
                 break
     return n, mean_y - n[:, None] * mean_x
 
@@ -294,13 +298,13 @@ def _fit(
     total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
     by_resampling = n_points >= FEWEST_FOR_RESAMPLING and dof > 0
     estimate = np.concatenate([[n], log_B])
-    spread = _widening(data, dof)
+    widening = _widening(data, dof)
     if by_resampling:
-        low, high = _percentiles(estimate, draws, spread)
+        low, high = _percentiles(estimate, draws, widening)
     else:
-        reach = _student(dof) * np.sqrt(np.diag(covariance))
-        low, high = estimate - reach, estimate + reach
-    low_total, high_total = _percentiles(estimate, total, spread)
+        half_width = _student(dof) * np.sqrt(np.diag(covariance))
+        low, high = estimate - half_width, estimate + half_width
+    low_total, high_total = _percentiles(estimate, total, widening)
     if not both_axes:
         shift = _flattening(data, estimate)
         low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
@@ -334,9 +338,9 @@ def _fit(
 
 
 def _flattening(data: Points, estimate: Floats) -> Floats:
-    """How far least squares in F falls short of a fit with all scatter on the speed, shape (1 + n_vines,): n, ln B."""
-    same = np.ones_like(data.log_force)
-    n, log_B = slope(data.log_force[None], same[None], data, same, 1e-14 * same)
+    """N and ln B of a fit with all scatter in the speed, minus the estimate by least squares in ln F."""
+    ones = np.ones_like(data.log_force)
+    n, log_B = slope(data.log_force[None], ones[None], data, ones, 1e-14 * ones)
     return np.concatenate([n, log_B[0]]) - estimate
 
 
@@ -353,20 +357,20 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
         if not (math.isfinite(n[0]) and n[0] > 0):
             break
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
-        # The scatter of ln F, beyond the stated errors, that makes χ² equal its degrees of freedom.
-        known = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
-        before, scatter = scatter, _unexplained(residual, known, dof)
+        # The scatter of ln F, beyond the stated errors, for which χ² equals its degrees of freedom.
+        stated = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
+        before, scatter = scatter, _unexplained(residual, stated, dof)
         if abs(scatter - before) <= 1e-6 * (scatter + 1e-12):
             break
     return speed_variance, np.maximum(force_variance, 1e-14)
 
 
-def _unexplained(residual: Floats, known: Floats, dof: int) -> float:
-    """Variance s with Σ residual²/(known + s) = dof, or 0 where the known variances are enough."""
+def _unexplained(residual: Floats, stated: Floats, dof: int) -> float:
+    """Variance s with Σ residual²/(stated + s) = dof, or nearly 0 where the stated variances suffice."""
     from scipy.optimize import brentq
 
     def excess(s: float) -> float:
-        return float(np.sum(residual**2 / (known + s))) - max(dof, 1)
+        return float(np.sum(residual**2 / (stated + s))) - max(dof, 1)
 
     largest = float(residual @ residual) / max(dof, 1) + 1e-12
     floor = 1e-12
@@ -376,7 +380,7 @@ def _unexplained(residual: Floats, known: Floats, dof: int) -> float:
 def _covariance(
     data: Points, n: float, speed_variance: Floats, force_variance: Floats, scatter: float, both_axes: bool
 ) -> Floats:
-    """Of n and the ln B, shape (1 + n_vines,) squared, from the curvature of χ² at its minimum."""
+    """Covariance of n and ln B, shape (1 + n_vines, 1 + n_vines), from the curvature of χ² at its minimum."""
     design = np.column_stack([data.log_speed, data.member])
     variance = force_variance + n**2 * speed_variance if both_axes else np.full(data.log_force.size, scatter**2)
     return np.asarray(np.linalg.pinv(design.T @ (design / variance[:, None])))
@@ -385,9 +389,9 @@ def _covariance(
 def _resample(
     data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_shared: bool
 ) -> Floats:
-    """Fits to trials drawn with replacement within each vine, shape (n_kept, 1 + n_vines): columns n, ln B.
+    """Fits to trials drawn with replacement within each vine, columns n and ln B; draws without a slope are dropped.
 
-    `with_shared` draws the errors that trials share as well: of the yield pressure once a vine, of the scale once.
+    `with_shared` also draws the errors that trials share: of the yield pressure for each vine, of the scale for all.
     """
     random = np.random.default_rng(seed)
     counts = np.zeros((resamples, data.log_force.size))
@@ -406,10 +410,10 @@ def _resample(
 
 
 def _widening(data: Points, dof: int) -> Floats:
-    """How much wider than their percentiles intervals must be, shape (1 + n_vines,).
+    """Factor by which percentile intervals must be widened, shape (1 + n_vines,).
 
-    Resampling N points about p fitted parameters shrinks their variance by (N − p)/N, and a spread that is itself
-    estimated calls for Student's t in place of the normal.
+    Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter requires
+    Student's t instead of the normal distribution.
     """
     n_points = data.log_force.size
     sizes = np.array([n_points / (1 + len(data.names)), *np.bincount(data.vine)])
@@ -417,9 +421,9 @@ def _widening(data: Points, dof: int) -> Floats:
     return np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
 
 
-def _percentiles(estimate: Floats, draws: Floats, spread: Floats) -> tuple[Floats, Floats]:
+def _percentiles(estimate: Floats, draws: Floats, widening: Floats) -> tuple[Floats, Floats]:
     low, high = np.percentile(draws, [2.5, 97.5], axis=0)
-    return estimate - spread * (estimate - low), estimate + spread * (high - estimate)
+    return estimate - widening * (estimate - low), estimate + widening * (high - estimate)
 
 
 def _student(dof: int) -> float:

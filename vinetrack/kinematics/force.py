@@ -1,12 +1,11 @@
-"""The force that drives a vine in its steady window, and whether the trial belongs in a damping fit.
+"""Driving force of a vine in its steady window, and whether the trial enters the damping fit.
 
     F = (P_w − P_y) A + r m̄ g cosθ
 
 In a window that is only quasi-steady, `r m̄ g cosθ` becomes `r m̄ (g cosθ − ẍ)`.
 
 P_w is the gauge pressure in the window (measured, else that of the model in use) and m̄ the mean moving mass there. The
-rule of the paper, Eq. (3), takes the set pressure and leaves the weight out: then noise-free data made with n = 0.37
-give 0.38.
+rule of the paper, Eq. (3), uses the set pressure and neglects the weight: noise-free data with n = 0.37 then give 0.38.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from vinetrack.kinematics.release import Release
 
 @dataclass(frozen=True)
 class SteadyForce:
-    """Force in a steady window, N; `sigma_N` its random error, `yield_sigma_N` what the yield pressure leaves open.
+    """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure.
 
-    The second is the same for all trials of a vine. `paper_N` is the published rule: set pressure, no weight.
+    The latter is shared by all trials of a vine. `paper_N` is the force by the published rule: set pressure, no weight.
     """
 
     force_N: float
@@ -41,7 +40,7 @@ class SteadyForce:
 def steady_force(
     trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model
 ) -> SteadyForce:
-    """Force of a trial in one window.
+    """Compute the force of a trial in one window.
 
     Parameters
     ----------
@@ -56,7 +55,7 @@ def steady_force(
     Raises
     ------
     EffectError
-        If an effect of the model needs what the trial lacks.
+        If the trial lacks what an effect of the model needs.
     """
     inside = (kinematics.time_s >= window.from_s) & (kinematics.time_s <= window.to_s)
     travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
@@ -90,14 +89,14 @@ def paper_force_N(trial: Trial) -> float:
 
 
 def known_pressure(trial: Trial, track: Track, kinematics: Kinematics, release: Release, model: Model) -> Floats | None:
-    """Gauge pressure at the points of the kinematics, shape (n,), Pa; None where only the set pressure is known.
+    """Return the gauge pressure at the points of the kinematics; None where only the set pressure is known.
 
-    Known is what was measured, or what a model with an effect on the pressure says.
+    It is the measured pressure, else that of a model with an effect on the pressure.
 
     Parameters
     ----------
     trial, track, kinematics, release : of one trial.
-    model : asked where no pressure was measured.
+    model : used where no pressure was measured.
 
     Returns
     -------
@@ -138,7 +137,7 @@ def _window_pressure(
 
 
 def _mean_error(measured_Pa: Floats) -> float:
-    """Standard error of the mean of a trace, from the scatter about its own straight line: a fall is not an error."""
+    """Standard error of the mean of a trace, from the scatter about its linear trend, which is not an error."""
     if measured_Pa.size < 4:
         return 0.0
     steps = np.arange(measured_Pa.size)
@@ -147,7 +146,7 @@ def _mean_error(measured_Pa: Floats) -> float:
 
 
 def why_not_in_fit(trial: Trial) -> str:
-    """Why a trial cannot enter the damping fit whatever its motion; blank if it can.
+    """Return why a trial cannot enter the damping fit whatever its motion; blank if it can.
 
     Parameters
     ----------
@@ -165,7 +164,7 @@ def why_not_in_fit(trial: Trial) -> str:
 
 
 def why_not_force(force: SteadyForce | None) -> str:
-    """Why a force cannot enter the damping fit; blank if it can.
+    """Return why a force cannot enter the damping fit; blank if it can.
 
     Parameters
     ----------

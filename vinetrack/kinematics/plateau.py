@@ -1,4 +1,4 @@
-"""Arithmetic of steady windows: least squares over any stretch of raw positions, with noise that remembers itself."""
+"""Least squares over windows of raw positions with AR(1) noise: speed, drift and their standard errors."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Bounds = Callable[[Indices, Indices], tuple[Floats, Floats]]
 class WindowMoments:
     """Quadratic fits to the raw positions of any window in constant time.
 
-    A window is two stretches that meet at a middle: level k has a middle every 2^(k + 1) points and the sums from it
-    outwards, of moments about its own time and position (a disjoint sparse table). Nothing is ever a small difference
-    of large sums, so that a short window late in a long track is known as well as any, in plain double precision.
+    A window consists of two stretches that meet at a middle. Level k has a middle every 2^(k + 1) points and the sums
+    outwards from it, of moments about its own time and position (a disjoint sparse table). No sum is a small difference
+    of large ones, so a short window late in a long track is as accurate as any other in double precision.
     """
 
     def __init__(self, time_s: Floats, position_m: Floats, noise_m: float, correlation: float) -> None:
@@ -85,15 +85,15 @@ class WindowMoments:
 
 
 class _GainTable:
-    """How much AR(1) noise enlarges the error of a window's curvature over white noise, by window length."""
+    """Ratio of the error of a window's curvature under AR(1) noise to that under white noise, by window length."""
 
     def __init__(self, n_longest: int, correlation: float) -> None:
         lengths = np.unique(np.rint(np.geomspace(3, max(n_longest, 4), 24)).astype(int))
         self.log_length = np.log(lengths)
-        self.gain = np.array([self._one(int(length), correlation) for length in lengths])
+        self.gain = np.array([self._gain(int(length), correlation) for length in lengths])
 
     @staticmethod
-    def _one(length: int, rho: float) -> float:
+    def _gain(length: int, rho: float) -> float:
         u = np.linspace(-1, 1, length)
         weights = u**2 - np.mean(u**2)
         return _ar1_sd(weights, rho) / float(np.sqrt(np.sum(weights**2)))
@@ -137,10 +137,10 @@ class RangeExtremes:
 
 
 def chord_bounds(time_s: Floats, position_m: Floats, noise_m: float, rho: float, sigmas: float) -> list[Bounds]:
-    """For chords of 1, 2, 4 … frames of the raw positions: the highest lower and lowest upper limit in a window.
+    """Return functions for the highest lower and lowest upper limit of chord speeds in a window, by length of chord.
 
-    A chord's speed has the error σ√(2(1 − ρ^k))/Δt. Nothing is smoothed, so that a window may reach right up to the
-    start-up or the end of growth without either leaking into it.
+    Chords span 1, 2, 4 … frames of the raw positions; the speed of one has the error σ√(2(1 − ρ^k))/Δt. Nothing is
+    smoothed, so a window may extend right up to the start-up or the end of growth without being affected by them.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def chord_bounds(time_s: Floats, position_m: Floats, noise_m: float, rho: float,
 
     Returns
     -------
-    an entry a length of chord, in rising length; speeds in m/s.
+    one function for each length of chord, shortest first; speeds in m/s.
     """
     bounds: list[Bounds] = []
     span = 1
@@ -180,10 +180,10 @@ def _bounds_of(low: RangeExtremes, high: RangeExtremes, span: int) -> Bounds:
 
 @dataclass(frozen=True)
 class LineFit:
-    """Raw positions of one window as Legendre polynomials in time: speed, its change, and what a cubic would add.
+    """Legendre polynomials fitted to the raw positions of one window: speed, its change, and the cubic term.
 
-    Speeds in m/s of the lead. `drift` is the relative change of speed across the window; `bend_m_s` the mean speed of
-    the cubic less that of the straight line, `bend_sigma_m_s` its error.
+    Lead speeds, m/s. `drift` is the relative change of speed across the window; `bend_m_s` is the mean speed of the
+    cubic minus that of the straight line, `bend_sigma_m_s` its standard error.
     """
 
     speed_m_s: float
@@ -200,9 +200,9 @@ class LineFit:
 
 
 def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -> LineFit:
-    """Least squares on the raw positions of one window of at least three points, errors for AR(1) noise.
+    """Fit the raw positions of one window of at least three points by least squares, with errors for AR(1) noise.
 
-    Where the points scatter about their cubic clearly more than `noise_m` says, the errors are those of that scatter.
+    Where the points scatter about their cubic significantly more than `noise_m`, the errors are those of the scatter.
 
     Parameters
     ----------
@@ -219,26 +219,26 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
     u = (time_s - (time_s[0] + time_s[-1]) / 2) / half
     order = min(3, n - 1)
     y = position_m - position_m.mean()
-    # Each weight row is that of a fit with no higher term than its own: the line, the parabola, the cubic.
+    # Row k has the weights of the highest coefficient of a fit of order k: line, parabola, cubic.
     rows = [np.linalg.pinv(np.polynomial.legendre.legvander(u, k))[k] for k in range(1, order + 1)]
     residual = y - np.polynomial.legendre.legval(u, np.polynomial.legendre.legfit(u, y, order))
     noise_m = _local_noise(residual, noise_m, rho, order + 1)
     slope, curve = float(rows[0] @ y), float(rows[1] @ y)
     errors = [noise_m * _ar1_sd(row, rho) for row in rows]
     bend, bend_sigma = (float(rows[2] @ y), errors[2]) if order == 3 else (0.0, 0.0)
-    known = slope != 0
+    is_moving = slope != 0
     return LineFit(
         speed_m_s=slope / half,
         speed_sigma_m_s=errors[0] / half,
-        drift=6 * curve / slope if known else math.nan,  # d(c₂P₂)/du runs from −3c₂ to 3c₂
-        drift_sigma=6 * errors[1] / abs(slope) if known else math.nan,
+        drift=6 * curve / slope if is_moving else math.nan,  # d(c₂P₂)/du runs from −3c₂ to 3c₂
+        drift_sigma=6 * errors[1] / abs(slope) if is_moving else math.nan,
         bend_m_s=bend / half,
         bend_sigma_m_s=bend_sigma / half,
     )
 
 
 def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> float:
-    """The track's noise, or the scatter in this window where that is clearly larger (three standard errors)."""
+    """The track's noise, or the scatter in this window where it is larger by more than three standard errors."""
     n = residual.size
     effective = n * (1 - rho**2) / (1 + rho**2) - terms
     if effective < 2:
@@ -248,10 +248,10 @@ def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> fl
 
 
 def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
-    """Measure speed, error, drift and variation in a window; whether it is accepted is left to the rule.
+    """Measure speed, its standard error, drift and variation in a window; the rule decides about acceptance.
 
-    The error of x_ss holds the noise and, where the speed bends within the window, how far the mean speed of a cubic
-    lies from that of the line.
+    The standard error of x_ss includes the noise and, where the speed is curved within the window, the difference of
+    the mean speeds of a cubic and of the line.
 
     Parameters
     ----------
@@ -287,10 +287,11 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
 def trim(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, window: tuple[int, int], band: float, drift_limit: float
 ) -> tuple[int, int]:
-    """Cut from both ends of a steady window what is not yet, or no longer, on its line of speed.
+    """Trim the ends of a steady window that deviate from its speed line.
 
-    The first and last 1, 2, 4 … frames must move within `band` (a fraction of the mean speed) and `TRIM_SIGMAS` of the
-    speed that the window's parabola has there. Cutting stops where the rest would no longer be shown to be steady.
+    The first and last 1, 2, 4 … frames must move within `band` (a fraction of the mean speed) plus `TRIM_SIGMAS`
+    standard errors of the speed that the window's parabola has there. Trimming stops where the rest would no longer be
+    shown to be steady.
 
     Parameters
     ----------
@@ -302,11 +303,11 @@ def trim(
 
     Returns
     -------
-    first and last point of what is left, both included.
+    first and last point of the trimmed window, both included.
     """
     first, last = window
     while last - first >= 4:
-        move_first, move_last = _untidy_ends(time_s, position_m, kinematics, first, last, band)
+        move_first, move_last = _points_to_trim(time_s, position_m, kinematics, first, last, band)
         if not (move_first or move_last):
             break
         first_now, last_now = first + move_first, last - move_last
@@ -325,14 +326,14 @@ def trim(
 
 
 TRIM_SIGMAS = 2.5
-"""Standard errors by which an end of a window must leave its line of speed to be cut off. Chosen: 1.2 % by chance;
+"""Standard errors by which an end of a window must deviate from its speed line to be trimmed. Chosen: 1.2 % by chance;
 at half steady windows are shortened by noise, at twice a start-up of twice the size stays in."""
 
 
-def _untidy_ends(
+def _points_to_trim(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, band: float
 ) -> tuple[int, int]:
-    """How many points to cut from the beginning and the end: none where the ends keep to the parabola."""
+    """Number of points to trim from the beginning and the end: none where the ends follow the parabola."""
     t, y = time_s[first : last + 1], position_m[first : last + 1]
     noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
     fit = fit_window(t, y, noise_m, rho)

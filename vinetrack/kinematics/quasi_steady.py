@@ -1,9 +1,8 @@
-"""Windows in which a vine keeps up with a pressure that changes.
+"""Quasi-steady windows, in which a vine follows a changing pressure with negligible inertia.
 
-Where the chamber runs down no speed is steady, yet the balance of forces holds at every instant as long as inertia is
-a small part of it. If the pressure along the way is known, measured or from the model in use, such a window gives a
-point of the damping law as good as a steady one. If it is not known, it gives a wrong one: then this rule is never
-asked.
+As the chamber empties no speed is steady, yet the forces balance at every instant as long as inertia is a small part of
+them. If the pressure during growth is known, measured or from the model in use, such a window gives a point of the
+damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not applied.
 """
 
 from __future__ import annotations
@@ -20,30 +19,31 @@ from vinetrack.kinematics.plateau import fit_window, judge
 from vinetrack.kinematics.release import Release
 
 INERTIA_LIMIT = 0.1
-"""Largest part of the force that inertia may take, with its 95 % interval.
+"""Largest inertia as a fraction of the force, at the end of its 95 % interval.
 
-Chosen: it is counted in the force; but the mass of film is known to a few per cent, which leaves 0.3 % of the force
-at this limit."""
+Chosen: inertia is included in the force, but the mass of film is known only to a few per cent, which leaves an error of
+0.3 % of the force at this limit."""
 
 LARGEST_CHANGE = 0.3
-"""Largest change of speed across a window.
+"""Largest relative change of speed across a window.
 
-Derived: it puts the mean of ẋⁿ off the power of the mean by n(n−1)/24 of its square, 0.09 %.
+Derived: the mean of ẋⁿ then differs from the power of the mean by n(n−1)/24 of its square, 0.09 %.
 """
 
 LAST_FRACTION = 0.95
-"""Part of the length up to which the mass of a bare vine is known well enough. Chosen: its film weighs 5 % of the whole
-there, and the gas, which is known less well, up to 10 %; nearer to the end the gas would outweigh the film."""
+"""Fraction of the length up to which the moving mass of a vine without payload is known well enough. Chosen: its film
+has 5 % of the whole mass there, and the gas, which is known less well, up to 10 %; nearer to the end the gas would have
+more mass than the film."""
 
 PARTS = 3
-"""Parts of a window in each of which inertia is fitted. Chosen: beginning, middle and end."""
+"""Parts of a window in which inertia is fitted separately. Chosen: beginning, middle and end."""
 
 FEWEST_POINTS = 4 * PARTS
-"""Derived: a quadratic in each part, with a point to spare."""
+"""Fewest points of a window. Derived: a quadratic in each part, with one degree of freedom."""
 
-TRIED = 6
-"""Parts between whose ends all windows are tried. Chosen: 21 windows; at 3 a window may be a third shorter than it
-could be, at 12 there are 78 to fit."""
+SECTIONS = 6
+"""Sections between whose ends all windows are tried. Chosen: 21 windows; at 3 a window may be a third shorter than
+possible, at 12 there are 78 to fit."""
 
 
 def quasi_steady_window(
@@ -55,18 +55,18 @@ def quasi_steady_window(
     *,
     start_fraction: float = 0.2,
 ) -> Window:
-    """The longest window, from the highest speed on, in which inertia is a small part of the force.
+    """Find the longest window after the highest speed in which inertia is a small part of the force.
 
     Parameters
     ----------
     trial, track, kinematics, release : of one trial.
     pressure_Pa : known gauge pressure at the points of `kinematics`, shape (n,).
-    start_fraction : slower than this part of the highest speed the window ends.
+    start_fraction : the window ends where the speed is below this fraction of the highest.
 
     Returns
     -------
     Window
-        Rule `quasi_steady`; `accepted` is False with the reason where there is none.
+        Rule `quasi_steady`; where there is none, `accepted` is False and `reason` says why.
     """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
@@ -83,35 +83,45 @@ def quasi_steady_window(
     mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     force_N = (pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N
-    share_N = trial.travel_ratio**2 * mass_kg
-    ends = np.linspace(first, last, TRIED + 1).round().astype(int)
+    inertial_mass_kg = trial.travel_ratio**2 * mass_kg
+    ends = np.linspace(first, last, SECTIONS + 1).round().astype(int)
     candidates = sorted(itertools.combinations(ends.tolist(), 2), key=lambda ends: ends[0] - ends[1])
-    worst = math.inf
+    smallest = math.inf
     for a, b in candidates:
         if b - a + 1 < FEWEST_POINTS:
             break
-        inertia = _largest_inertia(time_s, position_m, kinematics, share_N, force_N, a, b)
-        worst = min(worst, inertia)
+        inertia = _largest_inertia(time_s, position_m, kinematics, inertial_mass_kg, force_N, a, b)
+        smallest = min(smallest, inertia)
         if inertia <= INERTIA_LIMIT:
             window = judge(time_s, position_m, kinematics, a, b, "quasi_steady")
             reason = (
-                f"keeps up with a known pressure over {window.n_points} points: speed changes by"
+                f"follows a known pressure over {window.n_points} points: speed changes by"
                 f" {100 * window.drift:.2g} %, inertia at most {100 * inertia:.2g} % of the force"
             )
             return replace(window, accepted=True, reason=reason)
-    return Window("quasi_steady", False, f"inertia takes at least {100 * worst:.2g} % of the force in every window")
+    return Window("quasi_steady", False, f"inertia takes at least {100 * smallest:.2g} % of the force in every window")
 
 
 def _largest_inertia(
-    time_s: Floats, position_m: Floats, kinematics: Kinematics, share_N: Floats, force_N: Floats, a: int, b: int
+    time_s: Floats,
+    position_m: Floats,
+    kinematics: Kinematics,
+    inertial_mass_kg: Floats,
+    force_N: Floats,
+    a: int,
+    b: int,
 ) -> float:
-    """Largest part of the force that inertia may take in any third of a window, at 95 %."""
+    """Largest inertia in any third of a window as a fraction of the force, at the end of its 95 % interval."""
     edges = np.linspace(a, b + 1, PARTS + 1).round().astype(int)
     largest = 0.0
     for low, high in itertools.pairwise(edges):
         t = time_s[low:high]
         fit = fit_window(t, position_m[low:high], kinematics.noise_m, kinematics.noise_correlation)
-        to_force = float(np.mean(share_N[low:high]) / np.mean(force_N[low:high])) * fit.speed_m_s / float(t[-1] - t[0])
+        to_force = (
+            float(np.mean(inertial_mass_kg[low:high]) / np.mean(force_N[low:high]))
+            * fit.speed_m_s
+            / float(t[-1] - t[0])
+        )
         if not (fit.speed_m_s > 0 and np.all(force_N[low:high] > 0)):
             return math.inf
         largest = max(largest, to_force * (abs(fit.drift) + 1.96 * fit.drift_sigma))

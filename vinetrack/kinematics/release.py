@@ -1,4 +1,4 @@
-"""When a vine was released and where its leading edge rested: the zeros of time and position of a trial."""
+"""Release time and resting position of the leading edge: the zeros of time and position of a trial."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from vinetrack.core.records import Floats, Kinematics, Track, join_flags
 from vinetrack.tracks.position_noise import rest_points
 
 FEWEST_REST_POINTS = 3
-"""Points at rest that make a level. Chosen: two frames alike may be a slow start."""
+"""Fewest points at rest that define a resting position. Chosen: two equal frames may be a slow start."""
 
 LIFTED_SIGMAS = 5.0
-"""Standard deviations of a position by which the track must leave its start to count as moving. Chosen: 6e-7 by
-chance for one point; at half it is 1 %, at twice only small creeping motions are called rest."""
+"""Standard deviations of a position by which the track must leave its start to count as moving. Chosen: 6e-7 by chance
+for one point; at half it is 1 %, at twice small creeping motions count as rest."""
 
 CLEAR_SIGMAS = 15.0
-"""Travel, in standard deviations of a position, at which motion is clear and from where its onset is sought backwards.
+"""Travel, in standard deviations of a position, at which motion is certain; the onset is searched backwards from there.
 Chosen: three times `LIFTED_SIGMAS`, so that points lie between; half and twice were not tried."""
 
 LONGEST_EXTRAPOLATION_FRAMES = 20
-"""Frames before the first that an extrapolated release may lie. Chosen: beyond, the first acceleration says little
-about what came before; at half and at twice fewer or more tracks without rest get an onset, all are marked so."""
+"""Frames by which an extrapolated release may precede the first frame. Chosen: the first acceleration tells little
+about earlier motion. At half and at twice, fewer or more tracks without rest get an onset; all of them are marked."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """Onset of motion and the resting position of the leading edge; `time_s` is NaN where nothing moves.
+    """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves.
 
-    `moving_from_start` tells that the track shows no rest, so that both zeros are extrapolated or simply the first
-    point: `reason` says which, in one sentence.
+    `moving_from_start` marks tracks without rest, whose zeros are extrapolated or those of the first point; `reason`
+    says which.
     """
 
     time_s: float
@@ -42,7 +42,7 @@ class Release:
 
 
 def find_release(track: Track, kinematics: Kinematics) -> Release:
-    """Find where and until when the leading edge rested.
+    """Find the resting position of the leading edge and the time of its release.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
     Returns
     -------
     Release
-        Origin and onset, with a sentence on how they were found.
+        Origin and onset, with a sentence on how they were determined.
     """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
@@ -69,7 +69,7 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
 
 
 def flag_rest(track: Track, release: Release) -> Track:
-    """Flag every row earlier than the release `before_release`.
+    """Flag every row before the release with `before_release`.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def flag_rest(track: Track, release: Release) -> Track:
 
     Returns
     -------
-    a copy; the track itself where the release is unknown or it moves from the start.
+    a copy; the track itself where the release is unknown or the track moves from the start.
     """
     if not math.isfinite(release.time_s) or release.moving_from_start:
         return track
@@ -94,13 +94,13 @@ def flag_rest(track: Track, release: Release) -> Track:
 
 
 def _ever_moves(kinematics: Kinematics) -> bool:
-    """Whether the track ends, or passes, further from its start than noise can carry it."""
+    """Whether positions span more than noise can explain."""
     span_m = float(np.ptp(kinematics.lead_position_m))
     return span_m > LIFTED_SIGMAS * kinematics.noise_m and span_m > 0
 
 
 def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, float]:
-    """Mean of the points at rest and its standard error, with ρ counted."""
+    """Mean of the points at rest and its standard error under AR(1) noise."""
     n, rho = position_m.size, kinematics.noise_correlation
     lag = np.arange(1, n)
     variance = (1 + 2 * float(np.sum((1 - lag / n) * rho**lag))) / n
@@ -108,7 +108,7 @@ def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, f
 
 
 def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
-    """Go back to zero speed at the first acceleration where that is near, else take the first point."""
+    """Extrapolate to zero speed with the first acceleration where that is close, else use the first point."""
     velocity, acceleration = kinematics.lead_velocity_m_s[0], kinematics.lead_acceleration_m_s2[0]
     step_s = float(np.median(np.diff(time_s)))
     first_m = float(kinematics.lead_position_m[0])
@@ -123,16 +123,17 @@ def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
         )
         return Release(float(time_s[0]) - back_s, origin_m, sigma_m, True, reason)
     reason = (
-        f"moving at the first point ({velocity:.3g} m/s) without a trace of the start: zeros set to the first point"
+        f"moving at the first point ({velocity:.3g} m/s), and the start cannot be extrapolated: zeros set to the first"
+        " point"
     )
     return Release(float(time_s[0]), first_m, kinematics.noise_m, True, reason)
 
 
 def _onset(time_s: Floats, position_m: Floats, n_rest: int, origin_m: float, kinematics: Kinematics) -> float:
-    """Time at which the edge leaves rest: the best of y = y₀ + b·(t − t₀)^p, p = 1, 3/2, 2, through the first points.
+    """Time at which the edge leaves rest, by the best least-squares fit of y = y₀ + b·(t − t₀)^p with p = 1, 3/2 or 2.
 
-    A vine of little mass is at full speed within a frame (p = 1), a heavy one accelerates evenly (p = 2). The points
-    are those around the corner and on until the edge is clearly off its resting place, three of them at least.
+    A vine of small mass reaches full speed within a frame (p = 1), a heavy one has constant acceleration (p = 2). The
+    fit uses the points around the onset and on until the edge has clearly left its resting position, at least three.
     """
     travel = position_m - origin_m
     clear = max(CLEAR_SIGMAS * kinematics.noise_m, 1e-9, 1e-6 * float(np.ptp(position_m)))

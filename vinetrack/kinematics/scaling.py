@@ -1,13 +1,13 @@
-"""How the damping coefficient, steady speed and efficiency change with the size of the vine.
+"""Dependence of damping coefficient, steady speed and efficiency on the size of the vine.
 
-Two descriptions of B against the diameter, both reported because neither is known to be right: a power law
-(a straight line on log axes) and a straight line. For the published vines (R = 1…4) the first has a slope of 1.80,
-the second R² = 0.983 with an intercept of −1.7 N·(s/m)ⁿ.
+B against diameter is described by a power law (a straight line on log axes) and by a straight line; both are reported,
+because neither is known to be right. For the published vines (R = 1…4) the power is 1.80, and the straight line has
+R² = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
 
-Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. A size
-counts once however often it was measured: replicates share their vine, so it is the means of vines that scatter about
-a trend, and N is their number. Slopes stand on log axes with 95 % intervals by Student's t; each p-value is the
-probability of a slope as large where there is none.
+Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. Each size
+counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number. Slopes are
+those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as large if there
+is none.
 """
 
 from __future__ import annotations
@@ -27,47 +27,47 @@ ISOMETRIC_WITHIN = 0.05
 """Vines whose t/D agree within this fraction count as scaled copies of each other. Chosen: films are sold to ±5 %."""
 
 SAME_WITHIN = 0.02
-"""Vines whose diameters agree within this fraction count as of one diameter. Chosen: well below the
-steps between sizes; half and twice were not tried."""
+"""Vines whose diameters agree within this fraction count as equal in diameter. Chosen: well below the steps between
+sizes; half and twice were not tried."""
 
 FEWEST_VINES = 3
-"""Vines of a regression that states an error. Derived: two fix a line exactly."""
+"""Fewest vines of a regression with an error. Derived: two determine a line exactly."""
 
 
 def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_axes") -> dict[str, Any]:
-    """B against diameter for isometric vines, and against thickness for vines of one diameter.
+    """Regress B on diameter for isometric vines, and on thickness for vines of one diameter.
 
     Parameters
     ----------
     damping : both fits as `vinetrack.kinematics.damping.fit_damping` returns them.
-    method : which of them the coefficients are taken from.
+    method : the fit whose coefficients are used.
 
     Returns
     -------
     dict
         `isometric` and `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`,
         `sizes`, `B`, `power` and `line` (see `regress`), and `refused` (None, or why there is no regression). Where
-        no vines belong together the list is empty and `reason` says so.
+        no vines are comparable the list is empty and `reason` says why.
     """
     vines = damping[method]["vines"]
     isometric = _families(vines, "diameter_mm", lambda v: v["thickness_um"] / v["diameter_mm"], ISOMETRIC_WITHIN)
     thickness = _families(vines, "thickness_um", lambda v: v["diameter_mm"], SAME_WITHIN)
     reason = None
     if not isometric and not thickness:
-        reason = _nothing(len(vines))
+        reason = _why_no_family(len(vines))
     return {"method": method, "isometric": isometric, "thickness": thickness, "reason": reason}
 
 
-def _nothing(count: int) -> str:
+def _why_no_family(count: int) -> str:
     if count == 0:
         return "no vine has a damping coefficient"
     if count == 1:
-        return "one vine alone has a damping coefficient, and growth with size takes two"
-    return f"of {count} vines with a damping coefficient no two are scaled copies of each other or of one diameter"
+        return "only one vine has a damping coefficient, and a dependence on size needs two"
+    return f"of {count} vines with a damping coefficient no two are scaled copies of each other or of equal diameter"
 
 
 def _families(vines: Mapping[str, Any], along: str, alike: Any, within: float) -> list[dict[str, Any]]:
-    """Groups of two or more vines that are alike but for one size."""
+    """Groups of two or more vines that differ only in one size."""
     families = []
     remaining = sorted(vines, key=lambda name: alike(vines[name]))
     while remaining:
@@ -103,7 +103,7 @@ def _family(group: list[str], sizes: Floats, vines: Mapping[str, Any], along: st
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
-    """Straight line by least squares: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope.
+    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope.
 
     Parameters
     ----------
@@ -116,14 +116,14 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
     from scipy.stats import linregress, t
 
     line = linregress(x, y)
-    reach = float(t.ppf(0.975, x.size - 2))
+    quantile = float(t.ppf(0.975, x.size - 2))
     return {
         "slope": float(line.slope),
-        "slope_95": [float(line.slope - reach * line.stderr), float(line.slope + reach * line.stderr)],
+        "slope_95": [float(line.slope - quantile * line.stderr), float(line.slope + quantile * line.stderr)],
         "intercept": float(line.intercept),
         "intercept_95": [
-            float(line.intercept - reach * line.intercept_stderr),
-            float(line.intercept + reach * line.intercept_stderr),
+            float(line.intercept - quantile * line.intercept_stderr),
+            float(line.intercept + quantile * line.intercept_stderr),
         ],
         "R2": float(line.rvalue**2),
         "p": float(line.pvalue) if math.isfinite(line.pvalue) else math.nan,
@@ -132,14 +132,14 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
 
 
 SAME_SETTING_WITHIN = 0.01
-"""Pressures and payloads that agree within this fraction count as the same. Chosen: gauges are read to a per cent."""
+"""Pressures and payloads that agree within this fraction count as equal. Chosen: gauges are read to a per cent."""
 
 SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
 EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
-    """Families of conditions that differ in size alone, and how speed and efficiency go with it.
+    """Find families of conditions that differ only in size, and the trends of speed and efficiency with size.
 
     Parameters
     ----------
@@ -157,12 +157,12 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
 
 
 def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
-    """Group rows that agree in every column named, each within its own fraction of the group's first row.
+    """Group rows that agree in all given columns within a fraction of the group's first row.
 
     Parameters
     ----------
-    table : a row a condition.
-    within : relative difference allowed, by column.
+    table : one row for each condition.
+    within : largest relative difference, by column.
 
     Returns
     -------
@@ -251,15 +251,15 @@ def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:
 
 
 def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
-    """Powers of all sizes at once: ln value = a + Σ pᵢ ln sizeᵢ, by least squares.
+    """Fit powers of all sizes jointly: ln value = a + Σ pᵢ ln sizeᵢ, by least squares.
 
-    Sizes that do not vary are left out. Where diameter and thickness both vary each power is that of one size while
-    the other stands still, which a look at one of them alone would mix up.
+    Sizes that do not vary are left out. Where diameter and thickness both vary, each power is the partial one at
+    constant other size, which a regression on one of them alone would confound.
 
     Parameters
     ----------
-    sizes : by name, shape (n,), all in one unit or not: powers do not depend on it.
-    values : shape (n,); those that are not positive or unknown are left out.
+    sizes : by name, shape (n,), in any unit, on which powers do not depend.
+    values : shape (n,); values that are unknown or not positive are left out.
 
     Returns
     -------
@@ -276,19 +276,19 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     matrix = np.column_stack([np.ones(n), *varying.values()])
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
         return {
-            "refused": f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power stands alone",
+            "refused": f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power is identifiable",
             "n": n,
             "R2": None,
         }
     y = np.log(values[known])
     coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
-    left = y - matrix @ coefficients
-    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(left @ left) / dof)
-    reach = float(t.ppf(0.975, dof))
+    residual = y - matrix @ coefficients
+    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / dof)
+    quantile = float(t.ppf(0.975, dof))
     total = float(np.sum((y - y.mean()) ** 2))
     return {
-        **{name: _power(coefficients[i + 1], errors[i + 1], reach, dof) for i, name in enumerate(varying)},
-        "R2": 1 - float(left @ left) / total if total > 0 else math.nan,
+        **{name: _power(coefficients[i + 1], errors[i + 1], quantile, dof) for i, name in enumerate(varying)},
+        "R2": 1 - float(residual @ residual) / total if total > 0 else math.nan,
         "n": n,
         "refused": None,
     }
@@ -303,8 +303,12 @@ def _too_few(n: int, varying: Sequence[str]) -> str:
     return f"{n} conditions; {powers} with an error take{'s' if len(varying) == 1 else ''} {len(varying) + 2}"
 
 
-def _power(value: float, error: float, reach: float, dof: int) -> dict[str, float | Sequence[float]]:
+def _power(value: float, error: float, quantile: float, dof: int) -> dict[str, float | Sequence[float]]:
     from scipy.stats import t
 
     p = 2 * float(t.sf(abs(value) / error, dof)) if error > 0 else 0.0
-    return {"power": float(value), "power_95": [float(value - reach * error), float(value + reach * error)], "p": p}
+    return {
+        "power": float(value),
+        "power_95": [float(value - quantile * error), float(value + quantile * error)],
+        "p": p,
+    }

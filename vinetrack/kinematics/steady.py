@@ -1,11 +1,11 @@
-"""Steady windows: where a trial moves at one speed, by our gated rule, by the paper's literal rule, by hand.
+"""Steady windows of a trial, by an equivalence test (gated rule), by the paper's rule, or chosen by hand.
 
-Speeds in a `Window` are **tail** speeds. The gated rule looks for the longest stretch, well above rest, whose change of
-speed is shown to be small (equivalence) rather than merely not shown to be large.
+Speeds in a `Window` are **tail** speeds. The gated rule finds the longest stretch, well above rest, whose change of
+speed is shown to be small (an equivalence test), rather than merely not shown to be large.
 
 The paper's rule is a coefficient of variation below 3 % over at least three points: Alvarez et al., "High-Velocity,
-Pressure-Driven Eversion for Rapid Vine Robots", IEEE RA-L 2025. It finds windows in still frames, in drifting speed and
-by chance; it is computed beside the gated rule so that both can be compared.
+Pressure-Driven Eversion for Rapid Vine Robots", IEEE RA-L 2025. It also accepts frames at rest, drifting speeds and
+chance agreement; it is computed too, for comparison.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from vinetrack.kinematics.plateau import RangeExtremes, WindowMoments, chord_bou
 
 __all__ = ["gated_window", "paper_window", "user_window"]
 
-STEPS = 56
-"""Starts and ends tried in the first pass; the best is then moved point by point. Chosen: all pairs of 56 are 1500
+GRID_POINTS = 56
+"""Starts and ends tried in the first pass; the best is then refined point by point. Chosen: all pairs of 56 are 1500
 windows; at half a short window may be missed, at twice it takes four times as long."""
 
 BAND = 0.5
-"""Half-width of the band that holds every velocity, in drift limits. Derived: a drift of the limit is half that each
-side."""
+"""Half width of the band that contains every velocity, in drift limits. Derived: a drift of the limit is half of it on
+each side."""
 
 SHORTEST_SHARE = 0.1
-"""Least part of the motion that counts as steady. Derived: what speeds up evenly changes by 3 % within 3–4 % of its
-run: short enough a piece of anything looks steady."""
+"""Shortest steady window, as a fraction of the motion. Derived: a motion with constant acceleration changes speed by 3
+% within 3–4 % of its duration, so a short enough piece of any motion looks steady."""
 
 SHORTEST_FALL, FALLING = 0.02, 1 / 3
-"""Least part where the speed falls by more than a third of the limit. Chosen: a vine slowing down with its supply or
-weight is in balance all the while, one that speeds up is not."""
+"""Shortest window where the speed falls by more than a third of the limit. Chosen: a vine that slows down with its
+supply or weight is in quasi-steady balance, one that speeds up is not."""
 
 TRIM_BAND = 1 / 6
-"""The ends of a window keep to its line of speed within this many drift limits. Derived: a start-up of 1.5 % that
-decays over a tenth of the window would put the mean 0.15 % off the line."""
+"""Deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed. Derived: a
+start-up of 1.5 % that decays over a tenth of the window would shift the mean by 0.15 %."""
 
 END_FRACTION = 0.95
-"""Part of the growth behind which no window lies, where its end was seen or the length of the vine says that it is
-near: there the moving mass goes to nothing, or the vine is stopped. Chosen as the fit's own END_FRACTION; at 0.9 a
-tenth of every window is lost, at 0.975 windows of the demonstration still ran into the stop."""
+"""Fraction of the growth after which no window lies, if the end was recorded or follows from the length of the vine:
+the moving mass vanishes there, or the vine is stopped. Chosen as the fit's own END_FRACTION; at 0.9 a tenth of every
+window is lost, at 0.975 windows of the demonstration still ran into the stop."""
 
 START_FRACTION, START_SIGMAS = 0.2, 5.0
-"""A vine moves where its speed exceeds this part of the highest, and so many standard errors. Chosen as the settings of
-the run have them by default; half or twice moves the beginning of a slow start."""
+"""A vine counts as moving where its speed exceeds this fraction of the highest, and this many standard errors. Chosen
+as the defaults of the run's settings; half or twice moves the beginning of a slow start."""
 
 BAND_SIGMAS = 4.0
-"""How many standard errors a single velocity may lie outside the band. Chosen: 1 in 16 000 by chance."""
+"""Standard errors by which a single velocity may lie outside the band. Chosen: 1 in 16 000 by chance."""
 
 
 def gated_window(
@@ -63,12 +63,12 @@ def gated_window(
     start_fraction: float = START_FRACTION,
     start_sigmas: float = START_SIGMAS,
 ) -> Window:
-    """The longest window in which the vine provably moves at one speed.
+    """Find the longest window in which the speed is shown to be constant within the drift limit.
 
     Parameters
     ----------
-    track, kinematics : the track and the motion made from it.
-    length_m : of the vine, m; NaN where unknown or where nothing grows: then only an end that was seen counts.
+    track, kinematics : the track and the motion computed from it.
+    length_m : of the vine, m; NaN where unknown or where nothing grows: then only a recorded end counts.
     drift_limit : largest change of speed across the window, and of any velocity in it from the mean, as a fraction of
         the mean.
     start_fraction, start_sigmas : the search begins where the velocity exceeds this fraction of its maximum and this
@@ -77,7 +77,7 @@ def gated_window(
     Returns
     -------
     Window
-        Rule `gated`. Where nothing is steady, `accepted` is False and `reason` says what was nearest.
+        Rule `gated`. Where nothing is steady, `accepted` is False and `reason` describes the nearest window.
     """
     time_s, position_m = _points(track, kinematics)
     first, last, why = _gate(kinematics, start_fraction, start_sigmas)
@@ -89,13 +89,13 @@ def gated_window(
     steady, nearest = search.longest()
     if steady is None:
         return Window("gated", False, nearest)
-    whole = (first + steady[0], first + steady[1])
-    kept = trim(time_s, position_m, kinematics, whole, TRIM_BAND * drift_limit, drift_limit)
-    window = judge(time_s, position_m, kinematics, *kept, "gated")
+    untrimmed = (first + steady[0], first + steady[1])
+    trimmed = trim(time_s, position_m, kinematics, untrimmed, TRIM_BAND * drift_limit, drift_limit)
+    window = judge(time_s, position_m, kinematics, *trimmed, "gated")
     moving = last - first + 1
     reason = (
         f"steady over {window.n_points} of {moving} moving points: speed changes by {_percent(window)},"
-        f" inside ±{100 * drift_limit:g} %"
+        f" within ±{100 * drift_limit:g} %"
     )
     return _with(window, True, reason)
 
@@ -103,12 +103,12 @@ def gated_window(
 def user_window(
     track: Track, kinematics: Kinematics, window_s: tuple[float, float], length_m: float = math.nan
 ) -> Window:
-    """The window chosen by hand, always used; `reason` warns where it is not steady or runs into the end of growth.
+    """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady.
 
     Parameters
     ----------
     track, kinematics : of one trial.
-    window_s : begin and end on the clock of the track, s.
+    window_s : start and end on the clock of the track, s.
     length_m : see `gated_window`.
 
     Returns
@@ -124,7 +124,7 @@ def user_window(
     inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
     if inside.size < 3:
         raise ValueError(
-            f"the chosen window {window_s[0]:g}:{window_s[1]:g} s holds {inside.size} usable points, at least 3 are"
+            f"the chosen window {window_s[0]:g}:{window_s[1]:g} s contains {inside.size} usable points, at least 3 are"
             f" needed; the track runs from {time_s[0]:g} to {time_s[-1]:g} s"
         )
     window = judge(time_s, position_m, kinematics, int(inside[0]), int(inside[-1]), "user")
@@ -149,12 +149,12 @@ def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
 
 
 def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) -> tuple[int, int, str]:
-    """First and last point between which a window may lie, or why there is none."""
+    """First and last point between which a window may lie, or the reason why there is none."""
     velocity, sigma = kinematics.lead_velocity_m_s, kinematics.lead_velocity_sigma_m_s
-    surely = float(np.max(velocity - 3 * sigma))
-    if velocity.size < 3 or surely <= 0:
+    top_speed = float(np.max(velocity - 3 * sigma))  # a lower limit, so that noise does not raise the gate
+    if velocity.size < 3 or top_speed <= 0:
         return 0, 0, "nothing moves faster than three standard errors of its velocity"
-    moving = velocity > np.maximum(start_fraction * surely, start_sigmas * sigma)
+    moving = velocity > np.maximum(start_fraction * top_speed, start_sigmas * sigma)
     points = np.flatnonzero(moving)
     if points.size < 3:
         return (
@@ -169,10 +169,10 @@ def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) ->
 
 
 def _before_the_end(track: Track, position_m: Floats, first: int, last: int, length_m: float) -> int:
-    """Last point that a window may hold: where growth ended, or is about to, none of its last part."""
+    """Last point that a window may contain: not in the last part of the growth, where that ends or is about to end."""
     grown_m = float(np.max(position_m[first : last + 1])) - float(position_m[0])
-    # The growth has ended where the track says so, or where a vine that moved stands again; a recording that stops with
-    # the motion shows neither, but the vine has no more to grow.
+    # Growth has ended where the track is flagged so, or where a vine that moved is at rest again. A recording that
+    # stops during the motion shows neither, but the length of the vine may show that growth is nearly complete.
     ended = last < position_m.size - 1 or with_flag(track.flag, "after_end").any()
     if grown_m > END_FRACTION * length_m:
         grown_m, ended = max(grown_m, length_m), True
@@ -184,13 +184,13 @@ def _before_the_end(track: Track, position_m: Floats, first: int, last: int, len
 
 
 class _Search:
-    """All windows between two points, judged by cumulative sums."""
+    """Search over all windows between two points, each evaluated in constant time from cumulative sums."""
 
     def __init__(
         self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, drift_limit: float
     ) -> None:
         self.n = time_s.size
-        self.latest = self.n - 1  #: the last point that a window may hold
+        self.latest = self.n - 1  #: the last point that a window may contain
         self.limit = drift_limit
         self.moments = WindowMoments(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation)
         self.width = kinematics.window_points[inside]
@@ -202,7 +202,7 @@ class _Search:
 
     def longest(self) -> tuple[tuple[int, int] | None, str]:
         """First and last point of the longest steady window, or the reason why there is none."""
-        stride = max(1, math.ceil(self.n / STEPS))
+        stride = max(1, math.ceil(self.n / GRID_POINTS))
         edges = np.arange(0, self.n, stride)
         best, score = self._best(edges, np.union1d(edges, [self.n - 1]))
         if best is None:
@@ -257,7 +257,7 @@ class _Search:
             why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
         else:
             band = self.velocity[first[near] : last[near] + 1] / mean[near]
-            why = f"holds speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
+            why = f"contains speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
         return (
             f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest,"
             f" {count} of {self.n} moving points, {why}"
@@ -274,11 +274,11 @@ def _with(window: Window, accepted: bool, reason: str) -> Window:
 
 
 def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, min_points: int = 3) -> Window:
-    """The published rule to the letter: the longest run whose velocities vary by less than 3 %, wherever it is.
+    """Find the window of the published rule: the longest run whose velocities vary by less than 3 %, wherever it is.
 
-    Velocities are central differences of the raw positions, as Physics Tracker computes them; the run holds at
-    least `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`; x_ss is
-    their mean, and its error s/√n, which is what the rule implies and not what the data allow.
+    Velocities are central differences of the raw positions, as Physics Tracker computes them. The run has at least
+    `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`. x_ss is their mean and
+    its error s/√n, as the rule implies, although neighbouring differences are correlated.
 
     Parameters
     ----------
@@ -319,14 +319,14 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
 
 
 def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
-    """First and last index of the longest run with coefficient of variation below the limit; the steadiest of ties.
+    """First and last index of the longest run with coefficient of variation below the limit; the lowest of ties.
 
-    Lengths are tried from the longest down, octave by octave: a run of 2b to 4b values holds an aligned block of b
-    whose own scatter cannot be larger than the whole run's, so that only runs around quiet blocks are looked at.
+    Lengths are tried in descending order, octave by octave. A run of 2b to 4b values contains an aligned block of b
+    values whose squared deviations cannot exceed those of the run, so only runs around quiet blocks are evaluated.
     """
     n = velocity.size
     level = float(np.median(velocity))
-    nothing = 1e-9 * float(np.max(np.abs(velocity)))  # a mean of rounding errors is none: 0/0 is not steady
+    zero = 1e-9 * float(np.max(np.abs(velocity)))  # a mean below this is a rounding error of 0
     total = np.concatenate([[0.0], np.cumsum(velocity - level)])
     square = np.concatenate([[0.0], np.cumsum((velocity - level) ** 2)])
     longest = n
@@ -341,7 +341,7 @@ def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[in
             sums = total[first + length] - total[first]
             spread = np.maximum(square[first + length] - square[first] - sums**2 / length, 0.0) / (length - 1)
             mean = sums / length + level
-            good = np.flatnonzero((spread < (cv_limit * mean) ** 2) & (np.abs(mean) > nothing))
+            good = np.flatnonzero((spread < (cv_limit * mean) ** 2) & (np.abs(mean) > zero))
             if good.size:
                 start = int(first[good[np.argmin(spread[good] / mean[good] ** 2)]])
                 return start, start + length - 1
@@ -350,7 +350,7 @@ def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[in
 
 
 def _near_quiet_blocks(velocity: Floats, block: int, cv_limit: float) -> NDArray[np.int_]:
-    """Starts from which a run of 2 to 4 blocks can reach over a block that is quiet enough for the run.
+    """Starts from which a run of 2 to 4 blocks can contain a block that is quiet enough for the run.
 
     The run's mean m lies within 2·cv·|m| of the block's, and the block's squares sum to no more than 4·block·(cv·m)².
     """

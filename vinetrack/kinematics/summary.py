@@ -1,8 +1,8 @@
-"""One trial from its track to a row of results, and the damping law with the pressure that a fitted model gives.
+"""Analysis of one trial from its track to a row of results, and the damping law under a fitted model.
 
-A chamber that runs down lets the speed sag: no window is then steady with the pressure that was set, or the force in it
-is too large and n and B are wrong. Once the model holds what happens to the pressure, the same tracks give the law
-anew. Windows that no model is asked for are found once, however many models follow.
+As a chamber empties, the speed falls: with the set pressure no window is then steady, or the force in it is too large
+and n and B are biased. Under a model with the effect on the pressure, the same tracks give the law again. Windows that
+do not depend on the model are found once for all models.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_POINTS = 5
-"""Points of a track from which motion is computed: the narrowest window of `vinetrack.kinematics.velocity`, derived."""
+"""Fewest usable points of a track. Derived: the narrowest window of `vinetrack.kinematics.velocity`."""
 
 
 class TrialError(ValueError):
-    """A trial cannot be analysed; the message is a sentence for its `reason`."""
+    """A trial that cannot be analysed; the message is a sentence for its `reason`."""
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """All that is known of one trial: its corrected track, motion, windows by rule, and its rows of results.
+    """Results of one trial: its corrected track, motion, windows by rule, and its rows of results.
 
     `row` has the columns of `trials.csv`, `point` those of the damping fit, with `used` and the `reason` if not.
     """
@@ -60,7 +60,7 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class TrialMotion:
-    """What a track says of a trial whatever the model: its corrected track, motion, release, and windows by rule."""
+    """Model-independent results of a trial: its corrected track, motion, release, and windows by rule."""
 
     trial: Trial
     track: Track
@@ -71,7 +71,7 @@ class TrialMotion:
 
 @dataclass(frozen=True)
 class Steadiness:
-    """Windows by rule under one model, the one whose numbers are reported, and the force in it (None: none)."""
+    """Windows by rule under one model, the chosen one, whose values are reported, and the force in it."""
 
     windows: Mapping[str, Window]
     chosen: Window | None
@@ -79,7 +79,7 @@ class Steadiness:
 
 
 def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMotion:
-    """Velocity, release and the windows that no model is asked for.
+    """Find velocity, release and the windows that do not depend on a model.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
     Raises
     ------
     TrialError
-        If fewer than five points say where the leading edge was.
+        If the track has fewer than five usable points.
     """
     usable = int(track.usable.sum())
     if usable < FEWEST_POINTS:
@@ -109,21 +109,21 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
 
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
-    """The steady window of a trial and the force there, with the pressure along the way that a model gives.
+    """Find the steady window of a trial and the force in it, with the pressure of a model.
 
     Parameters
     ----------
     motion : from `look_at_motion`.
-    model : gives the pressure along the way where none was measured.
+    model : gives the pressure during growth where none was measured.
 
     Returns
     -------
-    all windows, the one chosen (None where no rule finds one), and the force in it.
+    all windows, the chosen one (None where no rule finds one), and the force in it.
 
     Raises
     ------
     EffectError
-        If the model lacks what it needs of the trial.
+        If the trial lacks what an effect of the model needs.
     """
     trial, track, kinematics, release = motion.trial, motion.track, motion.kinematics, motion.release
     windows = dict(motion.windows)
@@ -138,14 +138,14 @@ def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
 
 
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
-    """Velocity, steady windows by every rule, force, final speed and efficiency of one trial.
+    """Compute velocity, steady windows by every rule, force, final speed and efficiency of one trial.
 
     Parameters
     ----------
     trial : as the sheet states it.
     track : its positions.
     settings : of the run.
-    model : the model in use: it gives the pressure in the window where none was measured.
+    model : the model in use; it gives the pressure in the window where none was measured.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
     Raises
     ------
     TrialError
-        If fewer than five points say where the leading edge was, or the model lacks what it needs of the trial.
+        If the track has fewer than five usable points, or the trial lacks what an effect of the model needs.
     """
     motion = look_at_motion(trial, track, settings)
     try:
@@ -183,7 +183,7 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
 
 
 def _growth_m(motion: TrialMotion) -> float:
-    """From release to the furthest usable position, m."""
+    """Growth from release to the furthest usable position, m."""
     position_m = motion.track.lead_position_m[motion.track.usable]
     return float(position_m.max() - motion.release.lead_position_m) if position_m.size else math.nan
 
@@ -212,7 +212,7 @@ def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSe
 
 
 def _chosen(windows: Mapping[str, Window]) -> Window | None:
-    """The window whose numbers are reported: the user's own where there is one, else the first of ours accepted."""
+    """The window whose values are reported: the user's, else the gated, else the quasi-steady one if accepted."""
     for rule in ("user", "gated", "quasi_steady"):
         window = windows.get(rule)
         if window is not None and (window.accepted or rule == "user"):
@@ -243,7 +243,7 @@ def _steady_columns(window: Window | None, paper: Window, force: SteadyForce | N
 
 
 def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, settings: RunSettings) -> dict[str, object]:
-    """Speed at the set fraction of the length, efficiency at the set travel; NaN where growth did not get there."""
+    """Speed at the set fraction of the length, and efficiency at the set growth; NaN where growth did not get there."""
     travel_m = kinematics.lead_position_m - release.lead_position_m
     velocity_m_s = kinematics.lead_velocity_m_s
     if math.isfinite(trial.length_m):
@@ -265,7 +265,7 @@ def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
 
     Returns
     -------
-    a value a column; the unit stands in its name.
+    dict from column, with its unit in the name, to value.
     """
     window, paper, force = steady.chosen, steady.windows["paper"], steady.force
     reason = why_not_in_fit(trial) or why_not_force(force)
@@ -297,9 +297,9 @@ LAW_COLUMNS = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_
 
 @dataclass(frozen=True)
 class DampingLaw:
-    """`points` has a row a trial as `damping_points.csv`, `laws` is `damping.json`.
+    """The damping law under one model: `points` as in `damping_points.csv`, `laws` as in `damping.json`.
 
-    `left_out` gives trials that could not be looked at under the model, and why.
+    `left_out` maps trials that cannot be analysed under the model to the reason.
     """
 
     points: pd.DataFrame
@@ -308,7 +308,7 @@ class DampingLaw:
 
 
 def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings | None = None) -> list[TrialMotion]:
-    """Find velocity, release and windows of every track; trials with too few points are passed over.
+    """Find velocity, release and windows of every track; trials with too few points are skipped.
 
     Parameters
     ----------
@@ -329,11 +329,11 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings 
 
 
 def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings | None = None) -> DampingLaw:
-    """Steady windows and the damping law with the pressure that a model gives.
+    """Find steady windows and the damping law with the pressure of a model.
 
     Parameters
     ----------
-    model : a fitted model (`Fit.model`): its effects on the pressure count with their fitted sizes.
+    model : a fitted model (`Fit.model`), whose effects on the pressure have their fitted sizes.
     motions : from `look_at_motions`.
     settings : of the run; defaults if None.
 
@@ -344,7 +344,7 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
     Raises
     ------
     ValueError
-        If no trial can be looked at under this model.
+        If no trial can be analysed under this model.
     """
     import pandas as pd
 
@@ -357,7 +357,7 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
             left_out[motion.trial.name] = str(error)
     if not rows:
         raise ValueError(
-            f"no trial can be looked at under this model: {'; '.join(left_out.values()) or 'there is none'}"
+            f"no trial can be analysed under this model: {'; '.join(left_out.values()) or 'there is none'}"
         )
     points = mark_left_out(pd.DataFrame(rows))
     laws = fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
@@ -365,11 +365,11 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
 
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Laws under several models as one table: a row a model, method and vine, columns `LAW_COLUMNS`; SI.
+    """Return laws under several models as one table: a row for each model, method and vine, columns `LAW_COLUMNS`; SI.
 
     Parameters
     ----------
-    laws : `DampingLaw.laws`, or `damping.json`, by name of model. A fit that was refused has no row.
+    laws : `DampingLaw.laws`, or the content of `damping.json`, by name of model. A refused fit has no row.
 
     Returns
     -------

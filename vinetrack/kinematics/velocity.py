@@ -1,10 +1,10 @@
 """Velocity of the leading edge by Savitzky–Golay smoothing with a window chosen for each point.
 
-Around every point a cubic is fitted to windows of growing width, centred or to one side. Windows in which the cubic
-does not follow the points (release, the end of growth) are out; among the centred ones the widest is kept whose
-velocity agrees with all narrower ones (Lepski 1991, Theory Probab. Appl. 35:454); and of all windows that agree with
-it the one with the smallest error is used. Wide windows serve plateaus, narrow or one-sided ones the release.
-Position, velocity and acceleration always come from the same fit.
+Around every point a cubic is fitted to windows of increasing width, centred or to one side. Windows in which the cubic
+does not fit the points (release, end of growth) are excluded. Of the centred windows the widest is kept whose velocity
+agrees with all narrower ones (Lepski 1991, Theory Probab. Appl. 35:454); of all windows that agree with it, the one
+with the smallest standard error is used: wide windows on plateaus, narrow or one-sided ones at the release. Position,
+velocity and acceleration always come from the same fit.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from vinetrack.kinematics.windows import WindowFits, fit_all_windows
 from vinetrack.tracks.position_noise import track_noise
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)
-"""Widths tried, in points. Chosen: each about 1.45 times the one before, so that the best width is
-missed by less than a factor of 1.2; at half as many widths by less than 1.45."""
+"""Widths of windows, in points. Chosen: each about 1.45 times the one before, so that the best width is missed by less
+than a factor of 1.2; with half as many widths by less than 1.45."""
 
 SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)
-"""Where the point lies in its window, chosen: 0 in the middle, −1 at its beginning, 1 at its end."""
+"""Positions of the point in its window. Chosen: 0 in the middle, −1 at the beginning, 1 at the end, and halfway."""
 
 MISFIT_LIMITS = {0: np.inf, 1: 12.0, 2: 15.3, 3: 18.0, 4: 20.5}
-"""Largest misfit of a window that follows its points, by number of terms. Derived: χ² exceeded by 5 in
-10 000, and a tenth."""
+"""Largest misfit of a window that fits its points, by number of terms. Derived: χ² with a p-value of 5 in 10 000, and a
+tenth more."""
 
 KINK_GAIN = 2.5
-"""Derived: a kink within five points errs the velocity by 0.7–3.5 times what its residual, taken as noise, would."""
+"""Factor on the misfit, taken as noise, for the error of the velocity where no window fits. Derived: a kink within five
+points causes an error of 0.7 to 3.5 times that."""
 
 TRUSTED_GAIN = 0.5
-"""Chosen: a one-sided window may claim half the error of the centred ones, no less: what bends within its first
-points is beyond what they can tell."""
+"""Least standard error of a one-sided window, relative to that of the centred ones. Chosen: curvature within its first
+points cannot be detected."""
 
 
 Centred = tuple[Indices, Floats, Floats]
@@ -39,20 +40,20 @@ Centred = tuple[Indices, Floats, Floats]
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
-    """Position, velocity and acceleration of the leading edge at the usable points of a track.
+    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track.
 
     Parameters
     ----------
     track : at least two usable points, in order of time.
-    travel_ratio : how many times faster the tail moves than the lead.
+    travel_ratio : ratio of tail speed to lead speed.
     order : order of the polynomial.
-    kappa : how many standard errors two windows may differ by and still agree.
+    kappa : standard errors by which two windows may differ and still agree.
 
     Returns
     -------
     Kinematics
-        `lead_velocity_sigma_m_s` is the standard error that the noise of position, with its correlation, gives the
-        velocity of the window chosen; where no window follows the points, that of their misfit.
+        `lead_velocity_sigma_m_s` is the standard error of the velocity in the window used, from the correlated noise of
+        position; where no window fits the points, from their misfit.
 
     Raises
     ------
@@ -84,9 +85,9 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
 def smooth(
     time_s: Floats, position_m: Floats, noise_m: float, rho: float, *, order: int = 3, kappa: float = 3.0
 ) -> tuple[Floats, Floats, Indices]:
-    """Estimate position, velocity and acceleration at every point, the noise being known.
+    """Estimate position, velocity and acceleration at every point for known noise.
 
-    A window is used only if the next wider one at the same side agrees too: the widest that agrees has just begun to
+    A window is used only if the next wider one at the same position agrees too: the widest that agrees is about to
     disagree, and its bias may be several times its error. Each step in width changes their ratio by 1.45^5.5 = 8.
 
     Parameters
@@ -95,7 +96,7 @@ def smooth(
     noise_m : standard deviation of a position, m.
     rho : correlation of the noise from frame to frame.
     order : of the polynomial.
-    kappa : by how many standard errors two windows may differ and still agree.
+    kappa : standard errors by which two windows may differ and still agree.
 
     Returns
     -------
@@ -106,19 +107,19 @@ def smooth(
     least = min(n, max(WINDOWS[0], order + 2))
     widths = [least, *(width for width in WINDOWS if least < width <= n)]
     fits = [fit_all_windows(time_s, position_m, width, min(order, width - 1), rho) for width in widths]
-    follows = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
+    fits_points = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
-    low, high, centred_error = _agreement(centred, follows, noise_m, kappa)
-    best, window_used, sigma = _narrowest(fits[0], centred[0], follows[0], noise_m)
+    low, high, centred_error = _agreement(centred, fits_points, noise_m, kappa)
+    best, window_used, sigma = _narrowest(fits[0], centred[0], fits_points[0], noise_m)
     fit_used = np.zeros(n, dtype=int)
     for side in SIDES:
         wider_agrees = np.full(n, len(fits) == 1)
         for k in reversed(range(len(fits))):
             window, velocity, gain = centred[k] if side == 0 else fits[k].velocities(time_s, side)
             error = noise_m * gain
-            slack = kappa * error
-            agrees = follows[k][window] & (velocity >= low - slack) & (velocity <= high + slack)
-            better = agrees & wider_agrees & (error < (1 - 1e-6) * best)  # rounding must not decide between two sides
+            tolerance = kappa * error
+            agrees = fits_points[k][window] & (velocity >= low - tolerance) & (velocity <= high + tolerance)
+            better = agrees & wider_agrees & (error < (1 - 1e-6) * best)  # rounding must not decide between sides
             wider_agrees = agrees
             fit_used[better], window_used[better] = k, window[better]
             sigma[better] = best[better] = error[better]
@@ -129,29 +130,29 @@ def smooth(
     return values, np.maximum(sigma, TRUSTED_GAIN * centred_error), np.array(widths)[fit_used]
 
 
-def _narrowest(fit: WindowFits, centred: Centred, follows: Bools, noise_m: float) -> tuple[Floats, Indices, Floats]:
-    """Where nothing wider serves: the narrowest window, its error that of the noise or of its misfit if larger."""
+def _narrowest(fit: WindowFits, centred: Centred, fits_points: Bools, noise_m: float) -> tuple[Floats, Indices, Floats]:
+    """The narrowest window, used where no wider one is; its error is that of the noise, or of its misfit if larger."""
     window, _, gain = centred
-    good = follows[window]
+    good = fits_points[window]
     sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fit.misfit[window]))) * gain
     return np.where(good, sigma, np.inf), window.copy(), sigma
 
 
 def _agreement(
-    centred: list[Centred], follows: list[Bools], noise_m: float, kappa: float
+    centred: list[Centred], fits_points: list[Bools], noise_m: float, kappa: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Velocities on which the centred windows agree, from the narrowest up: lowest, highest, least error; (n,) each.
+    """Range of velocities on which the centred windows agree, from the narrowest up, and the least error; (n,) each.
 
-    Unbounded where not even the narrowest window follows its points: then one-sided windows decide.
+    Unbounded where not even the narrowest window fits its points: then one-sided windows decide.
     """
     n = centred[0][0].size
     low, high = np.full(n, -np.inf), np.full(n, np.inf)
     least_error = np.zeros(n)
-    going = np.ones(n, dtype=bool)
-    for (window, velocity, gain), good in zip(centred, follows, strict=True):
-        reach = kappa * noise_m * gain
-        lower, upper = np.maximum(low, velocity - reach), np.minimum(high, velocity + reach)
-        going &= good[window] & (lower <= upper)
-        low, high = np.where(going, lower, low), np.where(going, upper, high)
-        least_error = np.where(going, noise_m * gain, least_error)
+    all_agree = np.ones(n, dtype=bool)
+    for (window, velocity, gain), good in zip(centred, fits_points, strict=True):
+        half_width = kappa * noise_m * gain
+        lower, upper = np.maximum(low, velocity - half_width), np.minimum(high, velocity + half_width)
+        all_agree &= good[window] & (lower <= upper)
+        low, high = np.where(all_agree, lower, low), np.where(all_agree, upper, high)
+        least_error = np.where(all_agree, noise_m * gain, least_error)
     return low, high, least_error

@@ -1,7 +1,7 @@
-"""Local polynomials: every window of one width along a track, fitted at once.
+"""Local polynomials fitted to all windows of one width along a track at once.
 
-Even spacing is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows that hold a gap or an uneven
-spacing are fitted one by one by least squares of the same order.
+For even spacing the fit is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows with a gap or uneven
+spacing are fitted individually by least squares of the same order.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ EVEN_TOLERANCE = 0.01
 """Spacings within this fraction of their median count as even. Chosen: printed times are rounded."""
 
 MISFIT_TERMS = 4
-"""Further orthogonal polynomials that must be absent from the residuals. Chosen: what a corner or an unseen wave
-leaves."""
+"""Orthogonal polynomials of the next higher orders that are tested in the residuals. Chosen: a kink or an unresolved
+oscillation shows in these."""
 
 
 @dataclass(frozen=True)
 class WindowFits:
-    """Polynomials through all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
+    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
 
-    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,); `covariance` of the coefficients for noise of unit
-    standard deviation, `even_covariance` (order + 1, order + 1), or one for each window of uneven spacing in
-    `odd_covariance` (order + 1, order + 1, m); `odd` (m,) tells which those are. `misfit` (m,) is the sum of squares
-    of the next `misfit_terms` orthogonal polynomials, each divided by its variance for noise of unit variance, m².
+    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,). The covariance of the coefficients for noise of unit
+    standard deviation is `even_covariance` (order + 1, order + 1), and for windows of uneven spacing, marked in `odd`
+    (m,), `odd_covariance` (order + 1, order + 1, m). `misfit` (m,), m², is the sum of squares of the next
+    `misfit_terms` orthogonal polynomials, each divided by its variance for noise of unit variance.
     """
 
     width: int
@@ -66,49 +66,47 @@ class WindowFits:
         return values, np.sqrt(np.maximum(variance, 0.0)) / half
 
     def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
-        """Evaluate, at every point, the window in which it lies at one side.
-
-        The point lies at `side` of its window (−1 beginning, 0 middle, 1 end), or as near as the ends of the track
-        let it.
+        """Evaluate the velocity at every point, from the window in which the point has a given position.
 
         Parameters
         ----------
         time_s : of all points, shape (n,), s.
-        side : −1 beginning, 0 middle, 1 end of the window, or as near as the ends of the track allow.
+        side : position of the point in its window: −1 beginning, 0 middle, 1 end; near the ends of the track the
+            nearest possible.
 
         Returns
         -------
         number of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,).
         """
         n, m = time_s.size, self.coefficients.shape[1]
-        reach = _window_offset(self.width, side)
-        window = np.clip(np.arange(n) - reach, 0, m - 1)
+        offset = _window_offset(self.width, side)
+        window = np.clip(np.arange(n) - offset, 0, m - 1)
         velocity, gain = np.empty(n), np.empty(n)
-        u = 2 * reach / (self.width - 1) - 1
+        u = 2 * offset / (self.width - 1) - 1
         slope = _rows(np.array([u]), self.coefficients.shape[0])[1][:, 0]
-        plain = slice(reach, reach + m)
-        velocity[plain] = slope @ self.coefficients / self.half_s
-        gain[plain] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
-        special = np.ones(n, dtype=bool)
-        special[plain] = self.odd
-        points = np.flatnonzero(special)
+        regular = slice(offset, offset + m)
+        velocity[regular] = slope @ self.coefficients / self.half_s
+        gain[regular] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
+        irregular = np.ones(n, dtype=bool)
+        irregular[regular] = self.odd
+        points = np.flatnonzero(irregular)
         values, gain[points] = self.at(time_s[points], window[points])
         velocity[points] = values[1]
         return window, velocity, gain
 
 
 def _window_offset(width: int, side: float) -> int:
-    """How many points of a window lie before the one at `side`."""
+    """Number of points of a window before the one at `side`."""
     return round((1 + side) / 2 * (width - 1))
 
 
 def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:
-    """Fit a polynomial to every run of `width` neighbouring points.
+    """Fit a polynomial to every window of `width` consecutive points.
 
     Parameters
     ----------
     time_s, position_m : shape (n,), s and m, n ≥ width.
-    width, order : points in a window, and the order of the polynomial, below `width`.
+    width, order : number of points in a window, and order of the polynomial, below `width`.
     rho : lag-one correlation of the noise.
 
     Returns
@@ -125,10 +123,10 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
         u = (time_s[take] - middle[odd, None]) / half[odd, None]
-        uneven_weights, own_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        uneven_weights, uneven_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
         results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
         odd_covariance = np.zeros((order + 1, order + 1, m))
-        odd_covariance[:, :, odd] = own_covariance.transpose(1, 2, 0)
+        odd_covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
     return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
 
@@ -145,11 +143,11 @@ def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
 
 
 def _uneven_windows(time_s: Floats, width: int) -> Bools:
-    """Windows that hold a spacing off the usual one, shape (n − width + 1,)."""
+    """Mask of windows that contain a spacing different from the median, shape (n − width + 1,)."""
     spacing = np.diff(time_s)
-    off = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE
-    crossed = np.concatenate([[0], np.cumsum(off)])
-    return crossed[width - 1 :] > crossed[: crossed.size - width + 1]
+    is_uneven = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE
+    count = np.concatenate([[0], np.cumsum(is_uneven)])
+    return count[width - 1 :] > count[: count.size - width + 1]
 
 
 def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
@@ -162,7 +160,7 @@ def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats
 
 @lru_cache(maxsize=64)
 def _even_design(width: int, order: int) -> tuple[Floats, int]:
-    """The one design of all evenly spaced windows of a width."""
+    """The design shared by all evenly spaced windows of a width."""
     return _solve_design(np.linspace(-1, 1, width)[None, :], order)
 
 
