@@ -51,4 +51,4 @@ def test_vines_that_share_nothing_are_no_family() -> None:
 
 def test_one_vine_or_none_is_said_so() -> None:
     assert fit_scaling(damping({}))["reason"] == "no vine has a damping coefficient"
-    assert "one vine alone" in fit_scaling(damping({"a": law(1.0, 6.0, 50.0)}))["reason"]
+    assert "only one vine" in fit_scaling(damping({"a": law(1.0, 6.0, 50.0)}))["reason"]

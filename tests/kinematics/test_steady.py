@@ -271,7 +271,7 @@ def test_a_window_chosen_by_hand_in_still_frames_is_used_with_a_warning():
 
 def test_a_window_chosen_by_hand_outside_the_track_is_refused_in_words():
     track = ramp(0.0, 3e-5)
-    with pytest.raises(ValueError, match=r"5:6 s holds 0 usable points, at least 3 .* runs from 0 to 0.299 s"):
+    with pytest.raises(ValueError, match=r"5:6 s contains 0 usable points, at least 3 .* runs from 0 to 0.299 s"):
         user_window(track, estimate_kinematics(track, travel_ratio=2), (5.0, 6.0))
 
 

@@ -1,15 +1,15 @@
-"""Area scale: the diameter was measured wrong, or laid flat and taken for round.
+"""Area scale: the diameter is wrong, for example because the flattened tube was measured.
 
 Matters as twice its size on the drive: 1 % of 12 mm is 0.12 mm, 2 % of PA.
 
-    D → (1 + ε) D: A → (1 + ε)² A, λ → (1 + ε) λ, what was of what was measured
+    D → (1 + ε) D: A → (1 + ε)² A, λ → (1 + ε) λ, true from measured
 
 λ follows because it is computed from D.
 
-Easily taken for `pressure_gain`: with a heavy payload, or where λ is weighed, nothing tells them apart. Depletion sees
-the swept volume and does.
+Easily taken for `pressure_gain`: with a heavy payload, or where λ is weighed, nothing tells them apart, except
+depletion, which depends on the swept volume.
 
-Reduce it by measuring the width of the flattened tube: the diameter is 2/π of it; or the blown-up vine with callipers.
+Reduce it by measuring the width of the flattened tube: the diameter is 2/π of it; or the inflated vine with callipers.
 
 Source: the geometry of a tube; Eq. (2) of Alvarez et al. (2025).
 """

@@ -1,7 +1,7 @@
-"""Capstan friction: the tail wraps round the bends that the body has taken, and friction multiplies in each.
+"""Capstan friction: the tail runs around the bends of the body, and friction multiplies its tension in each.
 
 Matters for bends above some 30° in all, not on a straight path. Bends come from the sheet (`bends`), and only those
-that the tip has passed count; without any in the sheet a path that curves evenly is supposed.
+that the tip has passed count; without any in the sheet, a path of constant curvature is assumed.
 
     tail force −C (exp(μ_c φ(y)) − 1), φ the angle the tip has passed
     without bends in the sheet −C (exp(k y) − 1); as printed, a constant −Σ C exp(μ_c φ_i)

@@ -1,11 +1,11 @@
-"""End stop: from some way on the vine runs into something soft: a wall of foam, a cord that tightens, a seam.
+"""End stop: beyond some growth the vine runs into something soft: a wall of foam, a cord that tightens, a seam.
 
 Matters beyond y₀ and not at all before; a stiff one ends the growth before all film is everted.
 
     tail force −k max(0, y − y₀)
 
-k is the stiffness seen by the tail and y₀ the growth at which it begins, the same for all trials. A vine that has come
-to rest against it stays: it is not thrown back.
+k is the stiffness at the tail and y₀ the growth at which it begins, the same for all trials. A vine that has come to
+rest against it stays there: it does not rebound.
 
 Easily taken for `tail_friction`, or for the end of growth where the sheet's length is too large. A trial of another
 length tells them apart: the end of growth moves with the length, a stop in the room does not.
@@ -22,7 +22,7 @@ from vinetrack.effects import Parameter, Worked
 KIND = "physical"
 EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
-    Parameter("k", "k", "N/m", 20.0, bounds=(0.0, 1e6), plausible=(0.0, 1e4), meaning="stiffness seen by the tail"),
+    Parameter("k", "k", "N/m", 20.0, bounds=(0.0, 1e6), plausible=(0.0, 1e4), meaning="stiffness at the tail"),
     Parameter(
         "y_0", "y₀", "m", 0.1, bounds=(1e-3, 1e2), zero=0.1, plausible=(5e-3, 10.0),
         tried=tuple(float(y) for y in np.geomspace(0.02, 2.0, 20)), meaning="growth at which it begins",

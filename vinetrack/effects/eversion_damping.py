@@ -1,4 +1,4 @@
-"""Eversion damping: turning the film inside out costs more the faster it is done.
+"""Eversion damping: everting the film takes more force at higher speed.
 
 Matters always: it sets the steady speed of a fast vine.
 

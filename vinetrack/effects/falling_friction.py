@@ -1,11 +1,11 @@
-"""Falling friction: a friction on the tail that is large at rest and fades with speed, as in stick and slip.
+"""Falling friction: a friction on the tail that is largest at rest and falls with speed, as in stick and slip.
 
 Matters on slow vines, at the start and wherever motion nearly stops: dry film on film holds more than film that slides.
 
     tail force −F_s exp(−(ẋ/v_s)^k), against the motion
 
-F_s is what rest has beyond sliding, v_s the tail speed at which 1/e of it is left; k = 1 fades at once, k = 2 stays at
-first. With F_s above the drive the vine never starts.
+F_s is the friction at rest beyond that of sliding, v_s the tail speed at which it has fallen to 1/e; k = 1 falls from
+rest on, k = 2 is flat at first. With F_s above the drive the vine never starts.
 
 Easily taken for `static_yield` or a smaller n of `eversion_damping`; with v_s far below all speeds it is a
 `latch_release`. Trials at low and at high pressure tell them apart: what falls with speed hardly counts in fast
@@ -32,11 +32,12 @@ PARAMETERS = (
         "F_s", "F_s", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="friction at rest beyond sliding"
     ),
     Parameter(
-        "v_s", "v_s", "m/s", 0.5, bounds=(1e-2, 30.0), zero=0.5, plausible=(0.05, 3.0), meaning="where it fades"
+        "v_s", "v_s", "m/s", 0.5, bounds=(1e-2, 30.0), zero=0.5, plausible=(0.05, 3.0), meaning="speed at which it has "
+        "fallen to 1/e"
     ),
     Parameter(
         "k", "k", "1", 1.0, bounds=(1.0, 2.0), zero=1.0, plausible=(1.0, 2.0), tried=(1.0, 2.0),
-        meaning="1: fades at once; 2: stays at first",
+        meaning="1: falls from rest on; 2: flat at first",
     ),
 )  # fmt: skip
 

@@ -1,14 +1,15 @@
-"""Film mass: the film of a vine weighs more or less than its thickness and density say.
+"""Film mass: the film of a vine weighs more or less than its thickness and density give.
 
 Matters for all that accelerates: film is sold to within 10 % of its thickness, and its density is 1200 kg/m³ unless the
-settings say otherwise, where polyethylene has 920. A light vine starts by its mass, and slows by it as it grows.
+settings say otherwise, where polyethylene has 920. Without payload the mass of film determines how
+a vine starts, and how it slows as the film runs out.
 
-    λ → (1 + ε) λ for each vine, what was of what was computed from thickness, diameter and density
+    λ → (1 + ε) λ for each vine, true from computed with thickness, diameter and density
 
 Easily taken for `time_base` and `area_scale`, which change the mass beside the forces; for `pressure_gain`, which
-changes the forces beside the mass; where several vines differ, for `n_by_vine` and `wall_stretch`. Where one vine was
-filmed with other settings of the camera, a frame rate off by ε/2 or a scale off by −ε in its recordings alone is the
-same thing on the level without a payload, nearly so elsewhere.
+changes the forces beside the mass; where several vines differ, for `n_by_vine` and `wall_stretch`. An error
+of ε/2 in the frame rate or of −ε in the scale of one vine's recordings is equivalent for horizontal growth without a
+payload, and nearly so elsewhere.
 
 Reduce it by weighing a piece of each vine: its mass over its length is λ.
 

@@ -1,17 +1,18 @@
-"""Fold inertia: the fold hands part of the energy of the film it stops back to the tail.
+"""Fold inertia: the fold returns part of the kinetic energy of the film that it stops to the tail.
 
 Matters for every fast vine: the film arrives at the fold at the tail's speed and leaves it at rest. Without this term
-the fold swallows all of that energy; η = 1 is worth a drag coefficient of −133 on every vine of the paper's Table I.
+the fold dissipates all of that energy; η = 1 is equivalent to a drag coefficient of −133 on every vine of the paper's
+Table I.
 
     tail force +η ¼λẋ², with ¼ = (r−1)/(2r)
 
-Film passes the tip at (r−1)ẏ, so the tail loses c = λ(r−1)/r for each metre it travels. A lossless fold keeps
-½m(x)ẋ² but for the work of the other forces: m ẍ = F + ½c ẋ². Between lost (η = 0) and kept (η = 1) lies what a real
-fold does. d(mẋ)/dt = F would add twice as much and create energy.
+Film passes the tip at (r−1)ẏ, so the tail loses c = λ(r−1)/r for each metre it travels. With a lossless fold
+½m(x)ẋ² changes only by the work of the other forces: m ẍ = F + ½c ẋ². A real fold lies between η = 0 (all lost) and
+η = 1 (all returned). d(mẋ)/dt = F would add twice as much and create energy.
 
 Easily taken for a smaller n, and it cancels `air_drag`: the two are one curve on vines of one t/D.
 
-It cannot be reduced but by thinner film or slower growth; a payload that outweighs the film hides it.
+It cannot be reduced except by thinner film or slower growth; a payload heavier than the film makes it negligible.
 
 Source: the balance of energy at a moving fold, as for the falling folded chain: Wong & Yasui (2006), American Journal
 of Physics 74, 490–496.
@@ -23,7 +24,7 @@ KIND = "physical"
 NEEDS = ("thickness_um",)
 EASILY_TAKEN_FOR = ("air_drag", "eversion_damping")
 PARAMETERS = (
-    Parameter("eta", "η", "1", 0.5, bounds=(0.0, 1.0), plausible=(0.0, 1.0), meaning="share of the energy kept"),
+    Parameter("eta", "η", "1", 0.5, bounds=(0.0, 1.0), plausible=(0.0, 1.0), meaning="fraction of the energy returned"),
 )
 
 

@@ -1,14 +1,14 @@
-"""Gas inertia: the gas that fills the vine has to be set in motion, and new gas taken along.
+"""Gas inertia: the gas that fills the vine has to be accelerated, and new gas with it.
 
 Matters early, when everything accelerates, and in wide vines of thin film: the gas of a grown vine weighs 4 to
-10 % of its film. Its pull ½ẏ² stays at constant speed.
+10 % of its film. The force ½ẏ² of new gas remains at constant speed.
 
     tip force −f ρ_gas A (½ẏ² + y ÿ), on the tail −½f ρ_gas A (½ẏ² + y ÿ), by ½ = 1/r
-    y ÿ goes left as mass of the tail: f ¼ρ_gas A y, by ¼ = 1/r²
+    y ÿ becomes added mass of the tail: f ¼ρ_gas A y, by ¼ = 1/r²
 
-ρ_gas = (P + P_atm)/(287 T). f = 1 is a plug of gas as wide as the vine, moving with the leading edge; the core taken up
-by the tail and the profile of the flow change it by some tenths. The floor that the mass of a bare vine comes to at
-the end holds this gas already: it is not counted twice.
+ρ_gas = (P + P_atm)/(287 T). f = 1 is a plug of gas as wide as the vine, moving with the leading edge; the core occupied
+by the tail and the flow profile change it by some tenths. The lower limit of the moving mass without payload already
+includes this gas: it is not counted twice.
 
 Easily taken for `air_drag` or `inlet_loss`, by its ½ẏ². The start of growth, where they are nothing, tells them apart.
 
@@ -26,7 +26,13 @@ NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("air_drag", "inlet_loss")
 PARAMETERS = (
     Parameter(
-        "factor", "f", "1", 1.0, bounds=(0.0, 10.0), plausible=(0.8, 1.2), meaning="share of the gas that moves along"
+        "factor",
+        "f",
+        "1",
+        1.0,
+        bounds=(0.0, 10.0),
+        plausible=(0.8, 1.2),
+        meaning="fraction of the gas that moves along",
     ),
 )
 

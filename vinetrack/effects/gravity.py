@@ -1,19 +1,18 @@
 """Gravity: the weight of tail and payload, along the direction of growth.
 
-Matters with a payload, and on a bare vine as a few per cent of the drive that leave with the mass: a steady speed sags
-by 1–4 % for that alone.
+Matters with a payload. Without one it is a few per cent of the drive and vanishes with the moving mass: the speed falls
+by 1–4 % from that alone.
 
     tail force +m(x) g cosθ
 
-θ is the growth angle from straight down (0 down, 90° horizontal, 180° up) and m(x) what still moves: tail and payload.
-It acts on the tail itself and so counts whole.
+θ is the growth angle from straight down (0 down, 90° horizontal, 180° up) and m(x) the moving mass of tail and payload.
+It acts on the tail itself and so counts in full.
 
 Easily taken for `payload_friction` where cosθ or the payload's mass is wrong.
 
 Reduce it by growing horizontally.
 
-g is known and held, for a falling body too: there it would take up the drag of the air. Where a fall is filmed to
-measure g, free it by name.
+g is known and fixed, for a falling body too, where it would absorb air drag. To measure g from a fall, free it by name.
 
 Source: Alvarez et al. (2025), Eq. (1).
 """

@@ -1,17 +1,18 @@
-"""Growth angle: counted from the level instead of from straight down, so that the weight pulls where it does not.
+"""Growth angle: stated from the horizontal instead of from straight down, so that the weight has the wrong direction.
 
-Matters with a payload: a hanging vine stated as level (90 for 0), or a level one whose blank angle counts as straight
-down, has the whole weight wrong: 0.35 N with 35.6 g, as much as 1.5 kPa on 24 mm.
+Matters with a payload: a hanging vine stated as horizontal (90 for 0), or a horizontal one whose blank angle counts
+as straight down, has the whole weight wrong: 0.35 N with 35.6 g, as much as 1.5 kPa on 24 mm.
 
     tail force +m(x) g f (sinθ − cosθ)
 
-θ is the growth angle as stated and f how much of the slip there is: 1 is level for straight down or straight down for
-level, 2 up for down. In between lies a tilt: 20° from straight down are 0.06, 20° from the level 0.34.
+θ is the growth angle as stated and f the size of the error: 1 is horizontal for straight down or straight down for
+horizontal, 2 up for down. A tilt lies in between: 20° from straight down are 0.06, 20° from the horizontal 0.34.
 
-Easily taken for `payload_friction`, or P_y and B where all trials carry one payload. What tells it from them is the
-film, whose weight leaves as the vine grows: on vines of light film, 0.1 mm on 12 mm, it is too little for that.
+Easily taken for `payload_friction`, or P_y and B where all trials carry one payload. The film, whose weight
+vanishes as the vine grows, tells it from them, except on vines of light film, 0.1 mm on 12 mm.
 
-Measure it with a plumb-line beside the vine, and look at a picture of the rig: straight down is 0, level 90, up 180.
+Measure it with a plumb-line beside the vine, and look at a picture of the rig: straight down is 0, horizontal 90, up
+180.
 
 Source: Alvarez et al. (2025), Eq. (1).
 """
@@ -27,7 +28,7 @@ EASILY_TAKEN_FOR = ("payload_friction", "pressure_gauge")
 PARAMETERS = (
     Parameter(
         "f", "f", "1", 1.0, bounds=(0.0, 2.0), plausible=(0.8, 1.2),
-        meaning="1 where the angle was counted from the level and not from straight down",
+        meaning="1 where the angle was stated from the horizontal and not from straight down",
     ),
 )  # fmt: skip
 

@@ -5,7 +5,7 @@ the yield pressure, old vines, no supply.
 
     P → P e^(−t/τ), t from release
 
-The rate 1/τ is the parameter: no leak is 0, and what it takes off the pressure grows in proportion to it.
+The parameter is the rate 1/τ: it is 0 without a leak, and the loss of pressure is proportional to it.
 
 Easily taken for `reservoir_depletion`, which falls with the volume swept and so, at constant speed, with time as well.
 Growth at two speeds on one chamber tells them apart.
@@ -24,7 +24,9 @@ IN_TRACE = True
 ORDER = 2  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
-    Parameter("rate", "1/τ", "1/s", 0.5, bounds=(0.0, 50.0), plausible=(0.0, 5.0), meaning="share of P lost a second"),
+    Parameter(
+        "rate", "1/τ", "1/s", 0.5, bounds=(0.0, 50.0), plausible=(0.0, 5.0), meaning="fraction of P lost per second"
+    ),
 )
 
 

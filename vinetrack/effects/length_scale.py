@@ -1,12 +1,12 @@
-"""Length scale: millimetres a pixel are wrong by a constant factor.
+"""Length scale: millimetres per pixel are wrong by a constant factor.
 
 Matters always: the target stood before or behind the plane of growth, or its size was misread. One per cent of distance
 to the camera is one per cent of length.
 
-    y → (1 + ε) y, what is reported of what was
+    y → (1 + ε) y, reported from true
 
-Easily taken for an error of B or for drag; together with the frame rate, pressure and B it hides in one loaded trial to
-a fraction of a micrometre. The end of growth at a known length shows it.
+Easily taken for an error of B or for drag; together with errors of frame rate, pressure and B it is undetectable in one
+loaded trial, to a fraction of a micrometre. The end of growth at a known length shows it.
 
 Reduce it with a calibration target in the plane of growth, or a ruler beside the vine.
 
@@ -29,8 +29,8 @@ PARAMETERS = (
         plausible=(-0.1, 0.1),
         meaning="relative error of length",
         slips=(
-            (1.0, "the travel of the tail was taken for that of the edge, or a length of the target was stated twice"),
-            (-0.5, "half of a length of the target was stated"),
+            (1.0, "the travel of the tail was taken for that of the edge, or twice a length of the target was stated"),
+            (-0.5, "half a length of the target was stated"),
             (1.54, "centimetres were taken for inches"),
             (1 / 2.54 - 1, "inches were taken for centimetres"),
         ),

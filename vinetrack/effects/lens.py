@@ -1,14 +1,14 @@
-"""Lens: the picture is drawn in or pushed out towards its edges, as a lens without calibration does.
+"""Lens: radial distortion of a camera whose lens is not calibrated.
 
-Matters for wide lenses and for any camera whose distortion nobody measured: a barrel distortion of 1 % at the edge of a
-picture 0.3 m wide displaces the leading edge there by 1.5 mm (1 % of 150 mm, k₃ = −0.44 1/m²).
+Matters for wide lenses and for any camera whose distortion was not measured: a barrel distortion of 1 % at the edge of
+a picture 0.3 m wide displaces the leading edge there by 1.5 mm (1 % of 150 mm, k₃ = −0.44 1/m²).
 
-    y → y + k₃ ((y − y_c)³ + y_c³), what is reported of what was
+    y → y + k₃ ((y − y_c)³ + y_c³), reported from true
 
 y_c is the position at which the axis of growth passes the middle of the picture. The term y_c³ keeps the position at
 release; the origin is free in every trial anyway.
 
-Easily taken for `latch_release` (the first centimetres are stretched or drawn in) or `perspective`: a change of scale
+Easily taken for `latch_release` (the first centimetres are stretched or compressed) or `perspective`: a change of scale
 along y. A ruler or a checkerboard in the plane of growth tells them apart.
 
 Reduce it by calibrating the camera with a target that fills the picture, or with a longer lens farther away.

@@ -1,4 +1,4 @@
-"""Linear damping: a resistance in proportion to speed, beside the power law of eversion.
+"""Linear damping: a resistance proportional to speed, in addition to the power law of eversion.
 
 Matters where something viscous moves along: a wet or lubricated tail, a grease seal, a roller in its bearing.
 

@@ -1,11 +1,12 @@
-"""Moving average: positions that are means over a stretch of time, not of one instant.
+"""Moving average: positions that are means over an interval of time, not values at one instant.
 
-Matters where positions were smoothed before they were handed in: five frames at 1069 frames/s are 4.7 ms, which rounds
-the release off by up to a millimetre and shows a vine that moves before its release.
+Matters where positions were smoothed beforehand: five frames at 1069 frames/s are 4.7 ms, which rounds the release off
+by up to a millimetre and shows a vine that moves before its release.
 
     y → mean of y from t − T/2 to t + T/2; where the acceleration lasts, y → y + ÿ T²/24
 
-The number is T², by which positions move in proportion: of an average over N frames Δt apart it is (N² − 1) Δt².
+The parameter is T², to which the change of positions is proportional: for an average over N frames Δt apart it is
+(N² − 1) Δt².
 
 Easily taken for `supply_rise` and `latch_release`: the release is rounded off. Positions as they were measured tell
 them apart.

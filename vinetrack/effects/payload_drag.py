@@ -6,7 +6,7 @@ twice as fast, and has to push past it.
     tail force −½ρ_gas (C A_pay) ẏ², with ẏ = ẋ − ẏ the payload's speed through the gas, (r−1)ẏ in general
 
 ρ_gas = (P + P_atm)/(287 T). C·A_pay is drag coefficient times frontal area; in a narrow core C rises far above that of
-free air, for the gas has to squeeze past. Without a payload there is no such force.
+free air, since the gas has to squeeze past. Without a payload there is no such force.
 
 Easily taken for `air_drag`. Trials with and without payload tell them apart.
 

@@ -4,10 +4,10 @@ Matters with a payload, most on a horizontal vine, where the payload's whole wei
 
     tail force −μ_p m_pay g
 
-On a vertical rig nothing presses the payload on the wall but clinging film and crookedness: there μ_p is an effective
+On a vertical rig only clinging film and a crooked path press the payload on the wall: there μ_p is an effective
 coefficient, not that of the materials.
 
-Easily taken for an error of the growth angle (`growth_angle`) or of the payload's mass: both are a force in proportion
+Easily taken for an error of the growth angle (`growth_angle`) or of the payload's mass: both are forces proportional
 to m_pay. Growth upwards and downwards tells it from an angle, which changes sign.
 
 Reduce it with a smooth, round payload of smaller diameter, and powder. Measure it with a spring balance: pull the

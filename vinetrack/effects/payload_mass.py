@@ -1,14 +1,14 @@
-"""Payload mass: what rides in a vine weighs more or less than the sheet says, by the same in each of its loaded trials.
+"""Payload mass: the payload of a vine weighs more or less than stated, by the same amount in each loaded trial.
 
-Matters with a payload, most for a light one: its mount, tape, bolts or cable were not weighed along, or the balance was
-not zeroed. In a vine that runs at a few metres a second most of the mass that moves is payload.
+Matters with a payload, most for a light one: its mount, tape, bolts or cable were not weighed, or the balance was not
+zeroed. In a vine that runs at a few metres a second most of the mass that moves is payload.
 
     m_pay → m_pay + δ in trials with a payload: inertia and weight
 
-Friction of the payload stays that of the mass stated.
+Friction of the payload is that of the stated mass.
 
-Easily taken for `payload_friction`, `growth_angle` or `area_scale`, which change a force beside the payload; where no
-trial is bare, for `film_mass`, and on the level exactly for `reel_inertia`.
+Easily taken for `payload_friction`, `growth_angle` or `area_scale`, which change another force; where every
+trial has a payload, for `film_mass`, and for horizontal growth exactly for `reel_inertia`.
 
 Reduce it by weighing the payload as it is put in, mount and tape included.
 
@@ -30,7 +30,7 @@ PARAMETERS = (
         bounds=(-1.0, 1.0),
         shared="vine",
         plausible=(-0.02, 0.05),
-        meaning="mass of the payload beside what the sheet states",
+        meaning="mass of the payload beyond the stated one",
     ),
 )
 

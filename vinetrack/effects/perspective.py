@@ -1,9 +1,9 @@
-"""Perspective: the plane of growth is tilted to the sensor, so that scale changes along the way.
+"""Perspective: the plane of growth is tilted to the sensor, so that the scale changes along the growth.
 
 Matters for a camera that is not square to the growth: a tilt of 1° seen from 1 m is k = 0.017 1/m, half a millimetre
 at 0.17 m of growth.
 
-    y → y + k y², what is reported of what was
+    y → y + k y², reported from true
 
 k is the sine of the tilt over the distance of the camera; the origin and the scale at release are right.
 

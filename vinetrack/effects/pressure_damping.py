@@ -1,7 +1,7 @@
-"""Pressure damping: the film everts the harder the more it is blown up.
+"""Pressure damping: the damping coefficient grows with pressure.
 
-Matters on campaigns over a wide range of pressure: the pressure stretches the wall and presses the folds together, so
-that B is not one number for a vine.
+Matters in campaigns over a wide range of pressure: pressure stretches the wall and presses the folds together, so that
+a vine does not have one B.
 
     B → B (1 + βP)
 
@@ -11,7 +11,7 @@ show a B that drifts with P; a payload changes the speed at one pressure and tel
 It cannot be reduced; keep to a narrow range of pressure, or fit B at each.
 
 Source: first order of the dependence of B on pressure that a power law leaves out; Blumenschein, Okamura, Hawkes (2017)
-hold the damping independent of pressure.
+take the damping as independent of pressure.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ PARAMETERS = (
         3e-6,
         bounds=(-1e-4, 1e-4),
         plausible=(-1e-5, 1e-5),
-        meaning="relative change of B a pascal",
+        meaning="relative change of B per pascal",
     ),
 )
 

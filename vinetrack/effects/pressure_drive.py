@@ -1,6 +1,6 @@
-"""Pressure drive: the gas pushes the tip on.
+"""Pressure drive: the gas pushes the tip forward.
 
-Matters always: everything else in the model is measured against this term.
+Matters always: it drives the growth, and all other terms are small or large relative to it.
 
     tip force +PA, on the tail +½PA, by ½ = 1/r
 

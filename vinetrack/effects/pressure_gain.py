@@ -1,15 +1,15 @@
-"""Pressure gain: the gauge's scale is wrong, for P and P_y alike.
+"""Pressure gain: the scale of the gauge is wrong, for P and P_y alike.
 
 Matters at every pressure in proportion; pressures rounded to whole psi err by up to 1.5 %.
 
-    P → (1 + ε) P and P_y → (1 + ε) P_y, what was of what was read
+    P → (1 + ε) P and P_y → (1 + ε) P_y, true from read
 
 Easily taken for B together with the time base or the length scale, and for `area_scale`, from which nothing tells it
 apart where the film is weighed.
 
 Reduce it by calibrating the gauge against a column of water or a second gauge.
 
-Source: the linear error of a gauge; PA is all that Eq. (2) of Alvarez et al. (2025) knows of pressure.
+Source: the linear error of a gauge; Eq. (2) of Alvarez et al. (2025) depends on pressure only through PA.
 """
 
 from vinetrack.effects import Parameter, Worked

@@ -1,8 +1,8 @@
-"""Pressure gauge: the gauge that P was read on is off by a constant, and P_y was not read on it.
+"""Pressure gauge: the gauge for P has a constant error, and P_y was not read on it.
 
 Matters most near the yield pressure: 0.5 kPa is a tenth of P − P_y at 8 kPa over 3 kPa.
 
-    P → P + δ, P_y unchanged, what was of what was read
+    P → P + δ, P_y unchanged, true from read
 
 Read on one gauge, δ cancels in P − P_y and nothing changes.
 
@@ -11,7 +11,7 @@ Easily taken for an error of P_y: in the base model P_y − δ is exactly the sa
 Reduce it by zeroing the gauge before each trial, and reading P_y on it too: an error of P_y looks exactly the same, so
 measure that again as well.
 
-Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) knows P − P_y only.
+Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) depends on P − P_y only.
 """
 
 from vinetrack.effects import Parameter, Worked
@@ -20,7 +20,7 @@ KIND = "measurement"
 ORDER = 5  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
-    Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="what the gauge lacks"),
+    Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="true minus read pressure"),
 )
 
 

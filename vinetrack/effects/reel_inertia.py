@@ -1,17 +1,17 @@
-"""Reel inertia: a reel, spool or pulley that the tail turns has to be set in motion with it.
+"""Reel inertia: a reel, spool or pulley that the tail turns has to be accelerated with it.
 
 Matters where everything accelerates, and most on light vines: a reel of 20 g on its rim moves like five times the film
 of a small vine.
 
     M = J/r² moves with the tail, J the reel's moment of inertia, r the radius at which the tail leaves it
 
-It has no weight along the growth. The film still wound up is taken as part of J; that it gets less is left out.
+It has no weight along the growth. The film still on the reel counts as part of J; its decrease is neglected.
 
 Easily taken for `gas_inertia` or `latch_release`: all slow the start. `payload_g` that is too small looks the same on a
 horizontal vine; on a vertical one a payload's weight tells them apart.
 
 Reduce it with a light reel of small radius, or by letting the tail lie loose. Measure it by letting a known weight
-unwind the reel: M is what that weight seems to have beyond its own mass.
+unwind the reel: M is the apparent additional mass of that weight.
 
 Source: rotation about a fixed axis; Hawkes, Blumenschein, Greer, Okamura (2017), Science Robotics 2, eaan3028, store
 the tail on a reel in the base.
@@ -23,7 +23,9 @@ KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("gas_inertia", "latch_release")
 PARAMETERS = (
-    Parameter("M", "M", "kg", 0.01, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="J/r² of what the tail turns"),
+    Parameter(
+        "M", "M", "kg", 0.01, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="J/r² of the reel that the tail turns"
+    ),
 )
 
 

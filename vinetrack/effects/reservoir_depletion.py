@@ -5,13 +5,14 @@ refills the chamber works against it (`supply_refill`).
 
     P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
 
-V₀ is the chamber's volume and A·y what the vine has swept. Boyle's law needs absolute pressure: a volume change of a
-few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a vine of 24 mm × 280 mm, 28 kPa falls
-by 15 % (γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to
-71 %.
+V₀ is the chamber's volume and A·y the volume that the vine has filled. Boyle's law needs absolute pressure: a
+volume change of a few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a vine of 24 mm × 280
+mm, 28 kPa falls by 15 % (γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat);
+7 kPa by 51 to 71 %.
 
-V₀ counts hoses and whatever else is open to the vine. One that is off shows in γ: it is then that of the gas times the
-stated over the true volume, as long as V₀ is much more than is swept. A γ outside of 1 to 1.4 is an error of V₀.
+V₀ includes hoses and all else that is open to the vine. An error of V₀ shows in γ, which is then that of the gas times
+the ratio of stated to true volume, as long as V₀ is much larger than the filled volume. A γ outside 1 to 1.4 is an
+error of V₀.
 
 Easily taken for `tail_friction` in the first half of growth (all along with a reel), or for a `leak` at constant speed.
 Another chamber or another diameter tells them apart.

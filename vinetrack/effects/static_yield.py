@@ -1,7 +1,7 @@
 """Static yield: a vine at rest needs more pressure to start than to go on.
 
-Matters where motion stops, or pressure rises slowly through the threshold: growth goes by fits and starts, stick and
-slip. On a vine released at full pressure it leaves no trace, and these data cannot test it.
+Matters where motion stops, or pressure rises slowly through the threshold: growth is intermittent, by stick and slip.
+On a vine released at full pressure it has no effect, and such data cannot test it.
 
     at rest, eversion starts only above P_s > P_y: tip force −(P_s − P_y)A until it moves
 

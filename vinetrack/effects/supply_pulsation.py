@@ -1,19 +1,19 @@
-"""Supply pulsation: the pressure swings, as behind a pump or a regulator that hunts.
+"""Supply pulsation: the pressure oscillates, as behind a pump or a hunting regulator.
 
-Matters where the swing is slow enough for the vine to follow: at 20 Hz one part in twenty of the pressure moves the
-edge by millimetres, at 100 Hz by tenths.
+Matters where the oscillation is slow enough for the vine to follow: at 20 Hz an amplitude of a twentieth of the
+pressure moves the edge by millimetres, at 100 Hz by tenths of a millimetre.
 
     P → P (1 + a sin(2π f t + φ)), t from release
 
-φ counts as one number for all trials: release is locked to the swing, or the swing begins with the opening. A swing
-that meets each trial at another phase is a deviation of single trials instead.
+φ is shared by all trials: release is locked to the oscillation, or the oscillation begins with the opening. With a
+random phase in each trial it is a deviation of single trials instead.
 
 Easily taken for noise that is correlated, or where less than one period is filmed for `leak` and `reservoir_depletion`.
 A pressure measured beside the inlet shows it, and then takes the place of this effect.
 
 Reduce it with a chamber between pump and vine, ten times the volume that the vine takes. Measure it with a fast gauge.
 
-Source: the first term of a Fourier series; reciprocating pumps and relay-controlled regulators are its usual makers.
+Source: the first term of a Fourier series; reciprocating pumps and relay-controlled regulators are its usual causes.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ IN_TRACE = True
 ORDER = 2  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("leak", "reservoir_depletion")
 PARAMETERS = (
-    Parameter("a", "a", "1", 0.05, bounds=(0.0, 0.9), plausible=(0.0, 0.2), meaning="swing as a part of the pressure"),
+    Parameter("a", "a", "1", 0.05, bounds=(0.0, 0.9), plausible=(0.0, 0.2), meaning="relative amplitude"),
     Parameter(
         "f", "f", "Hz", 20.0, bounds=(1.0, 500.0), zero=20.0, plausible=(5.0, 100.0),
         tried=tuple(float(f) for f in np.geomspace(5.5, 90.0, 13)), meaning="frequency",

@@ -1,14 +1,14 @@
 """Supply refill: a regulator lets gas into the chamber while the growing vine draws it out.
 
 Matters wherever depletion would and a supply is open: with a slow regulator (τ_s of seconds) the pressure falls as in
-a closed chamber, with a fast one (τ_s far below the time of growth) it hardly falls at all. In between it sags early,
-then comes back, which a closed chamber cannot do. It contains `reservoir_depletion`, which rests beside it.
+a closed chamber, with a fast one (τ_s far below the time of growth) it hardly falls at all. In between it falls early
+and then recovers, which a closed chamber cannot do. It contains `reservoir_depletion`, which is inactive beside it.
 
     Ṗ = −γ (P + P_atm) A ẏ / (V₀ + A y) + (P_set − P) / τ_s
 
 The first term is the gas law of `reservoir_depletion` (γ = 1 slow and isothermal, 1.4 fast and adiabatic), the second
-the supply that closes the gap in a time τ_s. τ_s → 0 holds the set pressure: nothing is changed; τ_s → ∞ is the closed
-chamber.
+the supply that closes the gap in a time τ_s. τ_s → 0 keeps the set pressure, so that nothing changes; τ_s → ∞ is the
+closed chamber.
 
 Easily taken for a smaller γ or a larger V₀ of a closed chamber; growth that takes longer than τ_s, or a pressure
 measured on the chamber, tells them apart.

@@ -1,11 +1,11 @@
-"""Supply rise: a valve opens, and the pressure comes up with a time constant instead of at once.
+"""Supply rise: a valve opens, and the pressure rises with a time constant instead of at once.
 
 Matters where growth begins when a valve opens rather than when a latch lets go of a vine under pressure: 6 ms are a
 fifth of the growth of a small vine at 30 kPa.
 
     P → P (1 − e^(−(t/τ_v)^k)), t from the opening of the valve
 
-τ_v = 0 is a pressure that is there at once. k = 1 is a volume that fills through a fixed opening; a valve whose opening
+τ_v = 0 is an immediate rise. k = 1 is a volume that fills through a fixed opening; a valve whose opening
 itself takes time gives an S, k from 2 to 4.
 
 Easily taken for `latch_release`, or a later release: a slow start and a late one look alike on few frames. A pressure

@@ -1,7 +1,7 @@
 """Tail friction: the tail drags along the inside of the body it runs through.
 
 Matters for long vines, above some 30 cm: the length in contact grows with y. With the tail stored behind the base it
-shrinks again in the second half, when the tail runs out; a tail that comes off a reel always fills the body.
+decreases again in the second half, when the tail runs out; a tail that comes off a reel always fills the body.
 
     tail force −(μ_s w) min(y, L − y); with `tail_store: reel` −(μ_s w) y
 
@@ -33,7 +33,7 @@ PARAMETERS = (
         0.5,
         bounds=(0.0, 1e3),
         plausible=(0.0, 10.0),
-        meaning="friction on a metre of tail inside the body",
+        meaning="friction per metre of tail inside the body",
     ),
 )
 

@@ -1,17 +1,17 @@
-"""Tail stretch: tension lengthens tail and wall, so that the leading edge is ahead of where the tail says.
+"""Tail stretch: tension lengthens tail and wall, so that the leading edge is ahead of half the tail travel.
 
-Matters for soft, thin film under a strong drive: 2 to 4 mm on 0.3 m at 28 to 60 kPa. The tail's part is there at once
-on release and fades as the speed grows and the tension falls; the wall's part grows with the everted length.
+Matters for soft, thin film under a strong drive: 2 to 4 mm on 0.3 m at 28 to 60 kPa. The part of the tail is present
+at release and decreases as the speed grows and the tension falls; the part of the wall grows with the everted length.
 
     y → x/2 + ½L(ε − ε₀) + ½y(ε_w − ε), by ½ = 1/r
     ε = T₁/(EπDt) of the tail, ε_w = (PA − T₁)/(EπDt) of the wall, ε₀ that of the tail before release
 
-T₁ is what the forces at the tip leave for the tail; the pressure on the tip less that tension is carried by the wall.
-ε₀ is the same at every instant of a trial and hides in its origin: it is left out here. The parameter is the compliance
-1/E: the stretch is in proportion to it and nothing at 0, so that a score test can start from nothing, and its error is
-even-sided; in E nothing would lie at infinity, where no slope is left. 10 to 50 MPa are 100 to 20 billionths a pascal.
+T₁ is the tension of the tail that balances the forces at the tip; the wall carries the pressure force on the tip minus
+that tension. ε₀ is constant in a trial and part of its origin: it is left out here. The parameter is the compliance
+1/E: the stretch is proportional to it and vanishes at 0, where a score test can start, and its error is symmetric; in E
+no stretch would lie at infinity, where the gradient vanishes. 10 to 50 MPa are 100 to 20 billionths per pascal.
 
-Easily taken for an error of `length_scale`, or of the release time: the wall's part is nearly in proportion to y.
+Easily taken for an error of `length_scale`, or of the release time: the part of the wall is nearly proportional to y.
 
 Reduce it with stiffer or thicker film, or mark the tail and film the mark. Measure E by hanging a weight from a strip
 of the film.

@@ -1,9 +1,9 @@
-"""Time base: the frame rate was not what the sheet says.
+"""Time base: the frame rate was not the stated one.
 
-Matters where the rate was set by hand, read off a container that plays back slowly, or drifts with the camera's
-temperature. Speeds err by as much as the rate.
+Matters where the rate was set by hand, read from a container that plays back slowly, or drifts with the camera's
+temperature. The relative error of speeds is that of the rate.
 
-    t → (1 + ε) t, what is reported of what was
+    t → (1 + ε) t, reported from true
 
 Easily taken for `length_scale` (speed alone cannot tell them apart) or `pressure_gain`; on horizontal vines a gain of
 pressure and B together imitate it. Gravity does not: a falling body measures the rate.
@@ -27,7 +27,7 @@ PARAMETERS = (
         shared="day",
         plausible=(-0.1, 0.1),
         meaning="relative error of time",
-        slips=((1.0, "half of the frame rate was stated"), (-0.5, "twice the frame rate was stated")),
+        slips=((1.0, "half the frame rate was stated"), (-0.5, "twice the frame rate was stated")),
     ),
 )
 

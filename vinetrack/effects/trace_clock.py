@@ -1,11 +1,11 @@
 """Trace clock: the clock of the recorded pressure is ahead of the camera's, or behind it.
 
-Matters where pressure and pictures are recorded by two devices that nothing starts together: at 2 m/s an offset of 3 ms
+Matters where pressure and pictures are recorded by two devices without a common trigger: at 2 m/s an offset of 3 ms
 is 6 mm of growth.
 
-    t → t + δ_t, when what the trace stamps t was measured, on the clock of the camera
+    t → t + δ_t, time of a trace sample stamped t, on the clock of the camera
 
-Only a trial with a pressure measured during growth answers to it.
+Only trials with a pressure recorded during growth depend on it.
 
 Easily taken for `latch_release` where the pressure rises while the vine is filmed: the vine seems to wait. A lamp that
 both devices record tells them apart.

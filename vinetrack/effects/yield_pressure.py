@@ -1,4 +1,4 @@
-"""Yield pressure: the film resists being folded even when that is done slowly.
+"""Yield pressure: the film resists eversion even when that is slow.
 
 Matters near the threshold: at 7 kPa a P_y of 3 kPa takes 43 % of the drive.
 
