@@ -236,7 +236,7 @@ def test_an_error_of_measurement_among_physics_may_be_measured_instead(dragged: 
 def test_where_no_trial_can_be_made_it_says_so(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(dragged[1], Limits(pressure_kPa=(0.5, 1.0), payload_g=(0.0, 0.0)))
     assert found.trials == ()
-    assert found.text.startswith("No trial within the limits can be made and followed.")
+    assert found.text.startswith("No trial within the limits can be made and simulated.")
 
 
 def test_the_same_seed_gives_the_same_advice(dragged: tuple[Pairs, list[Fit]]) -> None:

@@ -3,9 +3,10 @@
     found = next_experiment([fit_with_drag, fit_with_inlet_loss], limits)
     print(found.text)
 
-Every trial within the limits is looked at by sensitivities, the best set of them found by exchange, and what it will
-bring predicted by refitting simulated trials; then the trials are simulated once more, truth and all drawn anew, as a
-check. Where no trials help, or only measurements are in doubt, it says what to measure instead.
+Every condition within the limits is rated by linear theory, and the best set of trials found by exchange. Its
+separation is predicted by refitting simulated trials; as a check, the trials are simulated again with the true
+parameters and all noise drawn anew. Where no trials help, or only measurements are in question, the advice is what to
+measure instead.
 """
 
 from __future__ import annotations
@@ -34,44 +35,46 @@ from vinetrack.planning.simulated_tracks import camera_of, courses
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 
-SEPARATES = 3.0
-"""Standard deviations below which trials are not worth making for the purpose."""
+LEAST_SEPARATION = 3.0
+"""Separation, in standard deviations, below which trials are not recommended. Chosen: the usual three."""
 
-ENOUGH = 8.0
-"""Standard deviations beyond which no more effort, such as a vine that has to be made, is asked for."""
+SUFFICIENT_SEPARATION = 8.0
+"""Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended.
+Chosen."""
 
-MOST_HYPOTHESES = 5
-"""Hypotheses that a design separates at most. Chosen for time: pairs grow with the square."""
+MAX_HYPOTHESES = 5
+"""Most hypotheses that a design separates. Chosen for time: pairs grow with the square."""
 
-NOTHING = "nothing more"
-"""Name of the hypothesis that has no effect which others have not as well."""
+NO_FURTHER_EFFECT = "nothing more"
+"""Name of the hypothesis whose effects all other hypotheses share."""
 
-DRAWS_OBSERVED = {2: 3, 3: 2}
-"""Draws of the check by number of hypotheses, else one: every draw takes as many refits as that number squared."""
+CHECK_DRAWS = {2: 3, 3: 2}
+"""Draws of the check by number of hypotheses, otherwise one: every draw takes as many refits as the square of that
+number. Chosen for time."""
 
-PLAIN = 20.0
-"""Standard deviations beyond which one draw less will do."""
+CLEAR_SEPARATION = 20.0
+"""Separation, in standard deviations, beyond which the check takes one draw less. Chosen for time."""
 
-GAIN = 1.01
-"""Gain in separation for which a trial is exchanged, and new vines tried at most. Chosen for time."""
+LEAST_GAIN = 1.01
+"""Factor by which the worth of a design must exceed that with less effort for it to be considered. Chosen for time."""
 
-MOST_VINES_TRIED = 2
-"""Chosen for time, see above."""
+MAX_VINES_TRIED = 2
+"""New vines that are tried, at most. Chosen for time."""
 
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """What to do next.
+    """The recommended next trials.
 
-    `trials` has an entry a condition: the columns of the sheet that may be chosen (`schema.LIMITED`; NaN where the
-    sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names of what differs from the rig so far.
+    `trials` has an entry for each condition: the columns of the sheet that may be chosen (`schema.LIMITED`; NaN where
+    the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names of what differs from the rig so far.
     Empty where no trials are recommended.
 
-    `separation_sigma` holds, by pair (`"a | b"`), the separation to expect once the trials are made and all are fitted
-    together, in standard deviations: the smaller of what it is if a is true and if b is true, which `if_true_sigma`
-    gives by pair and name. `simulated_sigma` holds mean and standard deviation of what the check by simulation gave, of
-    the smaller again. `alternatives` are the next best sets of trials with their separations. `calibration` says what
-    to measure, where that is needed or would do as well.
+    `separation_sigma` holds, by pair (`"a | b"`), the expected separation once the trials are made and all are fitted
+    together, in standard deviations: the smaller of those if a is true and if b is true, which `if_true_sigma` gives by
+    pair and name. `simulated_sigma` holds the mean and standard deviation of that separation in the check by
+    simulation. `alternatives` are the next best sets of trials with their separations. `calibration` states what to
+    measure, where that is needed or would do as well.
     """
 
     text: str
@@ -83,7 +86,7 @@ class NextExperiment:
     calibration: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it; what is not known is null."""
+        """As `diagnosis.json` holds it; unknown values are null."""
         content: dict[str, Any] = _without_nan(
             {
                 "text": self.text,
@@ -110,33 +113,33 @@ def _without_nan(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Option:
-    """A set of trials (places among the conditions, one a trial) and how −2 ln L should rise; see `expected`."""
+    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `expected`."""
 
     design: tuple[int, ...]
     rises: Floats
 
     @property
-    def between(self) -> Floats:
+    def separations(self) -> Floats:
         return separation(self.rises)
 
     @property
     def worth(self) -> float:
-        return float(worth(self.between[None])[0])
+        return float(worth(self.separations[None])[0])
 
     @property
     def weakest(self) -> float:
-        return min(_by_pair(self.between).values())
+        return min(_by_pair(self.separations).values())
 
 
 def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
-    """What to do to tell hypotheses apart that the same trials fit alike.
+    """Recommend trials that separate hypotheses which fit the same trials equally well.
 
     Parameters
     ----------
     tied : sequence of Fit
         Fits of two hypotheses or more to the same trials, most likely first; of more than five the first five count.
     limits : Limits, optional
-        Within what further trials can be made; what it leaves open follows the trials so far.
+        Within which further trials can be made; what it leaves open is as in the trials so far.
     seed : int
         Of the random numbers of the simulated trials.
 
@@ -147,82 +150,85 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     Raises
     ------
     FitError
-        If there are fewer than two fits, they are not of the same trials, or what they say of further trials cannot be
-        simulated.
+        If there are fewer than two fits, they are not of the same trials, or further trials cannot be simulated.
     """
     limits = limits or Limits()
-    _judge(tied)
-    tied = list(tied)[:MOST_HYPOTHESES]
+    _check_fits(tied)
+    tied = list(tied)[:MAX_HYPOTHESES]
     names = _hypothesis_names(tied)
     if only_measurement(tied):
         advice = calibration_for(list(itertools.combinations(tied, 2)))
-        faults = [name for name in names if name != NOTHING]
+        faults = [name for name in names if name != NO_FURTHER_EFFECT]
         are = "are errors" if len(faults) > 1 else "is an error"
         text = f"Measure before making more trials: {joined(faults)} {are} of measurement. {advice}"
         return NextExperiment(text=text, calibration=advice)
-    bench, sides = _bench(tied, names, limits)
-    options = _options(bench, sides, limits, seed)
+    bench, terms = _feasible_trials(tied, names, limits)
+    options = _options(bench, terms, limits, seed)
     if not options:
         advice = calibration_for(list(itertools.combinations(tied, 2)))
-        return NextExperiment(text=f"No trial within the limits can be made and followed. {advice}", calibration=advice)
-    return _conclude(bench, options, seed)
+        return NextExperiment(
+            text=f"No trial within the limits can be made and simulated. {advice}", calibration=advice
+        )
+    return _recommendation(bench, options, seed)
 
 
-def _judge(tied: Sequence[Fit]) -> None:
+def _check_fits(tied: Sequence[Fit]) -> None:
     if len(tied) < 2:
-        raise FitError("A next experiment needs two hypotheses to tell apart: give the fits of at least two.")
+        raise FitError("A next experiment needs at least two hypotheses to separate: give at least two fits.")
     names = [[trial_data.trial.name for trial_data in fit.predictor.data] for fit in tied]
     if any(others != names[0] for others in names[1:]):
-        raise FitError("The fits to tell apart are not of the same trials: fit all of them to one set.")
+        raise FitError("The fits to separate are not of the same trials: fit all hypotheses to the same trials.")
 
 
 def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
-    """Each hypothesis by the effects that not all of them have, numbered where that is not enough."""
+    """Each hypothesis named by the effects that not all of them have, numbered where that is ambiguous."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
-    names = [" + ".join(name for name in fit.model.names if name not in common) or NOTHING for fit in tied]
+    names = [" + ".join(name for name in fit.model.names if name not in common) or NO_FURTHER_EFFECT for fit in tied]
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
 
 
-def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[RefitTerms]]:
-    """Hypotheses, every condition worth filming, and what a trial of each would answer."""
+def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[RefitTerms]]:
+    """The hypotheses and conditions that can be simulated, and the quadratic forms of −2 ln L of a trial of each."""
     data = tied[0].predictor.data
-    every = conditions([trial_data.trial for trial_data in data], limits)
-    if not every:
+    feasible = conditions([trial_data.trial for trial_data in data], limits)
+    if not feasible:
         return Bench((), (), ()), []
-    cameras = [camera_of(data, condition.like) for condition in every]
-    runs = courses([carry(fit, name, every) for fit, name in zip(tied, names, strict=True)], every, cameras)
-    kept = [
-        (condition, lens, run) for condition, lens, run in zip(every, cameras, runs, strict=True) if run is not None
+    cameras = [camera_of(data, condition.like) for condition in feasible]
+    runs = courses([carry(fit, name, feasible) for fit, name in zip(tied, names, strict=True)], feasible, cameras)
+    usable = [
+        (condition, camera, run)
+        for condition, camera, run in zip(feasible, cameras, runs, strict=True)
+        if run is not None
     ]
-    if not kept:
+    if not usable:
         return Bench((), (), ()), []
-    chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
+    chosen, samplings, growth_courses = (list(column) for column in zip(*usable, strict=True))
     hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
     try:
-        return Bench(hypotheses, chosen, lenses), refit_terms(hypotheses, chosen, lenses, ways)
+        return Bench(hypotheses, chosen, samplings), refit_terms(hypotheses, chosen, samplings, growth_courses)
     except SimulationError as error:
-        raise FitError(f"Further trials cannot be followed by every hypothesis: {error}") from error
+        raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _options(bench: Bench, sides: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
-    """The best set of trials by every effort that gains over the lesser ones, with what to expect of it.
+def _options(bench: Bench, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
+    """The best set of trials for each level of effort that gains over the lower ones, with its expected separation.
 
-    One effort beyond what is enough is looked at, to have something to compare with.
+    One level beyond a sufficient one is computed as well, for comparison.
     """
     options: list[_Option] = []
     before = -math.inf
-    for allowed in _by_effort(bench, sides, limits.trials):
-        if any(option.weakest >= ENOUGH for option in options[:-1]):
+    for allowed in _conditions_by_effort(bench, terms, limits.trials):
+        if any(option.weakest >= SUFFICIENT_SEPARATION for option in options[:-1]):
             break
-        design, predicted = best_design(sides, allowed, limits.trials)
-        if predicted > GAIN * before:
+        design, predicted = best_design(terms, allowed, limits.trials)
+        if predicted > LEAST_GAIN * before:
             before = predicted
             options.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
     return options
 
 
-def _by_effort(bench: Bench, sides: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
-    """Conditions to choose from: on the rig so far, on others too, and with one or another new vine besides."""
+def _conditions_by_effort(bench: Bench, terms: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
+    """Conditions to choose from: with the rig so far, with another rig as well, and with one new vine as well."""
     efforts = np.array([condition.effort for condition in bench.conditions])
     for effort in (SAME_RIG, OTHER_RIG):
         if (efforts == effort).any():
@@ -230,60 +236,67 @@ def _by_effort(bench: Bench, sides: list[RefitTerms], trials: int) -> Iterator[N
     new = np.flatnonzero(efforts == NEW_VINE)
     if new.size:
         vines = np.array([condition.trial.vine for condition in bench.conditions])
-        most = MOST_VINES_TRIED if len(sides) == 2 else 1
-        for vine in best_new_vines(sides, bench.conditions, new, trials, most):
+        most = MAX_VINES_TRIED if len(terms) == 2 else 1
+        for vine in best_new_vines(terms, bench.conditions, new, trials, most):
             yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
-def _by_pair(between: Floats) -> dict[tuple[int, int], float]:
-    """The smaller separation of both directions, by pair."""
-    return {(a, b): float(min(between[a, b], between[b, a])) for a, b in itertools.combinations(range(len(between)), 2)}
+def _by_pair(separations: Floats) -> dict[tuple[int, int], float]:
+    """The smaller separation of the two directions, by pair."""
+    return {
+        (a, b): float(min(separations[a, b], separations[b, a]))
+        for a, b in itertools.combinations(range(len(separations)), 2)
+    }
 
 
-def _choice(options: Sequence[_Option]) -> _Option:
-    """The least effort that is enough, else the best."""
+def _recommended(options: Sequence[_Option]) -> _Option:
+    """The option of least effort that is sufficient, else the best."""
     for option in options:
-        if option.weakest >= ENOUGH:
+        if option.weakest >= SUFFICIENT_SEPARATION:
             return option
     return max(options, key=lambda option: option.worth)
 
 
-def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
-    best = _choice(options)
+def _recommendation(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
+    best = _recommended(options)
     best = _Option(best.design, np.concatenate([best.rises, expected(bench, best.design, [1], seed)]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
-    to_expect = _by_pair(best.between)
-    worth_it = max(to_expect.values()) >= SEPARATES
-    draws = max(DRAWS_OBSERVED.get(len(names), 1) - (min(to_expect.values()) > PLAIN), 1)
-    checked = _checked(observed(bench, best.design, range(draws), seed)) if worth_it else {}
-    left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
-    worth_it = worth_it and len(left) < len(to_expect)
+    expected_sigma = _by_pair(best.separations)
+    worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION
+    draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > CLEAR_SEPARATION), 1)
+    simulated = _simulated_separations(observed(bench, best.design, range(draws), seed)) if worth_it else {}
+    unresolved = [
+        pair
+        for pair, sigma in expected_sigma.items()
+        if min(sigma, simulated.get(pair, (sigma,))[0]) < LEAST_SEPARATION
+    ]
+    worth_it = worth_it and len(unresolved) < len(expected_sigma)
     fits = [hypothesis.fit for hypothesis in bench.hypotheses]
-    advice = calibration_for([(fits[a], fits[b]) for a, b in left or _measured(fits)])
-    sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
-    seen = {_pair(names, place): both for place, both in checked.items()}
+    advice = calibration_for([(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)])
+    sigmas = {_pair_name(names, pair): sigma for pair, sigma in expected_sigma.items()}
+    simulated_by_name = {_pair_name(names, pair): mean_and_sd for pair, mean_and_sd in simulated.items()}
     trials = entries(bench.conditions, best.design)
     if_true = {
-        _pair(names, (a, b)): {names[a]: float(best.between[a, b]), names[b]: float(best.between[b, a])}
-        for a, b in to_expect
+        _pair_name(names, (a, b)): {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
+        for a, b in expected_sigma
     }
     return NextExperiment(
         text=in_words(
             trials,
-            outlook(if_true, seen),
-            [_pair(names, place) for place in left],
+            outlook(if_true, simulated_by_name),
+            [_pair_name(names, pair) for pair in unresolved],
             advice,
             worth_it=worth_it,
-            least=SEPARATES,
+            least=LEAST_SEPARATION,
         ),
         trials=trials if worth_it else (),
         separation_sigma=sigmas,
         if_true_sigma=if_true,
-        simulated_sigma=seen,
+        simulated_sigma=simulated_by_name,
         alternatives=tuple(
             {
                 "trials": [dict(entry) for entry in entries(bench.conditions, option.design)],
-                "separation_sigma": {_pair(names, p): s for p, s in _by_pair(option.between).items()},
+                "separation_sigma": {_pair_name(names, p): s for p, s in _by_pair(option.separations).items()},
             }
             for option in sorted(options, key=lambda ranked: -ranked.worth)
             if option.design != best.design
@@ -292,25 +305,25 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
     )
 
 
-def _measured(fits: Sequence[Fit]) -> list[tuple[int, int]]:
-    """Pairs of which a measurement would decide as well as trials: those with a measurement effect in one of them."""
+def _separable_by_measurement(fits: Sequence[Fit]) -> list[tuple[int, int]]:
+    """Pairs that a measurement would decide as well as trials: those with a measurement effect in only one of them."""
     kinds = [{effect.kind for effect in fit.model} for fit in fits]
     pairs = itertools.combinations(range(len(fits)), 2)
     return [(a, b) for a, b in pairs if "measurement" in kinds[a] ^ kinds[b]]
 
 
-def _checked(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
-    """Mean and standard deviation of the separations observed, by pair, of the direction that separates less."""
+def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
+    """Mean and standard deviation of the simulated separations by pair, in the direction that separates less."""
     sigma = np.sqrt(np.maximum(rises, 0.0))
-    checked = {}
+    simulated = {}
     for a, b in itertools.combinations(range(rises.shape[1]), 2):
-        ways = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
-        ways = [way for way in ways if way.size]
-        if ways:
-            least = min(ways, key=lambda draws: float(np.mean(draws)))
-            checked[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
-    return checked
+        directions = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
+        directions = [draws for draws in directions if draws.size]
+        if directions:
+            least = min(directions, key=lambda draws: float(np.mean(draws)))
+            simulated[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
+    return simulated
 
 
-def _pair(names: Sequence[str], place: tuple[int, int]) -> str:
-    return f"{names[place[0]]} | {names[place[1]]}"
+def _pair_name(names: Sequence[str], pair: tuple[int, int]) -> str:
+    return f"{names[pair[0]]} | {names[pair[1]]}"

@@ -1,7 +1,7 @@
-"""Final speed against payload as a fitted model has it, for the conditions that differ in payload alone.
+"""Final speed against payload as a fitted model predicts it, for conditions that differ only in payload.
 
-The error is that of the fitted numbers, carried on through the model's own derivatives: what a mean of many trials
-would deviate by, not what one trial does.
+The standard error is propagated from the fitted parameters through numerical derivatives of the model: it is that of
+the mean of many trials, without the scatter of single trials.
 """
 
 from __future__ import annotations
@@ -31,28 +31,29 @@ CURVE_COLUMNS = (
     "final_lead_velocity_sigma_m_s",
 )
 PAYLOADS = 25
-"""On each curve, evenly from the least payload to the largest. Chosen for the picture."""
+"""Points on each curve, evenly spaced from the smallest payload to the largest. Chosen for the picture."""
 
-LASTS = 2.0
-"""How many times longer than the longest of its trials a curve's motions are followed. Chosen as a safeguard."""
+TIME_FACTOR = 2.0
+"""Time for which motions are simulated, as a multiple of the longest of their trials. Chosen as a safeguard."""
 
-INSTANTS = 801
-"""Instants of a motion. Derived: linear interpolation then errs by 1e-6 of the growth."""
+N_TIMES = 801
+"""Output times of a motion. Derived: linear interpolation then errs by 1e-6 of the growth."""
 
-MARGIN = 1.05
-"""By how much the instants outlast the arrival: a changed number may delay it. Chosen: fifty times STEP."""
+ARRIVAL_MARGIN = 1.05
+"""Factor by which the output times extend beyond the arrival, which a changed parameter may delay. Chosen: fifty times
+RELATIVE_STEP."""
 
-STEP = 1e-3
-"""Relative change of a number behind its derivative: far above the integrator's error, far below where it bends.
+RELATIVE_STEP = 1e-3
+"""Relative finite-difference step of a parameter: far above the integrator's error, and small enough for linearity.
 Derived: 1000 times the integrator's error."""
 
 
 def payload_curves(fit: Fit, final_at_fraction: float) -> pd.DataFrame:
-    """Final speed of the leading edge along payload, columns `CURVE_COLUMNS`; empty where payloads do not vary.
+    """Final speed of the leading edge against payload, columns `CURVE_COLUMNS`; empty where payloads do not vary.
 
     Parameters
     ----------
-    fit : a fit; its trials say which vines, pressures and payloads there are.
+    fit : a fit; its trials determine which vines, pressures and payloads arrived are.
     final_at_fraction : float
         Fraction of the length at which the speed is taken.
 
@@ -63,43 +64,43 @@ def payload_curves(fit: Fit, final_at_fraction: float) -> pd.DataFrame:
     import pandas as pd
 
     rows: list[tuple[object, ...]] = []
-    for trials, lasts_s in _families(fit):
+    for trials, longest_s in _families(fit):
         at_m = final_at_fraction * trials[0].length_m
-        speed, sigma = speeds_with_error(fit, trials, at_m, lasts_s)
+        speed, sigma = speeds_with_error(fit, trials, at_m, longest_s)
         for trial, v, s in zip(trials, speed, sigma, strict=True):
             rows.append((trial.vine, trial.pressure_Pa / 1e3, 1e3 * trial.payload_kg, 1e3 * at_m, v, s))
     return pd.DataFrame(rows, columns=list(CURVE_COLUMNS))
 
 
 def _families(fit: Fit) -> list[tuple[list[Trial], float]]:
-    """Trials along the payload, for every vine and setting with more than one, and how long they may take, s."""
-    alike: dict[str, list[tuple[float, float, Trial]]] = {}
+    """Trials at evenly spaced payloads for every vine and setting with several, and the longest simulated time, s."""
+    by_setting: dict[str, list[tuple[float, float, Trial]]] = {}
     for fitted in fit.trials:
         trial = fitted.trial
         if math.isfinite(trial.length_m) and trial.pressure_Pa > 0:
-            lasts_s = float(fitted.time_s[-1]) - fitted.release_s
-            alike.setdefault(_but_for_payload(trial), []).append((trial.payload_kg, lasts_s, trial))
+            longest_s = float(fitted.time_s[-1]) - fitted.release_s
+            by_setting.setdefault(_but_for_payload(trial), []).append((trial.payload_kg, longest_s, trial))
     families = []
-    for seen in alike.values():
-        payloads_kg = [load[0] for load in seen]
+    for same_setting in by_setting.values():
+        payloads_kg = [load[0] for load in same_setting]
         low, high = min(payloads_kg), max(payloads_kg)
         if high > low:
-            trials = [replace(seen[0][2], payload_kg=float(kg)) for kg in np.linspace(low, high, PAYLOADS)]
-            families.append((trials, LASTS * max(load[1] for load in seen)))
+            trials = [replace(same_setting[0][2], payload_kg=float(kg)) for kg in np.linspace(low, high, PAYLOADS)]
+            families.append((trials, TIME_FACTOR * max(load[1] for load in same_setting)))
     return families
 
 
 def _but_for_payload(trial: Trial) -> str:
-    """All that a motion depends on but the payload, as text: NaN equals nothing, itself included."""
+    """All settings that a motion depends on except the payload, as text, in which NaN equals NaN."""
     nan = math.nan
     bare = replace(trial, name="", condition="", video=None, track=None, pressure_trace=None, payload_kg=0.0)
     return repr(replace(bare, capture_fps=nan, exposure_s=nan, m_per_px=nan, steady_window_s=None))
 
 
-def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> tuple[Floats, Floats]:
+def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, longest_s: float) -> tuple[Floats, Floats]:
     """Speed of the leading edge at `at_m` of growth and its standard error, m/s, shape (n_trials,) each.
 
-    Trials of one vine. A motion that does not get there has speed 0.
+    A motion that does not reach `at_m` has speed 0.
 
     Parameters
     ----------
@@ -108,8 +109,8 @@ def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: f
         Of one vine.
     at_m : float
         Growth at which the speed is taken, m.
-    lasts_s : float
-        Growth is followed for so long, s.
+    longest_s : float
+        Simulated time, s.
 
     Returns
     -------
@@ -118,58 +119,56 @@ def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: f
     Raises
     ------
     ValueError
-        If the speeds do not depend smoothly on the fitted numbers.
+        If the speeds do not depend smoothly on the fitted parameters.
     """
     vine = trials[0].vine
-    instants = _around_arrival(fit, trials, at_m, lasts_s)
-    middle = _speeds(fit, trials, None, at_m, instants)
-    felt = [i for i, number in enumerate(fit.numbers) if _concerns(number, trials[0])]
-    slopes = np.zeros((len(felt), len(trials)))
-    for row, i in enumerate(felt):
+    times = _output_times(fit, trials, at_m, longest_s)
+    speed = _speeds(fit, trials, None, at_m, times)
+    affecting = [i for i, number in enumerate(fit.numbers) if _applies_to(number, trials[0])]
+    slopes = np.zeros((len(affecting), len(trials)))
+    for row, i in enumerate(affecting):
         number = fit.numbers[i]
-        step = STEP * (abs(number.value) or 1.0)
+        step = RELATIVE_STEP * (abs(number.value) or 1.0)
         up, down = (
-            _speeds(fit, trials, replace(number, value=number.value + sign * step), at_m, instants) for sign in (1, -1)
+            _speeds(fit, trials, replace(number, value=number.value + sign * step), at_m, times) for sign in (1, -1)
         )
         slopes[row] = (up - down) / (2 * step)
-    covariance = np.nan_to_num(np.asarray(fit.covariance, dtype=float)[np.ix_(felt, felt)])
+    covariance = np.nan_to_num(np.asarray(fit.covariance, dtype=float)[np.ix_(affecting, affecting)])
     variance = np.einsum("it,ij,jt->t", slopes, covariance, slopes)
     if not np.isfinite(variance).all():
-        raise ValueError(f"the speeds of {vine} do not depend smoothly on the fitted numbers")
-    return middle, np.sqrt(np.maximum(variance, 0.0))
+        raise ValueError(f"the speeds of {vine} do not depend smoothly on the fitted parameters")
+    return speed, np.sqrt(np.maximum(variance, 0.0))
 
 
-def _concerns(number: Number, trial: Trial) -> bool:
-    """Whether a number is one of this trial's: common to all, of its vine, or of its vine at its stated P_y."""
+def _applies_to(number: Number, trial: Trial) -> bool:
+    """Whether a parameter applies to this trial: common to all, of its vine, or of its vine at its stated P_y."""
     stated = f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"
     return number.vine in ("", trial.vine, stated)
 
 
-def _around_arrival(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> list[Floats]:
-    """For each trial, instants from release to a little after it gets to `at_m`; to the end where it does not."""
-    whole = [lasts_s * np.linspace(0, 1, INSTANTS)] * len(trials)
+def _output_times(fit: Fit, trials: Sequence[Trial], at_m: float, longest_s: float) -> list[Floats]:
+    """For each trial, output times from release to just after it reaches `at_m`, or to the end where it does not."""
+    whole = [longest_s * np.linspace(0, 1, N_TIMES)] * len(trials)
     ends = []
     for run in _runs(fit, trials, None, whole):
-        there = np.flatnonzero(run.lead_position_m >= at_m)
-        ends.append(run.time_s[there[0]] if there.size else lasts_s)
-    return [MARGIN * end_s * np.linspace(0, 1, INSTANTS) for end_s in ends]
+        arrived = np.flatnonzero(run.lead_position_m >= at_m)
+        ends.append(run.time_s[arrived[0]] if arrived.size else longest_s)
+    return [ARRIVAL_MARGIN * end_s * np.linspace(0, 1, N_TIMES) for end_s in ends]
 
 
-def _speeds(
-    fit: Fit, trials: Sequence[Trial], changed: Number | None, at_m: float, instants: Sequence[Floats]
-) -> Floats:
-    runs = _runs(fit, trials, changed, instants)
+def _speeds(fit: Fit, trials: Sequence[Trial], changed: Number | None, at_m: float, times: Sequence[Floats]) -> Floats:
+    runs = _runs(fit, trials, changed, times)
     speeds = [lead_velocity_at(run.lead_position_m, run.lead_velocity_m_s, at_m) for run in runs]
     return np.nan_to_num(np.array(speeds))
 
 
-def _runs(fit: Fit, trials: Sequence[Trial], changed: Number | None, instants: Sequence[Floats]) -> list[Trajectory]:
-    """Motions with the fitted numbers, but for one that was changed."""
+def _runs(fit: Fit, trials: Sequence[Trial], changed: Number | None, times: Sequence[Floats]) -> list[Trajectory]:
+    """Motions with the fitted parameters, one of them possibly changed."""
     theta = np.tile(fit.model.parameters_of(trials[0]), (len(trials), 1))
-    moved = list(trials)
+    changed_trials = list(trials)
     for number in (*fit.numbers, *([changed] if changed is not None else [])):
-        if number.key == YIELD_PRESSURE and _concerns(number, trials[0]):
-            moved = [replace(trial, yield_pressure_Pa=number.value) for trial in moved]
+        if number.key == YIELD_PRESSURE and _applies_to(number, trials[0]):
+            changed_trials = [replace(trial, yield_pressure_Pa=number.value) for trial in changed_trials]
     if changed is not None and changed.key != YIELD_PRESSURE:
         theta[:, fit.model.parameter_names.index(changed.key)] = changed.value
-    return simulate_many(fit.model, moved, instants, parameters=theta)
+    return simulate_many(fit.model, changed_trials, times, parameters=theta)
