@@ -27,7 +27,7 @@ from vinetrack.diagnosis.linear_power import effect_power, typical_shape_index
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials
 from vinetrack.diagnosis.score_test import scores_of
-from vinetrack.diagnosis.shape_products import blocks_of
+from vinetrack.diagnosis.shape_products import products_without_trial_effects
 from vinetrack.dynamics.model import Value
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING
@@ -277,15 +277,15 @@ def _tests_of(design: CampaignDesign, added: Sequence[Condition], candidates: tu
 def _products_by_trial(tests: MisfitTests, effect: str) -> Floats:
     """Cross products of each trial: free parameters, shared systematic errors and the effect, in this order."""
     fit, products, problem = tests.fit, tests.products, tests.fit.solution.problem
-    blocks = blocks_of(fit, products, fit.state)
+    blocks = products_without_trial_effects(fit, products, fit.state)
     keys, free, n = products.n_keys, problem.prior_mean.size, len(blocks)
     shape = keys + 1 + typical_shape_index(tests, effect)
     systematics = np.arange(keys + 1 + products.n_shapes, blocks.shape[1])
     columns = np.concatenate([np.arange(keys), systematics, [shape]])
     selected = blocks[:, columns[:, None], columns]
-    size = free + products.n_doubts + 1
+    size = free + products.n_systematics + 1
     # Unknowns that a trial does not depend on are collected in a last row and column, which is dropped.
-    of_systematics = np.where(products.places < products.n_doubts, free + products.places, size)
+    of_systematics = np.where(products.places < products.n_systematics, free + products.places, size)
     of_effect = np.full((n, 1), size - 1)
     index = np.concatenate([np.where(problem.index < 0, size, problem.index), of_systematics, of_effect], axis=1)
     aligned = np.zeros((n, size + 1, size + 1))
@@ -296,7 +296,7 @@ def _products_by_trial(tests: MisfitTests, effect: str) -> Floats:
 def _prior_precision(tests: MisfitTests) -> Floats:
     """Prior precision of the same unknowns: systematic errors have standard deviation 1."""
     free = tests.fit.solution.problem.prior_precision
-    return np.diag(np.concatenate([np.maximum(free, NOMINAL_PRECISION), np.ones(tests.products.n_doubts), [0.0]]))
+    return np.diag(np.concatenate([np.maximum(free, NOMINAL_PRECISION), np.ones(tests.products.n_systematics), [0.0]]))
 
 
 def _effect_information(totals: Floats) -> Floats:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.shape_products import Products, blocks_of
+from vinetrack.diagnosis.shape_products import Products, products_without_trial_effects
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     LEAST_BETWEEN_TRIAL_SD,
@@ -98,8 +98,8 @@ class Projection:
     """Shapes and systematic errors with the trial effects eliminated and the free parameters projected off.
 
     `blocks`, shape (n_trials, q, q), are cross products of keys, residual, shapes, and the systematic errors to which
-    each trial responds. `lever`, shape (n_free, n_asked), is I_θθ⁻¹ I_θs, `step`, shape (n_free,), the Newton step of
-    the free parameters, and `estimated` their indices, without those at a bound. `score`, shape (n_asked,), and
+    each trial responds. `lever`, shape (n_free, n_tested), is I_θθ⁻¹ I_θs, `step`, shape (n_free,), the Newton step of
+    the free parameters, and `estimated` their indices, without those at a bound. `score`, shape (n_tested,), and
     `information`, squared, are what remains of shapes and systematic errors; `empty` marks those without information.
     """
 
@@ -125,9 +125,9 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     Projection
     """
     problem = fit.solution.problem
-    p, size, asked = products.n_keys, problem.prior_mean.size, products.n_asked
+    p, size, asked = products.n_keys, problem.prior_mean.size, products.n_tested
     X, r, C = slice(0, p), p, slice(p + 1, None)
-    blocks, places = blocks_of(fit, products, state), products.asked
+    blocks, places = products_without_trial_effects(fit, products, state), products.tested_indices
     hessian = sum_matrix_blocks(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
     gradient = sum_vector_blocks(blocks[:, X, r], problem) - problem.prior_precision * (
         state.theta - problem.prior_mean
@@ -193,7 +193,7 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
     Scores
     """
     projection = projected(fit, products, state or fit.state)
-    blocks, index, asked = projection.blocks, fit.solution.problem.index, products.asked
+    blocks, index, asked = projection.blocks, fit.solution.problem.index, products.tested_indices
     p, n_shapes = products.n_keys, products.n_shapes
     X, r, C, S = slice(0, p), p, slice(p + 1, None), slice(p + 1, p + 1 + n_shapes)
     M = _marginalisation(projection.information, n_shapes)
@@ -239,10 +239,10 @@ def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float,
     array, shape (n_spreads, n_shapes)
     """
     state, size, p = fit.state, fit.solution.problem.prior_mean.size, products.n_keys
-    problem = with_shapes(fit.solution.problem, products.n_asked)
+    problem = with_shapes(fit.solution.problem, products.n_tested)
     total = problem.prior_mean.size
     keys = fit.solution.problem.index
-    index = np.concatenate([np.where(keys < 0, total, keys), size + products.asked], axis=1)
+    index = np.concatenate([np.where(keys < 0, total, keys), size + products.tested_indices], axis=1)
     problem = replace(problem, index=index)
     whole, squares, levers = np.zeros((total, total)), [], []
     for part in products.parts:
@@ -297,7 +297,7 @@ def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDAr
 
 
 def _marginalisation(information: Floats, n_shapes: int) -> Floats:
-    """Matrix that integrates systematic errors of standard deviation 1 out, shape (n_asked, n_shapes).
+    """Matrix that integrates systematic errors of standard deviation 1 out, shape (n_tested, n_shapes).
 
     Applied to the columns of shapes and systematic errors, it gives those of the shapes with the errors integrated out.
     """

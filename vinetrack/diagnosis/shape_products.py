@@ -1,6 +1,6 @@
-"""Columns of a fit, of candidates and of systematic errors, and the sums of their products by trial.
+"""Columns of a fit, of candidates and of systematic errors, and their cross products by trial.
 
-In order: a trial's own numbers, the keys of the fit, the residual, shapes of candidates, systematic errors ("doubts").
+In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic errors.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import all_products
 
 TRIALS_AT_ONCE = 64
-"""Trials whose products of all shapes are held at once, each of half a megabyte. Chosen for memory; no result depends
-on it."""
+"""Trials whose cross products are held at once, each of half a megabyte. Chosen for memory; no result depends on it."""
 
 
 @dataclass(frozen=True)
 class Products:
-    """Columns of a fit and of answers, shape (n_points, n_columns) a trial, and the sums of their products.
+    """Columns of a fit, of candidate shapes and of systematic errors, shape (n_points, n_columns) a trial.
 
-    In order: own numbers, keys, residual, shapes, doubts. Of doubts a trial has those that it feels; `places`, shape
-    (n_trials, n_columns), tells which of the `n_doubts` they are, `n_doubts` for none.
+    In this order: trial effects, keys, residual, shapes, systematic errors. A trial has columns only for the systematic
+    errors that affect it; `places`, shape (n_trials, n_affecting), holds their indices among the `n_systematics`, and
+    `n_systematics` for none.
     """
 
     columns: tuple[Floats, ...]
@@ -40,31 +40,31 @@ class Products:
     n_keys: int
     n_shapes: int
     places: NDArray[np.int_]
-    n_doubts: int = 0
+    n_systematics: int = 0
 
     @property
-    def n_asked(self) -> int:
-        """Shapes and doubts of the campaign."""
-        return self.n_shapes + self.n_doubts
+    def n_tested(self) -> int:
+        """Number of shapes and systematic errors of the campaign."""
+        return self.n_shapes + self.n_systematics
 
     @property
-    def asked(self) -> NDArray[np.int_]:
-        """Place of each trial's shapes and doubts among all of them, shape (n_trials, n_shapes + n_columns).
+    def tested_indices(self) -> NDArray[np.int_]:
+        """Indices of each trial's shapes and systematic errors among all, shape (n_trials, n_shapes + n_affecting).
 
-        `n_asked` where a trial does not feel a doubt.
+        `n_tested` for a systematic error that does not affect a trial.
         """
         shapes = np.tile(np.arange(self.n_shapes), (len(self.columns), 1))
         return np.concatenate([shapes, self.n_shapes + self.places], axis=1)
 
     @cached_property
     def parts(self) -> list[slice]:
-        """The trials in parts whose products are held at once."""
+        """Slices of the trials whose cross products are held at once."""
         return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
 
     def cross_products(self, part: slice) -> Floats:
-        """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
+        """Cross products of a part of the trials, see `whitening`.
 
-        Kept where there is one part; those of more would be three times as large as the columns.
+        They are cached where there is only one part; those of several would be three times as large as the columns.
 
         Parameters
         ----------
@@ -74,14 +74,14 @@ class Products:
         -------
         array, shape (n_trials, 3, n_columns, n_columns)
         """
-        return self._whole if len(self.parts) == 1 else self._of(part)
+        return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 
     def of(self, places: Sequence[int]) -> Products:
-        """The same of some of the trials, some of them several times.
+        """The same for some of the trials, which may be repeated.
 
         Parameters
         ----------
-        places : of the trials, in their new order.
+        places : indices of the trials, in their new order.
 
         Returns
         -------
@@ -91,10 +91,10 @@ class Products:
         return replace(self, columns=columns, data=data, places=self.places[list(places)])
 
     @cached_property
-    def _whole(self) -> Floats:
-        return self._of(self.parts[0])
+    def _all_cross_products(self) -> Floats:
+        return self._cross_products_of(self.parts[0])
 
-    def _of(self, part: slice) -> Floats:
+    def _cross_products_of(self, part: slice) -> Floats:
         data = self.data[part]
         first = [trial_data.first for trial_data in data]
         relative = [trial_data.relative_sd for trial_data in data]
@@ -102,16 +102,16 @@ class Products:
 
 
 def fit_columns(fit: Fit) -> list[Floats]:
-    """Columns of a fit's own numbers and residual, with derivatives as those of the candidates are taken.
+    """Columns of a fit's trial effects, parameters and residual, with the same derivatives as those of the candidates.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit under test.
 
     Returns
     -------
     list of arrays, shape (n_points, 4 + n_keys + 1)
-        As `Predictor.linearise`, past the end of growth.
+        As `Predictor.linearise`, also past the end of growth.
     """
     state = fit.solution.state
     try:
@@ -122,56 +122,56 @@ def fit_columns(fit: Fit) -> list[Floats]:
 
 
 def products_of(
-    fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Systematics
+    fit: Fit, columns: Sequence[Floats], sensitivities: EffectSensitivities, systematics: Systematics
 ) -> Products:
-    """All that the tests need the products of.
+    """Assemble the columns of a fit, of the candidates and of the systematic errors.
 
-    The columns of `answers` are views of those made here from then on, so that no trial's are held twice.
+    Afterwards the columns of `sensitivities` are views of those made here, so that no trial's are held twice.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit under test.
     columns : its own, from `fit_columns`.
-    answers : how positions answer to the candidates.
+    sensitivities : of positions to the candidates.
     systematics : Systematics
-        What trials err by together.
+        Shared systematic errors.
 
     Returns
     -------
     Products
     """
-    keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(answers.shapes)
+    keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(sensitivities.shapes)
     of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
     whole: list[Floats] = []
     for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
-        whole.append(np.column_stack([of_fit, answers.columns[i], systematic]))
-        answers.columns[i] = whole[-1][:, of_shapes]
+        whole.append(np.column_stack([of_fit, sensitivities.columns[i], systematic]))
+        sensitivities.columns[i] = whole[-1][:, of_shapes]
     return Products(tuple(whole), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
 
 
-def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
-    """Products of keys, residual, shapes and systematic errors of every trial, its own numbers integrated out.
+def products_without_trial_effects(fit: Fit, products: Products, state: FitState) -> Floats:
+    """Cross products of keys, residual, shapes and systematic errors of every trial, its trial effects integrated out.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    sums : from `products_of`.
-    state : noise and spreads.
+    fit : the fit under test.
+    products : from `products_of`.
+    state : noise and between-trial standard deviations.
 
     Returns
     -------
-    array, shape (n_trials, n_keys + 1 + n_shapes + n_columns, the same again)
+    array, shape (n_trials, n_keys + 1 + n_shapes + n_affecting, the same again)
     """
-    size = sums.columns[0].shape[1] - N_TRIAL_EFFECTS
-    blocks = np.empty((len(sums.columns), size, size))
-    for part in sums.parts:
+    size = products.columns[0].shape[1] - N_TRIAL_EFFECTS
+    blocks = np.empty((len(products.columns), size, size))
+    for part in products.parts:
         of_part = _of_trials(fit.solution.problem, state, part)
-        blocks[part] = trial_effects_eliminated(sums.cross_products(part), sums.n_keys, *of_part)
+        blocks[part] = trial_effects_eliminated(products.cross_products(part), products.n_keys, *of_part)
     return blocks
 
 
 def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
-    """Problem and state of a part of the trials."""
+    """Problem and state restricted to a part of the trials."""
     arrays = (
         "index",
         "has_deviation",
