@@ -42,7 +42,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
     return [(one.stated, one.track) for one in grow(trials, nature)]
 
 
-def tested_indices(pairs: Pairs) -> MisfitTests:
+def asked(pairs: Pairs) -> MisfitTests:
     model = vt.base_model()
     candidates = candidates_of(model, None, None)
     found = fit(model, pairs, host=host_for(model, candidates), profile=False)

@@ -1,4 +1,4 @@
-"""Values of single trials held against a condition: a straight line, groups, and the scatter of replicates."""
+"""Tests of whether per-trial estimates of a parameter vary with a condition: linear trend and differences."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates
 
 FEWEST_DEGREES = 2
-"""Replicates beyond the first of their condition that can say how values scatter; else the line's own residuals do.
-Chosen: two degrees of freedom know a scatter to a factor of two, which Student's t allows for."""
+"""Degrees of freedom of replicates from which they determine the scatter of estimates; with fewer, the residuals of the
+trend do. Chosen: two degrees of freedom determine a scatter to a factor of two, which Student's t allows for."""
 
 
 LEAST_SCATTER = 0.1
-"""Of the likely scatter of pressure and B: that replicates agree better is taken for chance. Chosen: a tenth of a
-usual scatter; with few replicates chance agreement would make any trend significant."""
+"""Least scatter of replicates, as part of the expected scatter of pressure and B; closer agreement counts as chance.
+Chosen: a tenth of a usual scatter; with few replicates chance agreement would make any trend significant."""
 
 
 @dataclass(frozen=True)
-class Against:
-    """A condition that a parameter should not know: attribute of a trial, and how it is shown."""
+class Covariate:
+    """A condition on which a parameter should not depend: the attribute of a trial, and how it is displayed."""
 
     column: str
-    words: str
+    label: str
     unit: str
     factor: float
     logarithmic: bool
 
     def level(self, trial: Trial) -> float:
-        """The nominal value of a trial, SI.
+        """The nominal value for a trial, SI.
 
         Parameters
         ----------
@@ -45,8 +45,8 @@ class Against:
         """
         return float(getattr(trial, self.column))
 
-    def along(self, levels: Floats) -> Floats:
-        """The coordinate a drift is a straight line in.
+    def coordinate(self, levels: Floats) -> Floats:
+        """The coordinate in which a trend is linear.
 
         Parameters
         ----------
@@ -58,7 +58,7 @@ class Against:
         """
         return np.log(levels) if self.logarithmic and np.all(levels > 0) else levels
 
-    def shown(self, level: float) -> str:
+    def formatted(self, level: float) -> str:
         """A level with its unit.
 
         Parameters
@@ -72,18 +72,22 @@ class Against:
         return f"{level * self.factor:.3g} {self.unit}"
 
 
-CONDITIONS = (
-    Against("pressure_Pa", "pressure", "kPa", 1e-3, True),
-    Against("payload_kg", "payload", "g", 1e3, False),
-    Against("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
-    Against("chamber_m3", "chamber volume", "l", 1e3, True),
-    Against("inlet_m", "inlet", "mm", 1e3, True),
+COVARIATES = (
+    Covariate("pressure_Pa", "pressure", "kPa", 1e-3, True),
+    Covariate("payload_kg", "payload", "g", 1e3, False),
+    Covariate("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
+    Covariate("chamber_m3", "chamber volume", "l", 1e3, True),
+    Covariate("inlet_m", "inlet", "mm", 1e3, True),
 )
 
 
 @dataclass(frozen=True)
-class Sums:
-    """Weighted deviations about the means of their blocks, and the scatter they are judged by."""
+class BlockedDeviations:
+    """Deviations of coordinate x and estimate d from the weighted means of their block, and the scatter of replicates.
+
+    `variance` is that scatter relative to the estimates' own variances, with `dof` degrees of freedom; `chi2` is the
+    sum of squares between groups, with `groups` degrees of freedom.
+    """
 
     x: Floats
     d: Floats
@@ -94,22 +98,24 @@ class Sums:
     groups: int
 
 
-def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]) -> Sums | None:
-    """Deviations about the mean of each vine (or of all), and the scatter of replicates; None without any to tell.
+def blocked_deviations(
+    estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]
+) -> BlockedDeviations | None:
+    """Deviations from the mean of each vine (or of all), and the scatter of replicates; None without enough trials.
 
     Parameters
     ----------
     estimates : values of one parameter by trial.
     x : array, shape (n_trials,)
-        Coordinate of a drift.
+        Coordinate of a trend.
     levels : array, shape (n_trials,)
-        Values that make the groups.
+        Values that define the groups.
     chosen : array of bool, shape (n_trials,)
         Trials that are tested.
 
     Returns
     -------
-    Sums or None
+    BlockedDeviations or None
     """
     conditions = np.array([trial.condition for trial in estimates.trials])
     blocks = (
@@ -118,10 +124,10 @@ def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDA
         else np.full(len(estimates.trials), "")
     )
     weight = 1 / estimates.variance
-    spread = np.zeros(len(estimates.trials))
+    from_replicates = np.zeros(len(estimates.trials))
     for condition in dict.fromkeys(conditions[np.isfinite(estimates.deviation)]):
         k = np.flatnonzero((conditions == condition) & np.isfinite(estimates.deviation))
-        spread[k] = estimates.deviation[k] - np.average(estimates.deviation[k], weights=weight[k])
+        from_replicates[k] = estimates.deviation[k] - np.average(estimates.deviation[k], weights=weight[k])
     known = np.isfinite(estimates.deviation)
     dof = int(known.sum()) - len(set(conditions[known]))
     xs, ds = x[chosen].copy(), estimates.deviation[chosen].copy()
@@ -133,27 +139,27 @@ def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDA
     if not np.sum(w * xs**2) > 0:
         return None
     if dof >= FEWEST_DEGREES:
-        variance = float(np.sum(weight[known] * spread[known] ** 2)) / dof
+        variance = float(np.sum(weight[known] * from_replicates[known] ** 2)) / dof
     else:
         dof = ds.size - len(set(block)) - 1
         if dof < FEWEST_DEGREES:
             return None
-        left = ds - xs * np.sum(w * xs * ds) / np.sum(w * xs**2)
-        variance = float(np.sum(w * left**2)) / dof
+        residual = ds - xs * np.sum(w * xs * ds) / np.sum(w * xs**2)
+        variance = float(np.sum(w * residual**2)) / dof
     pairs = list(dict.fromkeys(zip(block, levels[chosen], strict=True)))
     chi2 = 0.0
     for name, level in pairs:
         k = (block == name) & (levels[chosen] == level)
         chi2 += float(np.sum(w[k]) * np.average(ds[k], weights=w[k]) ** 2)
-    return Sums(xs, ds, w, max(variance, LEAST_SCATTER**2), dof, chi2, len(pairs) - len(set(block)))
+    return BlockedDeviations(xs, ds, w, max(variance, LEAST_SCATTER**2), dof, chi2, len(pairs) - len(set(block)))
 
 
-def constancy(sums: Sums) -> tuple[float, float]:
-    """How likely chance is to make groups differ so much, and that as a normal deviate.
+def constancy_p_value(deviations: BlockedDeviations) -> tuple[float, float]:
+    """F test of whether the groups have the same mean: its p-value, and that as a normal deviate.
 
     Parameters
     ----------
-    sums : from `sums_of`.
+    deviations : from `blocked_deviations`.
 
     Returns
     -------
@@ -161,14 +167,14 @@ def constancy(sums: Sums) -> tuple[float, float]:
     """
     from scipy.stats import f as fisher
 
-    if sums.groups < 1:
+    if deviations.groups < 1:
         return 1.0, 0.0
-    p = float(fisher.sf(sums.chi2 / sums.groups / sums.variance, sums.groups, sums.dof))
-    return p, as_deviate(p)
+    p = float(fisher.sf(deviations.chi2 / deviations.groups / deviations.variance, deviations.groups, deviations.dof))
+    return p, normal_deviate(p)
 
 
-def as_deviate(p: float) -> float:
-    """The normal deviate that is two-sided as unlikely as `p`.
+def normal_deviate(p: float) -> float:
+    """The normal deviate with this two-sided p-value.
 
     Parameters
     ----------
@@ -186,7 +192,7 @@ def as_deviate(p: float) -> float:
 
 @dataclass(frozen=True)
 class ConstancyTest:
-    """A row of the table of drifts and how likely chance alone makes it, with the rows of its groups."""
+    """A row of the table of drifts with its p-value, and the rows of its groups."""
 
     row: dict[str, object]
     p: float

@@ -25,11 +25,19 @@ from numpy.typing import NDArray
 from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit
-from vinetrack.diagnosis.constancy_tests import CONDITIONS, Against, ConstancyTest, Sums, as_deviate, constancy, sums_of
+from vinetrack.diagnosis.constancy_tests import (
+    COVARIATES,
+    BlockedDeviations,
+    ConstancyTest,
+    Covariate,
+    blocked_deviations,
+    constancy_p_value,
+    normal_deviate,
+)
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, lay, per_trial_estimates
 from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
-from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
+from vinetrack.diagnosis.stretches import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
@@ -126,7 +134,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     import pandas as pd
 
     notes: list[str] = []
-    scatter = scatter or replicate_scatter(fit, courses_of(fit)[0])
+    scatter = scatter or replicate_scatter(fit, residual_courses(fit)[0])
     tests = list(_tests(fit, scatter, notes))
     level = 1 - (1 - FALSE_ALARM_LEVEL) ** (1 / max(len(tests), 1))
     tests.sort(key=lambda tested: tested.p)
@@ -174,7 +182,7 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTe
             notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
             continue
         damping = estimates if key == DAMPING else damping
-        for against in CONDITIONS:
+        for against in COVARIATES:
             yield from _against(estimates, against)
     yield from _between_vines(fit, scatter)
     yield from against_the_sheet(fit)
@@ -185,7 +193,7 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTe
             notes.append("B could not be followed along the growth: the model cannot be followed there.")
 
 
-def _against(estimates: PerTrialEstimates, against: Against) -> Iterator[ConstancyTest]:
+def _against(estimates: PerTrialEstimates, against: Covariate) -> Iterator[ConstancyTest]:
     """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
     levels = np.array([against.level(trial) for trial in estimates.trials])
     usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
@@ -201,7 +209,7 @@ def _against(estimates: PerTrialEstimates, against: Against) -> Iterator[Constan
     else:
         choices = [("", usable)]
     for vine, chosen in choices:
-        sums = sums_of(estimates, against.along(levels), levels, chosen)
+        sums = blocked_deviations(estimates, against.coordinate(levels), levels, chosen)
         if sums is None:
             continue
         shown = [] if estimates.per_vine and not vine else _groups(estimates, against, levels, chosen, sums, vine)
@@ -210,9 +218,9 @@ def _against(estimates: PerTrialEstimates, against: Against) -> Iterator[Constan
 
 def _slope(
     estimates: PerTrialEstimates,
-    against: Against,
+    against: Covariate,
     levels: Floats,
-    sums: Sums,
+    sums: BlockedDeviations,
     vine: str,
     groups: list[dict[str, object]],
 ) -> ConstancyTest:
@@ -222,13 +230,13 @@ def _slope(
     slope = float(np.sum(sums.weight * sums.x * sums.d)) / square
     sigma = math.sqrt(sums.variance / square)
     low, high = float(levels.min()), float(levels.max())
-    reach = float(np.diff(against.along(np.array([low, high])))[0])
+    reach = float(np.diff(against.coordinate(np.array([low, high])))[0])
     start, stop = (low, high) if slope >= 0 else (high, low)
     change, error = abs(slope) * reach, sigma * reach
     if estimates.logarithmic:
         change, error = math.expm1(change), math.exp(change) * error
     p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
-    p_groups, z_constancy = constancy(sums)
+    p_groups, z_constancy = constancy_p_value(sums)
     row: dict[str, object] = {
         "parameter": estimates.key,
         "vine": vine,
@@ -240,7 +248,7 @@ def _slope(
         "change": change,
         "change_sigma": error,
         "relative": estimates.logarithmic,
-        "z": as_deviate(p),
+        "z": normal_deviate(p),
         "z_constancy": z_constancy,
         "dof": sums.dof,
         "n_trials": int(sums.x.size),
@@ -249,19 +257,19 @@ def _slope(
     return ConstancyTest(row, min(1.0, 2 * min(p, p_groups)), groups)
 
 
-def _said(estimates: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
+def _said(estimates: PerTrialEstimates, against: Covariate, row: Mapping[str, Any], *, steadily: bool) -> str:
     """A row in words; `steadily` where a straight line says more than that groups differ."""
     who = f"{estimates.symbol} of {row['vine']}" if row["vine"] else estimates.symbol
-    start, stop = against.shown(row["from_level"]), against.shown(row["to_level"])
+    start, stop = against.formatted(row["from_level"]), against.formatted(row["to_level"])
     if steadily:
         return (
             f"{who} rises by {_amount(estimates, row['change'], row['change_sigma'])} from {start} to {stop}"
-            f" of {against.words} ({row['z']:.1f} σ), though it should not know the {against.words}."
+            f" of {against.label} ({row['z']:.1f} σ), though it should not know the {against.label}."
         )
     low, high = sorted((row["from_level"], row["to_level"]))
     return (
-        f"{who} is not the same at every {against.words} ({row['z_constancy']:.1f} σ), without rising or falling"
-        f" steadily from {against.shown(low)} to {against.shown(high)}."
+        f"{who} is not the same at every {against.label} ({row['z_constancy']:.1f} σ), without rising or falling"
+        f" steadily from {against.formatted(low)} to {against.formatted(high)}."
     )
 
 
@@ -274,10 +282,10 @@ def _amount(estimates: PerTrialEstimates, change: float, error: float) -> str:
 
 def _groups(
     estimates: PerTrialEstimates,
-    against: Against | None,
+    against: Covariate | None,
     levels: Floats,
     chosen: NDArray[np.bool_],
-    sums: Sums,
+    sums: BlockedDeviations,
     vine: str,
 ) -> list[dict[str, object]]:
     """Mean value of every group; error from the scatter of replicates."""
@@ -293,7 +301,7 @@ def _groups(
 
 def _group_row(
     estimates: PerTrialEstimates,
-    against: Against | None,
+    against: Covariate | None,
     level: float,
     vine: str,
     mean: float,
@@ -394,7 +402,7 @@ def _apart(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> Cons
     p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
     groups = [_alone_group(*estimate, common.value) for estimate in estimates]
     count = sum(estimate[2] for estimate in estimates)
-    row = _vine_row(common.key, common.symbol, common.unit, groups, as_deviate(p), math.inf, count)
+    row = _vine_row(common.key, common.symbol, common.unit, groups, normal_deviate(p), math.inf, count)
     return ConstancyTest(row, p, groups)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, as_deviate
+from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, normal_deviate
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, acceleration_sensitivities, motions_of
 from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, PerTrialEstimates
 from vinetrack.dynamics.force_terms import evaluate
@@ -138,13 +138,13 @@ def _tested(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Constan
         "change": change,
         "change_sigma": error,
         "relative": True,
-        "z": as_deviate(p),
-        "z_constancy": as_deviate(p),
+        "z": normal_deviate(p),
+        "z_constancy": normal_deviate(p),
         "dof": dof,
         "n_trials": int(chosen.size),
         "sentence": (
             f"{who} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} % larger in the {where[1]}"
-            f" half of the growth than in the {where[0]} ({as_deviate(p):.1f} σ), though it should not change along"
+            f" half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though it should not change along"
             " the way."
         ),
     }

@@ -11,7 +11,7 @@ from vinetrack.diagnosis.cubic_splines import splines
 from vinetrack.diagnosis.force_inversion import ForceEstimate, LinearInversion
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
 from vinetrack.diagnosis.per_trial_estimates import lay
-from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
+from vinetrack.diagnosis.stretches import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
@@ -56,7 +56,7 @@ def linear_misfit(fit: Fit) -> LinearMisfit:
         If the model cannot be simulated.
     """
     try:
-        scatter = replicate_scatter(fit, courses_of(fit)[0])
+        scatter = replicate_scatter(fit, residual_courses(fit)[0])
         starts = [fit.solution.state.trial_effects, lay(fit).trial_effects]
         linearised = [_linearised(fit, LinearInversion(fit, trial_effects, scatter)) for trial_effects in starts]
     except SimulationError as error:

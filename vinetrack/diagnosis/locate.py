@@ -23,15 +23,15 @@ from vinetrack.diagnosis.ladder import excess
 from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, stretch_covariance, unlikely
 from vinetrack.diagnosis.replicates import replicates_of
 from vinetrack.diagnosis.stretches import (
-    STRETCHES,
-    Course,
-    by_condition,
+    MAX_STRETCHES,
+    ResidualCourse,
     common_edges,
-    courses_of,
-    means_of,
+    common_stretches,
+    courses_by_condition,
     replicate_scatter,
-    stretches_of,
-    variances_of,
+    residual_courses,
+    stretch_means,
+    stretch_variances,
 )
 from vinetrack.inference.fit_result import Fit, TrialFit
 
@@ -112,15 +112,15 @@ def locate(fit: Fit) -> Failure:
     """
     import pandas as pd
 
-    courses, predicted = courses_of(fit)
+    courses, predicted = residual_courses(fit)
     scatter = replicate_scatter(fit, courses)
-    of = by_condition(courses)
+    of = courses_by_condition(courses)
     conditions = list(of)
     edges = {name: common_edges(members) for name, members in of.items()}
     rows = []
     for name in conditions:
         members = [trial for trial in predicted if trial.trial.condition == name]
-        rows.append(_condition_row(members, stretches_of(of[name], "time_s", edges[name]), scatter))
+        rows.append(_condition_row(members, common_stretches(of[name], "time_s", edges[name]), scatter))
     table = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
     vines = list(dict.fromkeys(course.trial.vine for course in courses))
     whole = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
@@ -164,22 +164,22 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
 
 def _along(
     along: str,
-    of: dict[str, list[Course]],
-    whole: dict[str, list[Course]],
+    of: dict[str, list[ResidualCourse]],
+    whole: dict[str, list[ResidualCourse]],
     columns: Sequence[str],
     scatter: Scatter,
 ) -> pd.DataFrame:
     """Conditions of a vine along the same stretches, and all of its trials together."""
     parts = []
     for members in whole.values():
-        edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), STRETCHES + 1)
+        edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
         names = dict.fromkeys(member.trial.condition for member in members)
         parts += [(of[name], along, edges, name) for name in names] + [(members, along, edges, "")]
     return _table(parts, columns, scatter)
 
 
 def _table(
-    parts: Sequence[tuple[Sequence[Course], str, Floats, str]], columns: Sequence[str], scatter: Scatter
+    parts: Sequence[tuple[Sequence[ResidualCourse], str, Floats, str]], columns: Sequence[str], scatter: Scatter
 ) -> pd.DataFrame:
     import pandas as pd
 
@@ -188,13 +188,13 @@ def _table(
 
 
 def _mean_rows(
-    members: Sequence[Course], along: str, edges: Floats, condition: str, scatter: Scatter
+    members: Sequence[ResidualCourse], along: str, edges: Floats, condition: str, scatter: Scatter
 ) -> list[tuple[object, ...]]:
     """Mean residual of every stretch over the trials that reach it, and its error."""
-    parts = [means_of(member, along, edges) for member in members]
+    parts = [stretch_means(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     present = np.isfinite(both).all(axis=2)
-    each = np.array([variances_of(*part, scatter) for part in zip(members, parts, strict=True)])
+    each = np.array([stretch_variances(*part, scatter) for part in zip(members, parts, strict=True)])
     rows: list[tuple[object, ...]] = []
     for k in range(edges.size - 1):
         there = present[:, k]

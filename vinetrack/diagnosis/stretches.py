@@ -1,4 +1,7 @@
-"""Trials cut into stretches, and how much replicates scatter in them; see `vinetrack.diagnosis.replicate_scatter`."""
+"""Residuals of trials averaged over stretches of the growth, and the scatter of replicates in them.
+
+See `vinetrack.diagnosis.replicate_scatter`.
+"""
 
 from __future__ import annotations
 
@@ -22,35 +25,36 @@ from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 
-STRETCHES = 8
-"""Parts of the growth that a mean is taken over. Chosen: a trial errs in two or three independent ways; more stretches
-share their errors."""
+MAX_STRETCHES = 8
+"""Most stretches of the growth over which residuals are averaged. Chosen: a trial has two or three independent errors;
+more stretches share their errors."""
 
-FEWEST_FRAMES = 2
-"""Frames of a stretch, at least: a shorter recording is cut into fewer. Derived: one frame has no neighbour to average
+MIN_FRAMES_PER_STRETCH = 2
+"""Least frames of a stretch: a shorter recording is cut into fewer. Derived: one frame has no neighbour to average
 with."""
 
 
 @dataclass(frozen=True)
-class Course:
-    """One trial's residuals and what it answers to scatter, with the coordinates they are looked at along.
+class ResidualCourse:
+    """One trial's residuals, their response to between-trial scatter, and the coordinates along the growth.
 
-    From the first motion on; arrays have shape (n_points,), `answers` (n_points, 2). `noise_m2` is the variance of a
-    frame's position, times the frames that share one error; `rest_m2` that of the origin.
+    From the first motion on; arrays have shape (n_points,), `scatter_response` (n_points, 2). `noise_variance_m2` is
+    the variance of a frame's position times the number of frames that share an error; `origin_variance_m2` is that of
+    the origin.
     """
 
     trial: Trial
     residual_m: Floats
-    answers: Floats
+    scatter_response: Floats
     time_s: Floats
     lead_position_m: Floats
     lead_velocity_m_s: Floats
-    noise_m2: float
-    rest_m2: float
+    noise_variance_m2: float
+    origin_variance_m2: float
 
 
-def courses_of(fit: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
-    """Every trial of a fit as a course, and as predicted with a release and an origin of its own.
+def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ...]]:
+    """Residuals of every trial of a fit, and the trials as predicted with their own release and origin.
 
     Parameters
     ----------
@@ -59,73 +63,73 @@ def courses_of(fit: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
 
     Returns
     -------
-    courses : list of Course
+    courses : list of ResidualCourse
     predicted : tuple of TrialFit
 
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
     predicted = in_sample(fit).trials
-    answers = scatter_sensitivities(lay(fit))
-    return [_course(*members) for members in zip(predicted, answers, fit.predictor.data, strict=True)], predicted
+    response = scatter_sensitivities(lay(fit))
+    return [_course(*members) for members in zip(predicted, response, fit.predictor.data, strict=True)], predicted
 
 
-def by_condition(courses: Sequence[Course]) -> dict[str, list[Course]]:
+def courses_by_condition(courses: Sequence[ResidualCourse]) -> dict[str, list[ResidualCourse]]:
     """Courses by name of condition, in order.
 
     Parameters
     ----------
-    courses : sequence of Course
+    courses : sequence of ResidualCourse
 
     Returns
     -------
-    dict of list of Course
+    dict of list of ResidualCourse
     """
     names = dict.fromkeys(course.trial.condition for course in courses)
     return {name: [course for course in courses if course.trial.condition == name] for name in names}
 
 
-def replicate_scatter(fit: Fit, courses: Sequence[Course]) -> Scatter:
-    """How much replicates scatter, from stretches of time that all of a condition were filmed in.
+def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
+    """Estimate the scatter of replicates from stretches of time that all trials of a condition were recorded in.
 
     Parameters
     ----------
     fit
         A fitted model.
-    courses : sequence of Course
+    courses : sequence of ResidualCourse
 
     Returns
     -------
     Scatter
     """
-    groups = by_condition(courses).values()
-    return find_scatter(fit, [stretches_of(members, "time_s", common_edges(members)) for members in groups])
+    groups = courses_by_condition(courses).values()
+    return find_scatter(fit, [common_stretches(members, "time_s", common_edges(members)) for members in groups])
 
 
-def _course(trial: TrialFit, answers: Floats, trial_data: FitTrial) -> Course:
-    noise_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
+def _course(trial: TrialFit, response: Floats, trial_data: FitTrial) -> ResidualCourse:
+    noise_variance_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
     begin = first_that_counts(trial)
     growth = trial.predicted_position_m - trial.origin_m
-    return Course(
+    return ResidualCourse(
         trial=trial.trial,
         residual_m=trial.residual_m[begin:],
-        answers=answers[begin:],
+        scatter_response=response[begin:],
         time_s=trial.time_s[begin:] - trial.release_s,
         lead_position_m=growth[begin:],
         lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
-        noise_m2=noise_m2,
-        rest_m2=noise_m2 / max(trial_data.n_rest, 1),
+        noise_variance_m2=noise_variance_m2,
+        origin_variance_m2=noise_variance_m2 / max(trial_data.n_rest, 1),
     )
 
 
-def common_edges(members: Sequence[Course]) -> Floats:
-    """Edges of stretches of time that every replicate was filmed in.
+def common_edges(members: Sequence[ResidualCourse]) -> Floats:
+    """Edges of stretches of time that every replicate was recorded in.
 
     Parameters
     ----------
-    members : sequence of Course
+    members : sequence of ResidualCourse
         Of one condition.
 
     Returns
@@ -135,12 +139,12 @@ def common_edges(members: Sequence[Course]) -> Floats:
     begin = max(float(member.time_s[0]) for member in members)
     end = min(float(member.time_s[-1]) for member in members)
     frames = min(int(np.count_nonzero((member.time_s >= begin) & (member.time_s <= end))) for member in members)
-    count = max(min(STRETCHES, frames // FEWEST_FRAMES), 1)
+    count = max(min(MAX_STRETCHES, frames // MIN_FRAMES_PER_STRETCH), 1)
     return np.linspace(begin, max(end, begin), count + 1)
 
 
-def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
-    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames.
+def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
+    """Means of [residual, scatter response] in each stretch, NaN where there is no frame, and the numbers of frames.
 
     Parameters
     ----------
@@ -155,21 +159,21 @@ def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]
     means : array, shape (n_stretches, 3), m
     frames : array, shape (n_stretches,)
     """
-    values, at = np.column_stack([course.residual_m, course.answers]), getattr(course, along)
-    place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
+    values, at = np.column_stack([course.residual_m, course.scatter_response]), getattr(course, along)
+    stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
     inside = (at >= edges[0]) & (at <= edges[-1])
     total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
-    np.add.at(total, place[inside], values[inside])
-    np.add.at(count, place[inside], 1.0)
+    np.add.at(total, stretch[inside], values[inside])
+    np.add.at(count, stretch[inside], 1.0)
     return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
 
 
-def stretches_of(members: Sequence[Course], along: str, edges: Floats) -> Stretches:
-    """The stretches that all of the members have frames in.
+def common_stretches(members: Sequence[ResidualCourse], along: str, edges: Floats) -> Stretches:
+    """The stretches in which all members have frames.
 
     Parameters
     ----------
-    members : sequence of Course
+    members : sequence of ResidualCourse
         Of one condition.
     along : str
         Attribute of the courses that the edges belong to.
@@ -179,34 +183,34 @@ def stretches_of(members: Sequence[Course], along: str, edges: Floats) -> Stretc
     -------
     Stretches
     """
-    parts = [means_of(member, along, edges) for member in members]
-    both = np.array([means for means, _ in parts])
-    reached = np.isfinite(both).all(axis=(0, 2))
+    parts = [stretch_means(member, along, edges) for member in members]
+    all_means = np.array([means for means, _ in parts])
+    reached = np.isfinite(all_means).all(axis=(0, 2))
     noise = np.mean([_noise(course, count[reached]) for course, (_, count) in zip(members, parts, strict=True)], axis=0)
-    return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
+    return Stretches(all_means[:, reached, 0], all_means[:, reached, 1:].mean(axis=0), noise)
 
 
-def _noise(course: Course, count: Floats) -> Floats:
+def _noise(course: ResidualCourse, count: Floats) -> Floats:
     """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
-    return np.asarray(np.diag(course.noise_m2 / np.maximum(count, 1.0)) + course.rest_m2)
+    return np.asarray(np.diag(course.noise_variance_m2 / np.maximum(count, 1.0)) + course.origin_variance_m2)
 
 
-def variances_of(course: Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
-    """Variances of the means of one trial's stretches, shape (n_stretches,).
+def stretch_variances(course: ResidualCourse, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
+    """Variances of the means of one trial's stretches.
 
     Parameters
     ----------
     course
         One trial along its growth.
     part : (means, frames)
-        From `means_of`.
+        From `stretch_means`.
     scatter
-        What replicates differ by.
+        Scatter of replicates.
 
     Returns
     -------
     array, shape (n_stretches,), m²
     """
     means, count = part
-    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
-    return np.diag(stretch_covariance(scatter, alone))
+    single = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
+    return np.diag(stretch_covariance(scatter, single))
