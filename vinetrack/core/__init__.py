@@ -1,1 +1,1 @@
-"""What every package stands on: records, units, tables, problems, the terminal."""
+"""Foundations of all packages: records, units, tables, problems, terminal output."""

@@ -1,7 +1,7 @@
-"""Files as an experiment may hold them: what is no ordinary file is never opened, since a pipe would be waited for.
+"""Checks of files before they are opened: only regular files are, since reading a pipe would block.
 
-What a sheet names is a path inside the folder by its text. A link there may lead to a file or a folder elsewhere, as to
-recordings on another disk; what it ends at must be an ordinary file, as must every file of the folder itself.
+The text of a path in a sheet stays inside the experiment folder, but a link in the folder may lead outside, for example
+to recordings on another disk. Its target must be a regular file or a folder, like every entry of the folder itself.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import stat
 from pathlib import Path
 
 DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Errors of a disk, or a share of one, on which nothing more can be written."""
+"""Error numbers of a full disk or an exhausted quota."""
 
 
 NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
-"""What is said of a FIFO, a socket, a terminal or anything like `/dev/zero`."""
+"""Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`."""
 
 
 def missing_file_message(path: Path) -> tuple[str, str]:
-    """What is said of a file that is not there, and what to do.
+    """Return message and remedy for a missing file; a broken link, as to a disk that is not mounted, is named as such.
 
     Parameters
     ----------
-    path : of the file; a link whose end is missing, as one to a disk that is not mounted, is named as such.
+    path : path of the file.
 
     Returns
     -------
@@ -39,15 +39,15 @@ def missing_file_message(path: Path) -> tuple[str, str]:
 
 
 def is_pipe_or_device(path: Path) -> bool:
-    """Whether a path ends at something that a program would wait for, or read for ever.
+    """Whether a path leads to something other than a file or folder, reading which may block or never end.
 
     Parameters
     ----------
-    path : or a link to it.
+    path : the path; links are followed.
 
     Returns
     -------
-    False for files and folders, and where there is nothing.
+    False for files, folders and missing paths.
     """
     try:
         mode = path.stat().st_mode
@@ -57,7 +57,7 @@ def is_pipe_or_device(path: Path) -> bool:
 
 
 def file_size(path: Path) -> int:
-    """Size of an ordinary file that may be read.
+    """Return the size of a readable regular file.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def file_size(path: Path) -> int:
     Raises
     ------
     OSError
-        With a `strerror` for a person: there is none, it may not be read, it is a folder, a pipe or a device.
+        If it does not exist, is not readable, or is a folder, a pipe or a device; `strerror` says which, for the user.
     """
     status = path.stat()
     if stat.S_ISDIR(status.st_mode):
@@ -83,15 +83,15 @@ def file_size(path: Path) -> int:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether a path leads to an ordinary file, or a folder, that may be read.
+    """Whether a path leads to a readable regular file or folder.
 
     Parameters
     ----------
-    path : whatever a sheet names.
+    path : path named by a sheet.
 
     Returns
     -------
-    False also where there is nothing.
+    False if it does not exist.
     """
     try:
         return (path.is_dir() and os.access(path, os.R_OK | os.X_OK)) or file_size(path) >= 0
@@ -100,14 +100,14 @@ def is_readable(path: Path) -> bool:
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error says that the disk is full.
+    """Whether an error means that the disk is full.
 
     Parameters
     ----------
-    error : as it was raised.
+    error : the error raised.
 
     Returns
     -------
-    True for a full disk or a quota that is used up.
+    True for a full disk or an exhausted quota.
     """
     return isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS

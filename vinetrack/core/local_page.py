@@ -1,4 +1,4 @@
-"""What local pages have in common: the address they are bound to, their port, and why one cannot be served."""
+"""Serving of local pages: address, port, and shutdown."""
 
 from __future__ import annotations
 
@@ -12,52 +12,52 @@ from vinetrack.core.problems import UserError
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30
-"""Chosen: free of well-known services; 30 pages on one machine, then any free port."""
+"""Chosen: not used by well-known services; 30 pages on one machine, then any free port."""
 
 TOKEN_BYTES = 16
-"""Chosen: 128 bits, which nobody guesses; half would do."""
+"""Chosen: 128 bits, which cannot be guessed; half would suffice."""
 
 THREAD_PREFIX = "vinetrack-"
-"""Threads of a page whose work need not be waited for when it ends are named so."""
+"""Prefix of the names of a page's threads that need not finish before the process exits."""
 
 Server = TypeVar("Server")
 
 
 class PageError(UserError, RuntimeError):
-    """The page cannot be served; one sentence with a remedy."""
+    """A page that cannot be served; the message is one sentence with a remedy."""
 
 
 def secret_path() -> str:
-    """A random first part of a page's address, so that only who was told the address can ask for anything.
+    """Return a random first part of a page's path, so that only users who know the address have access.
 
     Returns
     -------
-    path, with a slash before and none behind it.
+    path with a leading slash and no trailing one.
     """
     return f"/{secrets.token_urlsafe(TOKEN_BYTES)}"
 
 
 def allowed_hosts(port: int) -> frozenset[str]:
-    """Names under which a page of this machine is asked for; another name that leads here is somebody else's page.
+    """Return the allowed values of a request's `Host` header; others indicate a page of another site (DNS rebinding).
 
     Parameters
     ----------
-    port : of the server.
+    port : port of the server.
 
     Returns
     -------
-    what the header `Host` of a request may say.
+    allowed values, with port.
     """
     return frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
 
 
 def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
-    """A server on a port, or on the first that is free.
+    """Start a server on a port, or on the first free one.
 
     Parameters
     ----------
-    serve : starts one on a port; OSError where it is taken.
-    port : to take, 0 for any that is free; None looks for the first free one from `FIRST_PORT`.
+    serve : starts a server on a port; raises OSError if the port is in use.
+    port : port to use, 0 for any free one; None for the first free one from `FIRST_PORT`.
 
     Returns
     -------
@@ -66,10 +66,10 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
     Raises
     ------
     PageError
-        If the port is taken.
+        If the port is in use.
     """
-    tried = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
-    for number in tried:
+    ports = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
+    for number in ports:
         with contextlib.suppress(OSError):
             return serve(number)
     raise PageError(f"Port {port} is in use: give another with --port, or omit --port to use a free one.")
@@ -77,23 +77,23 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
 
 @contextlib.contextmanager
 def stop_on_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end a server between two turns of its loop, in the middle of nothing.
+    """Let Ctrl-C and SIGTERM end a server between two iterations of its loop.
 
     Parameters
     ----------
-    end : asks the loop to end; called in the thread that serves, it must not wait.
+    end : requests the end of the loop; it is called in the serving thread and must not block.
 
     Yields
     ------
-    None : while the signals are taken.
+    None : while the signals are handled.
     """
 
-    def ended(_number: int, _frame: Any) -> None:
+    def handle(_number: int, _frame: Any) -> None:
         end()
 
-    before = {number: signal.signal(number, ended) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,7 +1,7 @@
-"""What objects show of themselves in a notebook: tables as HTML, and the figures of the report.
+"""Display of objects in a notebook: tables as HTML, and figures of the report.
 
-The figures stand above the objects that they show, so an object names its drawing package as a backend, loaded when a
-figure is asked for, as pandas does.
+The figure packages lie above the objects that they draw, so the drawing module is a backend that is imported when a
+figure is requested, as in pandas.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLOTTING_BACKEND = "vinetrack.interface.plotting"
-"""Module whose `figure_of(object, name, **options)` draws an object of this package."""
+"""Module whose function `figure_of(object, name, **options)` draws objects of this package."""
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:
-    """Return a table as HTML, every text escaped.
+    """Return a table as HTML with all text escaped.
 
     Parameters
     ----------
-    head, rows : texts, as many in a row as in the head.
-    title : a line above the table.
-    notes : lines below it.
+    head, rows : names of the columns, and cells of each row.
+    title : line above the table.
+    notes : lines below the table.
 
     Returns
     -------
@@ -39,12 +39,12 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = 
 
 
 def plot(shown: Any, name: str = "", **options: Any) -> Figure:
-    """Return the figure of an object as the report has it.
+    """Draw an object as in the report.
 
     Parameters
     ----------
     shown : a fit, a comparison, a diagnosis or loaded results.
-    name : of the figure, see `vinetrack.figures.registry`; blank for the one that says most about the object.
+    name : name of the figure, see `vinetrack.figures.registry`; blank for the main figure of the object.
     options : for figures of one trial, `trial`.
 
     Returns

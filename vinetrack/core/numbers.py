@@ -1,6 +1,6 @@
-"""Numbers as text: a value to the digit that its error allows.
+"""Formatting of numbers: values with as many digits as their error justifies.
 
-Used alike by the terminal, the report, the figures and the explorer.
+Used by terminal, report, figures and explorer alike.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import Any
 
 _FIXED_EXPONENTS = (-4, 6)
-"""Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
+"""Decimal exponents written without "e". Convention: the range of Python's `g` format, 0.0001 to 999999."""
 
 _MAX_FIXED_DECIMALS = 6
-"""Decimals beyond which a value and its error share a power of ten. Chosen: six zeros can still be counted."""
+"""Decimals beyond which value and error are written with a common power of ten. Chosen: six zeros can be counted."""
 
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -22,7 +22,7 @@ _MAX_DECIMALS = 12
 
 
 def decimals(sigma: float) -> int:
-    """Return how many decimals show two digits of an error, at most 12; 0 for an error that is 0 or NaN.
+    """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def decimals(sigma: float) -> int:
 
 
 def or_nan(value: Any) -> float:
-    """Return a number of a JSON file as a float; NaN for None, which stands there for an unknown number.
+    """Return a number of a JSON file as a float; NaN for None, which means unknown.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
     Parameters
     ----------
-    value : what is shown; None and NaN are unknown.
+    value : the number; None and NaN are unknown.
     digits : significant digits.
 
     Returns
@@ -92,7 +92,7 @@ def with_error(value: float | None, sigma: float | None) -> str:
         return "–"
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return number(value)
-    places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 is written 0.010, and counts as that
+    places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 rounds to 0.010
     if places > _MAX_FIXED_DECIMALS:
         power = 3 * ((places - 1) // 3)
         shown = max(places - power, 0)
@@ -103,11 +103,11 @@ def with_error(value: float | None, sigma: float | None) -> str:
 
 
 def interval(bounds: Sequence[float | None] | None) -> str:
-    """Return `(low, high)` as "low to high", both to the decimal that its width allows; "–" where unknown.
+    """Return `(low, high)` as "low to high", with decimals that suit its width; "–" if unknown.
 
     Parameters
     ----------
-    bounds : low and high, in the same unit; None where unknown.
+    bounds : low and high, in the same unit; None if unknown.
 
     Returns
     -------
@@ -122,12 +122,12 @@ def interval(bounds: Sequence[float | None] | None) -> str:
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None) -> str:
-    """Return `value (95 %: low to high)`, all to the digit that the width allows; the value alone where unknown.
+    """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds are unknown.
 
     Parameters
     ----------
-    value : in the unit of the bounds; None where unknown.
-    bounds : of the 95 % interval.
+    value : the number, in the unit of the bounds; None if unknown.
+    bounds : bounds of the 95 % interval; None if unknown.
 
     Returns
     -------
@@ -139,6 +139,6 @@ def with_interval(value: float | None, bounds: Sequence[float | None] | None) ->
     if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)
-    half = float(f"{(high - low) / 2:.1e}")  # 0.00999 is written 0.010, and counts as that
+    half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
     places = min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 else 3
     return f"{value:.{places}f} (95 %: {low:.{places}f} to {high:.{places}f})"

@@ -1,6 +1,6 @@
-"""What is wrong with an experiment, said so that a person can put it right.
+"""Problems of the user's input, each with its location, the value, what is allowed, and the remedy.
 
-Reading an experiment collects every problem before it gives up, so that a sheet is mended in one go.
+Reading an experiment collects all problems before it stops, so that a sheet can be corrected in one pass.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 CLOSE_NAME_RATIO = 0.6
-"""Chosen: part of the letters that two names share from which one may be a slip for the other; difflib's default."""
+"""Similarity ratio above which an unknown name may be a misspelling of a known one. Chosen: difflib's default."""
 
 MAX_QUOTED_LENGTH = 60
-"""Of a value quoted in a message; chosen: half a line, as a paragraph pasted in a cell would hide the message."""
+"""Longest quotation of a value in a message. Chosen: half a line; a pasted paragraph would hide the message."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """One fault (`severity` "error") or oddity ("warning"): where it is, what was given, what is allowed, what to do.
+    """An error or a warning (`severity`): location, given value, allowed values, and remedy.
 
-    `file` is relative to the experiment; `line` counts from 1, 0 where it makes no sense; other fields are blank
-    where they do not apply. `value` is None where there is none, "" for a blank cell. `of_a_measurement`: the message
-    quotes what was measured on this very trial; of another trial it is the same problem with another number.
+    `file` is relative to the experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if
+    they do not apply. `value` is None if there is none, "" for a blank cell. `of_a_measurement` marks a message that
+    quotes a measured number: problems of several trials that differ only in that number are reported as one.
     """
 
     message: str
@@ -39,12 +39,12 @@ class Problem:
 
     @classmethod
     def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
-        """The problem that the words of an error state: what is wrong, then after a colon the remedy.
+        """Make a problem of an error whose text is `message: remedy`.
 
         Parameters
         ----------
-        error : with such words.
-        file : that it was met in.
+        error : the error.
+        file : file in which it occurred.
         details : further fields.
 
         Returns
@@ -56,7 +56,7 @@ class Problem:
 
     @property
     def reason(self) -> str:
-        """The problem without file, line and trial, for the row of a trial that failed.
+        """The problem without file, line and trial, as the reason of a failed trial.
 
         >>> Problem(message="is not a number", column="pressure_kPa", value="12 kPa", remedy="write 12").reason
         "pressure_kPa '12 kPa' is not a number: write 12"
@@ -75,14 +75,14 @@ class Problem:
 
 
 class UserError(Exception):
-    """Something that a person can put right: the message says what is wrong and what to do, without a traceback.
+    """An error that the user can correct: the message says what is wrong and what to do.
 
-    Errors that reach the terminal as their own sentence derive from it; any other is a fault of the program.
+    The command line prints the message of these errors; any other exception is an error in the program.
     """
 
 
 class ExperimentError(UserError):
-    """An experiment that cannot be read; `problems` holds everything that was found, errors first."""
+    """An experiment that cannot be read; `problems` holds all its problems, errors first."""
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda problem: problem.severity != "error"))
@@ -90,14 +90,14 @@ class ExperimentError(UserError):
 
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
-    """Say the problems in at most `limit` lines, errors first; where there are more, the last line says how many.
+    """Format problems as at most `limit` lines, errors first; the last line counts those omitted.
 
-    One that several trials have alike is said once.
+    A problem that several trials share is reported once.
 
     Parameters
     ----------
-    problems : in any order.
-    limit : lines at most.
+    problems : the problems, in any order.
+    limit : largest number of lines.
 
     Returns
     -------
@@ -116,28 +116,28 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
 
 
 def _merged(problems: Iterable[Problem]) -> list[Problem]:
-    """Problems that differ in trial, line and what was measured alone as one that names the first, counting others."""
-    alike: dict[Problem, list[Problem]] = {}
+    """Merge problems that differ only in trial, line and measured number; the result names the first and counts."""
+    groups: dict[Problem, list[Problem]] = {}
     for problem in problems:
         message = "" if problem.of_a_measurement else problem.message
-        alike.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
+        groups.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
     return [
         group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")
-        for group in alike.values()
+        for group in groups.values()
     ]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """What an unknown name may have meant: the nearest three of those that are known.
+    """Suggest the three known names most similar to an unknown one.
 
     Parameters
     ----------
-    name : as it was written.
-    known : names that would have been right.
+    name : the unknown name.
+    known : known names.
 
     Returns
     -------
-    a question where one comes close, else a list; blank where nothing is known.
+    a question if one is similar enough, else a list; blank if there are no known names.
 
     >>> did_you_mean("presure", ["pressure", "payload", "trial", "preview"])
     'did you mean pressure? (or preview, trial)'
@@ -156,5 +156,5 @@ def _shorten(text: str) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Replace line breaks and control characters: a hostile cell must not forge further lines of a report."""
+    """Replace line breaks and control characters, so that a cell cannot forge further lines of output."""
     return "".join(char if char.isprintable() else " " for char in text)

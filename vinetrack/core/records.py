@@ -1,8 +1,7 @@
-"""The nouns that every stage hands on: a trial, its track, its kinematics.
+"""Records passed between stages: trial, track, kinematics, steady window.
 
-Plain data in SI units, without files and without behaviour beyond what follows from the data themselves.
-`lead_` is the leading edge (what a camera sees), `tail_` the tail and a payload riding on it; the tail moves
-`travel_ratio` times as fast as the lead.
+Plain data in SI units, without file access. `lead_` is the leading edge (what a camera sees), `tail_` the tail and a
+payload riding on it; the tail moves `travel_ratio` times as fast as the leading edge.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ Indices = NDArray[np.int_]
 Bools = NDArray[np.bool_]
 
 FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "corrected", "gap", "retimed", "after_end")
-"""Every flag a point of a track can carry; several are joined by `;` in this order. `corrected`: a person has moved,
-dropped or confirmed the point. `gap`: frames are missing before it; `retimed`: the times from it on were put right."""
+"""Flags of a point of a track; several are joined by `;` in this order. `corrected`: moved, dropped or confirmed by
+hand. `gap`: frames are missing before it. `retimed`: the times from it on were corrected."""
 
 _FORMER_RETIMED_FLAGS = "gap;corrected"
-"""What releases before `retimed` wrote for `gap;retimed`; `corrected` stands before `gap` since, so that the two can be
-told apart. Read for one release."""
+"""Former spelling of `gap;retimed`, read for one more release. In the current order `corrected` precedes `gap`, so that
+the two are distinguishable."""
 
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
-"""A point with one of these says nothing about where the leading edge was."""
+"""Flags of points that are not measurements of the leading edge."""
 
 
 CORRECTION_ACTIONS = ("move", "drop", "confirm")
-"""What a person may do with a point of a track."""
+"""Manual corrections of a point of a track."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What a person says of one frame of a recording: one of CORRECTION_ACTIONS, and to where it is moved.
+    """A manual correction of one frame of a recording: one of CORRECTION_ACTIONS, and for `move` the new position.
 
-    `edge_px` counts along the growth axis of the trial, as the track's does; NaN where the point is not moved.
+    `edge_px` is measured along the growth axis of the trial, as in the track; NaN if the point is not moved.
     """
 
     frame: int
@@ -50,16 +49,16 @@ class Correction:
 
 
 POSITION_SYSTEMATIC_M = 1e-4
-"""Standard deviation of a smooth error of position where nothing is known of the lens. Measured: with this allowance, a
-smooth error of 0.11 mm was named as physics in 0 of 5 campaigns (5 of 6 without it), and neither depletion nor tail
-friction was lost. At half of it such an error counts as 2 σ; at twice, errors of small effects grow with it."""
+"""Standard deviation of smooth position errors if lens distortion is unknown. Measured: with this allowance, a smooth
+error of 0.11 mm was identified as a physical effect in 0 of 5 campaigns (5 of 6 without it), and both depletion and
+tail friction were still detected. At half, such an error counts as 2 σ; at twice, the errors of small effects grow."""
 
 
 @dataclass(frozen=True)
 class PictureAxis:
-    """A line in the picture along which a trial moves: (x, y) of its ends, px; `width_m` is NaN where not given.
+    """The growth axis of a trial in the picture: (x, y) of its ends, px; `width_m` is NaN if not given.
 
-    `via_px` are the points between its ends through which a path that bends goes, in order.
+    `via_px` are intermediate points of a curved path, in order.
     """
 
     from_px: tuple[float, float]
@@ -70,7 +69,7 @@ class PictureAxis:
 
 @dataclass(frozen=True)
 class Bend:
-    """A bend of the path: where it starts along the growth axis, its arc length and its radius, in metres."""
+    """A bend of the path: start along the growth axis, arc length and radius, in metres."""
 
     start_m: float
     arc_m: float
@@ -79,11 +78,11 @@ class Bend:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One row of the trial sheet, shared settings filled in, in SI units; NaN where the sheet is blank.
+    """One row of the trial sheet with shared settings filled in, in SI units; NaN for blank cells.
 
-    `vine` names the trials of one diameter, thickness and length; `condition` the replicates: trials whose
-    nominal settings are all the same. `specimen` is which tube of that vine it was, `day` the day or batch, blank
-    where unknown; `order` the place of the trial among those made, counted from 1, NaN where unknown.
+    `vine` is common to trials with the same diameter, thickness and length; `condition` to replicates, trials with the
+    same nominal settings. `specimen` is the physical tube and `day` the day or batch, blank if unknown; `order` is the
+    position of the trial in the order in which trials were run, from 1, NaN if unknown.
     """
 
     name: str
@@ -117,7 +116,7 @@ class Trial:
     mass_loss: str = "geometric"
     tail_slack: str = "taut"
     tail_store: str = "body"
-    position_systematic_m: float = math.nan  #: sd of smooth errors of position that no scatter shows; NaN: the default
+    position_systematic_m: float = math.nan  #: standard deviation of smooth position errors; NaN: the default
     specimen: str = ""
     day: str = ""
     order: float = math.nan
@@ -127,7 +126,7 @@ class Trial:
     corrections: tuple[Correction, ...] = ()
 
     def group(self, shared: str) -> str:
-        """Name of the trials that have a number of their own together, where numbers are shared so.
+        """Return the group of this trial for a parameter that is shared within groups.
 
         Parameters
         ----------
@@ -137,7 +136,7 @@ class Trial:
         Returns
         -------
         str
-            Blank for all, and where the day is unknown.
+            Name of the group; blank for `all`, and if the day is unknown.
         """
         if shared == "day":
             return f"day {self.day}" if self.day else ""
@@ -157,17 +156,17 @@ class Trial:
 
     @property
     def mass_loss_kg_m(self) -> float:
-        """Mass c that the tail loses per metre of *tail* travel: λ(r−1)/r, or λ where the paper is taken literally."""
+        """Mass c that the tail loses per metre of *tail* travel: λ(r−1)/r, or λ as printed in the paper."""
         if self.mass_loss == "as_printed":
             return self.linear_density_kg_m
         return self.linear_density_kg_m * (self.travel_ratio - 1) / self.travel_ratio
 
     def moving_mass_kg(self, lead_travel_m: Floats | float) -> Floats:
-        """Mass of tail and payload m = λL + m_pay − c·x after `lead_travel_m` of growth (x = r·y), never negative.
+        """Return the mass of tail and payload, m = max(λL − c·x, 0) + m_pay, after growth y, with x = r·y.
 
         Parameters
         ----------
-        lead_travel_m : array of any shape, m: growth since release.
+        lead_travel_m : growth y since release, array of any shape, m.
 
         Returns
         -------
@@ -180,17 +179,17 @@ class Trial:
 
 
 def join_flags(*flags: str) -> str:
-    """`;`-join flags in the order of FLAGS, each once, blanks dropped."""
+    """Join flags by `;` in the order of FLAGS, without repetitions and blanks."""
     present = {part for flag in flags for part in split_flags(flag)}
     return ";".join(flag for flag in FLAGS if flag in present)
 
 
 def split_flags(flag: str) -> list[str]:
-    """The flags of one point.
+    """Split the flags of one point.
 
     Parameters
     ----------
-    flag : as a track holds it, joined by `;`; `gap;corrected` of an earlier release is read as `gap;retimed`.
+    flag : flags joined by `;`; `gap;corrected` of an earlier release is read as `gap;retimed`.
 
     Returns
     -------
@@ -203,11 +202,11 @@ def split_flags(flag: str) -> list[str]:
 
 
 def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
-    """Mask, shape (n_frames,), of points that carry a flag.
+    """Return the mask of points that carry a flag.
 
     Parameters
     ----------
-    flags : of every frame, joined by `;`.
+    flags : flags of every frame, joined by `;`.
     name : one of FLAGS.
 
     Returns
@@ -218,11 +217,11 @@ def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
 
 
 def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
-    """Mask, shape (n_frames,), of points that a person has moved, dropped or confirmed.
+    """Return the mask of points that were moved, dropped or confirmed by hand.
 
     Parameters
     ----------
-    flags : of every frame, joined by `;`.
+    flags : flags of every frame, joined by `;`.
 
     Returns
     -------
@@ -233,14 +232,13 @@ def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Track:
-    """Where the leading edge was at each frame of one trial. All arrays have shape (n_frames,).
+    """Position of the leading edge at each frame of one trial. All arrays have shape (n_frames,).
 
-    `lead_position_m` is NaN where there is none; `lead_position_sigma_m` the random error of that point alone (NaN
-    where unknown), `lead_position_systematic_m` that of its slow error, which neighbouring frames share and an average
-    over frames keeps (None or NaN where nothing is known of it). `flag` holds strings, see FLAGS; `pressure_Pa` is the
-    gauge pressure measured along with it, if any; `notes` are sentences about the track as a whole that a person should
-    read. `tracked_px` is `edge_px` as the tracker saw it, before anything was corrected by hand, None where nothing
-    was.
+    `lead_position_m` is NaN where the edge was not found. `lead_position_sigma_m` is the standard deviation of the
+    random error of each point (NaN if unknown), `lead_position_systematic_m` that of its slowly varying error, which
+    neighbouring frames share and averaging does not reduce (None or NaN if unknown). `flag` holds strings, see FLAGS;
+    `pressure_Pa` is the gauge pressure measured during the trial, if any; `notes` are sentences about the whole track
+    for the user. `tracked_px` is `edge_px` before manual corrections, None if there were none.
     """
 
     time_s: Floats
@@ -255,7 +253,7 @@ class Track:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Mask, shape (n_frames,): points that say where the leading edge was."""
+        """Mask, shape (n_frames,), of points that are measurements of the leading edge."""
         usable = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
         for flag in {str(flag) for flag in self.flag[self.flag != ""]}:
             if UNUSABLE_FLAGS.intersection(flag.split(";")):
@@ -266,13 +264,13 @@ class Track:
 def plain_track(
     time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
 ) -> Track:
-    """Positions of which nothing else is known: no flag, no pixels, and no error unless it is given.
+    """Make a track of positions alone: without flags and pixels, and without errors unless given.
 
     Parameters
     ----------
     time_s, lead_position_m : shape (n_frames,), s and m.
-    sigma_m : shape (n_frames,), random error of each point, m.
-    pressure_Pa : shape (n_frames,), gauge pressure measured along with it, Pa.
+    sigma_m : shape (n_frames,), standard deviation of the random error of each point, m.
+    pressure_Pa : shape (n_frames,), gauge pressure measured during the trial, Pa.
 
     Returns
     -------
@@ -309,11 +307,11 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Window:
-    """A stretch of a trial judged for steadiness by one rule, with the verdict and why.
+    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason.
 
     `rule` is `gated`, `paper` or `user`; `x_ss_m_s` the mean **tail** speed in the window and `x_ss_sigma_m_s` its
     standard error; `drift` the relative change of speed across the window with its 95 % interval `drift_95`; `cv` the
-    coefficient of variation of the velocities in it. Numbers are NaN where there is no window.
+    coefficient of variation of the velocities in it. Numbers are NaN if there is no window.
     """
 
     rule: str

@@ -1,8 +1,8 @@
-"""Tables and files as people have them: read in any dialect Excel writes, written whole or not at all.
+"""Reading of CSV files in any dialect that Excel writes, and atomic writing of files.
 
 Reading accepts comma, semicolon or tab; decimal points or commas; UTF-8 with or without BOM, UTF-16 (Excel's "Unicode
-text") and cp1252; any line ends. Cells stay text, so that a message can quote what the person wrote; `parse_number`
-and `Table.numbers` are strict about what a number is.
+text") and cp1252; any line ends. Cells stay text, so that messages can quote them; `parse_number` and `Table.numbers`
+convert strictly. A file is written under a temporary name and renamed, so that it is complete or absent.
 """
 
 from __future__ import annotations
@@ -30,29 +30,30 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_TABLE_BYTES = 200_000_000
-"""Beyond this a file is no table: probably a recording named in the wrong column. Chosen: an hour of positions at 1000
-frames a second takes 150 MB. At half such a file is refused, at twice a recording takes memory first."""
+"""Largest file read as a table; a larger one is probably a recording named in the wrong column. Chosen: an hour of
+positions at 1000 frames per second takes 150 MB. At half such a file is refused; at twice more memory is used before a
+recording is refused."""
 
-STANDARD_OUTPUT = Path("-")  # convention of commands: a file of this name is the terminal
+STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard output
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
-"""1,069 or 1.069: a decimal mark or a thousands separator, depending on the country."""
+"""Such as 1,069 or 1.069: the mark is a decimal mark or a thousands separator, depending on the locale."""
 _PLAIN_NUMBERS = re.compile(r"[0-9eE+.\n-]*")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
 
 class TableError(UserError):
-    """A file that cannot be read as a table, or a cell that is no number: one sentence, with a remedy."""
+    """A file that cannot be read as a table, or a cell that is not a number: one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of a CSV, as text without blanks around it.
+    """Cells of a CSV file as stripped text.
 
-    `rows[i]` maps each column to its cell ("" where blank or where the line is short); `lines[i]` is its line in the
-    file, from 1; `extra[i]` holds what stands beyond the last column; `nameless` tells that a column without a name
-    holds something. `decimal` is the decimal mark the file uses, "." or ",", or "" where it uses both.
+    `rows[i]` maps each column to its cell ("" if blank or if the line is short); `lines[i]` is its line in the file,
+    from 1; `extra[i]` holds the cells beyond the last column; `nameless`: a column without a name has content.
+    `decimal` is the decimal mark of the file, "." or ",", or "" if it uses both.
     """
 
     columns: tuple[str, ...]
@@ -64,7 +65,7 @@ class Table:
     nameless: bool = False
 
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
-        """A column as numbers, shape (n_rows,); blank cells are NaN if `blank_is_nan`, else refused.
+        """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error.
 
         Parameters
         ----------
@@ -81,7 +82,7 @@ class Table:
             Naming line, column and cell of the first that is not a number.
         """
         cells = [row[column] for row in self.rows]
-        # Plain numbers, the usual case, are read 10 times faster without looking at each cell.
+        # Fast path, 10 times faster: a column of plain numbers needs no check of each cell.
         joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
         unambiguous = self.decimal == "." or (self.decimal == "," and not any("." in cell for cell in cells))
         if unambiguous and _PLAIN_NUMBERS.fullmatch(joined):
@@ -106,7 +107,7 @@ def parse_number(text: str, decimal: str = ".") -> float:
     Parameters
     ----------
     text : one cell.
-    decimal : the decimal mark of the file, blank where unknown; it only settles what 1,069 and 1.069 are.
+    decimal : decimal mark of the file, blank if unknown; used only to interpret numbers such as 1,069 and 1.069.
 
     Returns
     -------
@@ -115,7 +116,7 @@ def parse_number(text: str, decimal: str = ".") -> float:
     Raises
     ------
     TableError
-        Saying what is wrong with it, without repeating it.
+        If it is not a number; the message does not quote the text.
 
     >>> parse_number("0,5"), parse_number(" 2.5e3 "), parse_number("1,069", decimal=",")
     (0.5, 2500.0, 1.069)
@@ -140,11 +141,11 @@ def parse_number(text: str, decimal: str = ".") -> float:
 
 
 def decode_text(data: bytes) -> str:
-    r"""Text of a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
+    r"""Decode a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
 
     Parameters
     ----------
-    data : the bytes of a file.
+    data : content of the file.
 
     Returns
     -------
@@ -168,7 +169,7 @@ def decode_text(data: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Decoded text of a file of at most `MAX_TABLE_BYTES`.
+    """Read a text file of at most `MAX_TABLE_BYTES`.
 
     Parameters
     ----------
@@ -181,7 +182,7 @@ def read_text(path: Path) -> str:
     Raises
     ------
     TableError
-        If there is no such file, it cannot be opened, is too large or is not text.
+        If the file does not exist, cannot be opened, is too large or is not text.
     """
     try:
         if file_size(path) > MAX_TABLE_BYTES:
@@ -208,18 +209,18 @@ def read_table(path: Path) -> Table:
     Raises
     ------
     TableError
-        A sentence without the file's name, which the caller knows.
+        If it is not a table; the message does not contain the name of the file.
     """
     return parse_table(read_text(path))
 
 
 def parse_table(text: str, skip_lines: int = 0) -> Table:
-    r"""Read the text of a CSV; `skip_lines` lines stand before its header.
+    r"""Read the text of a CSV file.
 
     Parameters
     ----------
-    text : content of a CSV.
-    skip_lines : lines that stand before the header.
+    text : content of the file.
+    skip_lines : number of lines to skip before the header.
 
     Returns
     -------
@@ -256,25 +257,25 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
 
 
 def _find_delimiter(header: str) -> str:
-    """The separator that cuts the header in most cells; headers hold no decimal commas, so this is safe."""
+    """Return the separator that splits the header into most cells; headers contain no decimal commas."""
     bare = re.sub(r'"[^"]*"', "", header)
     return max("\t;,", key=bare.count) if any(mark in bare for mark in "\t;,") else ","
 
 
 def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
-    """Lines cut in stripped cells, each with the number of the line it starts on."""
+    """Split the text into records of stripped cells, each with the number of the line on which it starts."""
     try:
-        return _cut(text, delimiter, strict=True)
+        return _split_records(text, delimiter, strict=True)
     except csv.Error as error:
         if "end of data" in str(error):
             raise TableError("has a quotation mark that is never closed: remove it") from None
     try:
-        return _cut(text, delimiter, strict=False)
+        return _split_records(text, delimiter, strict=False)
     except csv.Error as error:
         raise TableError(f"is not a table ({error}): save it as CSV") from None
 
 
-def _cut(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]:
+def _split_records(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]:
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=strict)
     records, start = [], 1
     for cells in reader:
@@ -284,39 +285,39 @@ def _cut(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]
 
 
 def _find_decimal(cells: list[str], delimiter: str) -> str:
-    """Decimal mark of a table: that of the numbers that can be read one way only, else what its separator suggests."""
+    """Return the decimal mark: that of the unambiguous numbers; without any, that which the separator suggests."""
     if not any("," in cell for cell in cells):
         return "."
     marks: set[str] = set()
-    doubtful: set[str] = set()
+    ambiguous: set[str] = set()
     for cell in cells:
         if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
-            (doubtful if _AMBIGUOUS_NUMBER.fullmatch(cell) else marks).add("," if "," in cell else ".")
+            (ambiguous if _AMBIGUOUS_NUMBER.fullmatch(cell) else marks).add("," if "," in cell else ".")
     if not marks and delimiter == ";":
-        marks = doubtful
+        marks = ambiguous
     if len(marks) == 2:
         return ""
     return marks.pop() if marks else "."
 
 
 def safe_join(folder: Path, relative: str) -> Path:
-    r"""Path of a file inside `folder`, judged by its text alone: a link inside the folder may point out of it.
+    r"""Return the path of a file inside `folder`; only its text is checked, so a link may still lead outside.
 
-    Windows' backslashes count as slashes.
+    Backslashes count as slashes.
 
     Parameters
     ----------
-    folder : the folder that must not be left.
-    relative : what the sheet or the settings say.
+    folder : folder that the path must not leave.
+    relative : path stated by the sheet or the settings.
 
     Returns
     -------
-    the path, inside `folder` by its text.
+    the path below `folder`.
 
     Raises
     ------
     TableError
-        If `relative` is blank, absolute, starts with a drive letter or climbs out of the folder.
+        If `relative` is blank, absolute, starts with a drive letter or leaves the folder.
 
     >>> safe_join(Path("exp"), r"videos\a.mp4").as_posix()
     'exp/videos/a.mp4'
@@ -325,7 +326,8 @@ def safe_join(folder: Path, relative: str) -> Path:
     vinetrack.core.tables.TableError: leads out of the experiment folder: move the file into it, or put a link there
     """
     text = relative.strip().replace("\\", "/")
-    # Control characters, line and paragraph separators; macOS itself puts unusual blanks in the names of recordings.
+    # Refuse control characters, surrogates, line and paragraph separators. Unusual spaces are allowed: macOS puts them
+    # into the names of recordings.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
         raise TableError("contains characters that no path should have: type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
@@ -344,13 +346,13 @@ def safe_join(folder: Path, relative: str) -> Path:
 
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
-    """Path of a result named after a trial, vine or condition; a name that could leave `folder` is refused.
+    """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`.
 
     Parameters
     ----------
-    folder : where the file goes.
-    name : of a trial, vine or condition.
-    suffix : with its dot.
+    folder : folder of the file.
+    name : name of a trial, vine or condition.
+    suffix : suffix of the file, with its dot.
 
     Returns
     -------
@@ -366,11 +368,11 @@ def result_file(folder: Path, name: str, suffix: str) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, with its suffix; on success it takes the place of `path`, else it goes.
+    """Yield a temporary path beside `path`; on success it is renamed to `path`, otherwise deleted.
 
     Parameters
     ----------
-    path : the file to be written, by whatever wants a path; its folder is made where it is missing.
+    path : the file to write; a missing folder is created.
 
     Yields
     ------
@@ -386,30 +388,30 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a whole file or none.
+    """Write a file atomically.
 
     Parameters
     ----------
-    path : the file; its folder is made where it is missing.
-    data : the whole content.
+    path : the file; a missing folder is created.
+    data : content of the file.
     """
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a whole file or none, in UTF-8; line ends stay as they are.
+    """Write a text file atomically, in UTF-8, without changing line ends.
 
     Parameters
     ----------
     path : the file.
-    text : the whole content.
+    text : content of the file.
     """
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
-    """Write a table with its header as first line; missing numbers are `NaN`, missing text is blank.
+    """Write a table atomically as CSV; missing numbers are `NaN`, missing text is blank.
 
     Floats are written with all digits needed to read back the same value.
 
@@ -429,7 +431,7 @@ def write_json(path: Path, content: Any) -> None:
 
     Parameters
     ----------
-    path : the file; STANDARD_OUTPUT prints it.
+    path : the file; STANDARD_OUTPUT for the terminal.
     content : mappings, lists, numbers, text, arrays and paths.
     """
     text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
@@ -437,7 +439,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def _plain(content: Any) -> Any:
-    """Content in the types JSON knows."""
+    """Convert content to JSON types."""
     if isinstance(content, dict):
         return {str(key): _plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):

@@ -1,7 +1,7 @@
-"""What a person sees on the terminal: aligned tables with units, bars with the time left, colour where it is wanted.
+"""Terminal output: aligned tables with units, progress bars, colour.
 
-Bars go to standard error and show on a terminal only; what is piped, logged or run by a workflow stays plain. Colour
-is for a terminal that has not declined it (https://no-color.org).
+Progress bars go to standard error and appear only on a terminal; piped or logged output stays plain. Colour is used on
+a terminal unless NO_COLOR is set (https://no-color.org).
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from typing import Any, Generic, TextIO, TypeVar
 Item = TypeVar("Item")
 
 PROGRESS_DELAY_S = 0.5
-"""Chosen: work done within half a second needs no bar; work of two seconds shows one for most of its time."""
+"""Delay before a progress bar appears. Chosen: half a second of work needs no bar; two seconds show one most of the
+time."""
 
 COLUMN_GAP = "  "
 STYLE_CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
@@ -32,15 +33,15 @@ _NO_VALUE = frozenset({"", "–", "-", "—", "nan", "open"})
 
 
 def colour_wanted(stream: TextIO | None = None) -> bool:
-    """Whether a stream is a terminal that wants colour.
+    """Whether to use colour on a stream.
 
     Parameters
     ----------
-    stream : standard output if None.
+    stream : the stream; None for standard output.
 
     Returns
     -------
-    False where NO_COLOR is set, the terminal is "dumb", or the stream is no terminal.
+    False if NO_COLOR is set, TERM is "dumb", or the stream is not a terminal.
     """
     stream = stream or sys.stdout
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
@@ -49,13 +50,13 @@ def colour_wanted(stream: TextIO | None = None) -> bool:
 
 
 def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
-    """The text in these styles (see `STYLE_CODES`) where the stream wants colour, else as it is.
+    """Apply styles to a text, if the stream uses colour.
 
     Parameters
     ----------
-    text : what is printed.
+    text : the text.
     *styles : keys of `STYLE_CODES`.
-    stream : where it is printed; standard output if None.
+    stream : stream to which the text is printed; None for standard output.
 
     Returns
     -------
@@ -71,8 +72,8 @@ def severity_first(line: str, stream: TextIO | None = None) -> str:
 
     Parameters
     ----------
-    line : "error: …" or "warning: …"; any other line stays as it is.
-    stream : where it is printed; standard output if None.
+    line : "error: …" or "warning: …"; any other line is returned unchanged.
+    stream : stream to which the line is printed; None for standard output.
 
     Returns
     -------
@@ -87,15 +88,15 @@ def severity_first(line: str, stream: TextIO | None = None) -> str:
 
 
 def width(text: str) -> int:
-    """Count the columns that a text takes on a terminal: styles and combining marks none, wide characters two.
+    """Return the width of a text on a terminal: 0 for styles and combining marks, 2 for wide characters.
 
     Parameters
     ----------
-    text : one line, styles included.
+    text : one line, with or without styles.
 
     Returns
     -------
-    columns.
+    number of terminal columns.
     """
     plain = _ESCAPE_CODE.sub("", text)
     return sum(
@@ -111,14 +112,14 @@ def table(
     indent: str = "",
     align: str = "",
 ) -> list[str]:
-    """Rows as lines of aligned columns: numbers to the right, words to the left.
+    """Format rows as lines of aligned columns: numbers right-aligned, words left-aligned.
 
     Parameters
     ----------
-    rows : cells of each row, as many in each; what is no text is written by `str`.
-    header, units : names of the columns and, on a line of their own, their units; no line where empty.
+    rows : cells of each row, converted by `str`.
+    header, units : names of the columns and their units, one line each; no line if empty.
     indent : text before every line.
-    align : a letter a column, `<` or `>`; by default numbers go to the right.
+    align : one character per column, `<` or `>`; by default numbers are right-aligned.
 
     Returns
     -------
@@ -147,19 +148,18 @@ def _padded(cell: str, columns: int, side: str) -> str:
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
-    """Whether a column holds numbers, or marks where there is none."""
-    known = [cell for cell in (_ESCAPE_CODE.sub("", cell).strip() for cell in cells) if cell not in _NO_VALUE]
-    return bool(known) and all(_NUMBER.fullmatch(cell) for cell in known)
+    """Whether all cells of a column are numbers or placeholders for a missing one, and at least one is a number."""
+    values = [cell for cell in (_ESCAPE_CODE.sub("", cell).strip() for cell in cells) if cell not in _NO_VALUE]
+    return bool(values) and all(_NUMBER.fullmatch(cell) for cell in values)
 
 
 class Progress(Generic[Item]):
-    """A bar with the time left, or where the end is unknown the time that has gone: see `progress`."""
+    """A progress bar with the remaining time, or with the elapsed time if the total is unknown; see `progress`."""
 
     def __init__(self, items: Iterable[Item] | None, total: int | None, description: str, unit: str) -> None:
         from tqdm import tqdm
 
         self._items = items
-        known = {"bar_format": None if total is not None else "{desc}: {n_fmt} {unit} [{elapsed}{postfix}]"}
         self._bar: Any = tqdm(
             total=total,
             desc=description,
@@ -169,11 +169,11 @@ class Progress(Generic[Item]):
             dynamic_ncols=True,
             leave=False,
             file=sys.stderr,
-            **known,
+            bar_format=None if total is not None else "{desc}: {n_fmt} {unit} [{elapsed}{postfix}]",
         )
 
     def advance(self, count: int = 1) -> None:
-        """Count steps as done.
+        """Advance by a number of steps.
 
         Parameters
         ----------
@@ -182,20 +182,20 @@ class Progress(Generic[Item]):
         self._bar.update(count)
 
     def reach(self, done: int) -> None:
-        """Set how many steps are done in all.
+        """Set the number of completed steps.
 
         Parameters
         ----------
-        done : steps since the beginning.
+        done : completed steps since the start.
         """
         self._bar.update(done - self._bar.n)
 
     def say(self, words: str) -> None:
-        """Show what is being done right now behind the bar.
+        """Show the current activity after the bar.
 
         Parameters
         ----------
-        words : a few words; the next call replaces them.
+        words : a few words, which replace those of the previous call.
         """
         self._bar.set_postfix_str(words, refresh=False)
 
@@ -217,18 +217,18 @@ class Progress(Generic[Item]):
 def progress(
     work: Iterable[Item] | int, description: str, *, total: int | None = None, unit: str = "trial"
 ) -> Progress[Item]:
-    """A bar on standard error, on a terminal only, for what takes longer than half a second.
+    """Return a progress bar, which appears on standard error after half a second if that is a terminal.
 
     Parameters
     ----------
-    work : what to go through, or how many steps there will be; where nobody knows, see `waiting`.
-    description : what is being done, a word or two.
-    total : how many there will be, for an iterable without a length.
-    unit : what is counted, in the singular.
+    work : an iterable, or the number of steps; for an unknown number see `waiting`.
+    description : one or two words.
+    total : number of elements of an iterable without a length.
+    unit : unit of the count, in the singular.
 
     Returns
     -------
-    a bar: iterate over it, or use it as a context and call `advance` or `reach`.
+    a bar: iterate over it, or use it as a context manager and call `advance` or `reach`.
 
     >>> [item for item in progress(["a", "b"], "trials")]
     ['a', 'b']
@@ -237,12 +237,12 @@ def progress(
     """
     if isinstance(work, int):
         return Progress(None, work, description, unit)
-    known = len(work) if total is None and isinstance(work, Sized) else total
-    return Progress(work, known, description, unit)
+    count = len(work) if total is None and isinstance(work, Sized) else total
+    return Progress(work, count, description, unit)
 
 
 class waiting:  # noqa: N801 - used as a context, like a function
-    """Show that something goes on whose length nobody knows: a sign of life and the time that has gone.
+    """Context manager that shows a spinner and the elapsed time, for work of unknown length.
 
     >>> with waiting("compiling the model"):
     ...     pass
@@ -258,7 +258,7 @@ class waiting:  # noqa: N801 - used as a context, like a function
 
     def __enter__(self) -> waiting:
         if sys.stderr.isatty():
-            self._thread = threading.Thread(target=self._turn, daemon=True)
+            self._thread = threading.Thread(target=self._spin, daemon=True)
             self._thread.start()
         return self
 
@@ -269,13 +269,13 @@ class waiting:  # noqa: N801 - used as a context, like a function
         if self._thread is not None:
             self._thread.join()
 
-    def _turn(self) -> None:
-        turns = 0
+    def _spin(self) -> None:
+        steps = 0
         while not self._done.wait(self.STEP_S):
-            turns += 1
-            gone_s = turns * self.STEP_S
-            if gone_s >= PROGRESS_DELAY_S:
-                sign = self.SIGNS[turns % len(self.SIGNS)]
-                print(f"\r{sign} {self.description} … {gone_s:.0f} s", end="", file=sys.stderr, flush=True)
-        if turns * self.STEP_S >= PROGRESS_DELAY_S:
+            steps += 1
+            elapsed_s = steps * self.STEP_S
+            if elapsed_s >= PROGRESS_DELAY_S:
+                sign = self.SIGNS[steps % len(self.SIGNS)]
+                print(f"\r{sign} {self.description} … {elapsed_s:.0f} s", end="", file=sys.stderr, flush=True)
+        if steps * self.STEP_S >= PROGRESS_DELAY_S:
             print("\r\x1b[2K", end="", file=sys.stderr, flush=True)

@@ -1,6 +1,6 @@
-"""The one table of units: those of columns and options, those people write by mistake, and those tables print.
+"""Units of columns and options, units that users write by mistake, and display units.
 
-Inside the program all is SI. A name that carries a unit ends in it: `pressure_kPa`, `film_density_kg_m3`.
+The program calculates in SI. A name that carries a unit ends with it: `pressure_kPa`, `film_density_kg_m3`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit and its size: value in SI = value · `multiply` / `divide`.
+    """A unit and its conversion: value in SI = value · `multiply` / `divide`.
 
-    Two numbers in place of one factor, so that both are exact: 28.7 mm / 1000 is the double next to 0.0287, while
-    28.7 · 0.001 may miss it by one in the last place. `text` is how it is printed, `metavar` how the help of a command
-    names a value in it.
+    Factor and divisor are separate so that both are exact: 28.7 / 1000 is the double closest to 0.0287, whereas
+    28.7 · 0.001 may differ in the last place. `text` is the printed unit, `metavar` the placeholder of a value in the
+    help of a command.
     """
 
     si: str
@@ -85,9 +85,9 @@ UNITS: dict[str, Unit] = {
     "kg_m3": Unit("kg_m3", "kg/m³"),
     "fps": Unit("fps", "frames a second"),
 }
-"""Units by the ending of a name. An inch is 25.4 mm, a foot 304.8 mm, a pound 453.59237 g and an ounce a sixteenth of
-it, all by definition (international yard and pound agreement, 1959); a psi is the weight of a pound (g = 9.80665 m/s²)
-on a square inch: 0.45359237 · 9.80665 / 0.0254² Pa."""
+"""Units by the suffix of a name. By definition (international yard and pound agreement, 1959) an inch is 25.4 mm, a
+foot 304.8 mm, a pound 453.59237 g and an ounce 1/16 pound; a psi is the weight of a pound (g = 9.80665 m/s²) on a
+square inch: 0.45359237 · 9.80665 / 0.0254² Pa."""
 
 DISPLAY_UNITS: dict[str, tuple[str, float]] = {
     "Pa": ("kPa", 1e-3),
@@ -95,28 +95,28 @@ DISPLAY_UNITS: dict[str, tuple[str, float]] = {
     "kg": ("g", 1e3),
     "1": ("", 1.0),
 }
-"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa, what they carry and
-turn in grams; "1" has no unit."""
+"""Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is
+dimensionless."""
 
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}
-"""The same for a slider, which moves in steps that a hand can see; lengths of vines are of millimetres."""
+"""Display units of sliders; lengths are shown in millimetres."""
 
 PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}
-"""The same for a prediction: a vine grows in a tenth of a second."""
+"""Display units of predictions; times are shown in milliseconds, since a vine grows within a tenth of a second."""
 
 
 def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS) -> tuple[str, float]:
-    """Return the unit shown in place of an SI unit, and the factor from SI to it.
+    """Return the display unit of an SI unit, and the factor from SI.
 
     Parameters
     ----------
-    unit : SI unit as parameters of effects state it, such as ``"1/Pa"``.
-    table : what is shown in place of what, for a slider or a prediction.
+    unit : SI unit as stated by parameters of effects, such as ``"1/Pa"``.
+    table : display units, such as `SLIDER_UNITS` or `PREDICTION_UNITS`.
 
     Returns
     -------
     name, factor
-        The unit itself and 1.0 where nothing else is shown in its place.
+        The unit itself and 1.0 if it has no other display unit.
 
     >>> display_unit("Pa"), display_unit("m")
     (('kPa', 0.001), ('m', 1.0))
@@ -125,11 +125,11 @@ def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNI
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Split a name into what it names and the key of its unit, which is blank where it ends in none.
+    """Split a name into its quantity and the key of its unit, which is blank if the name does not end in a unit.
 
     Parameters
     ----------
-    name : of a column, key or option.
+    name : name of a column, key or option.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def convert(value: float, unit: str, to: str) -> float:
-    """Return a value in another unit of the same quantity.
+    """Convert a value to another unit of the same quantity.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def convert(value: float, unit: str, to: str) -> float:
     Raises
     ------
     ValueError
-        If the two measure different quantities.
+        If the units belong to different quantities.
 
     >>> convert(4, "psi", "kPa"), convert(1, "in", "mm")
     (27.579029172673444, 25.4)
@@ -168,5 +168,5 @@ def convert(value: float, unit: str, to: str) -> float:
     given, wanted = UNITS[unit], UNITS[to]
     if given.si != wanted.si:
         raise ValueError(f"{given.text} cannot be turned into {wanted.text}")
-    # Both factors in one product: 1 in is 25.4 mm, not 25.4 · 1000 / 1000 with the rounding of each step.
+    # One product of both factors avoids the rounding of an intermediate SI value: 1 in is exactly 25.4 mm.
     return value * (given.multiply * wanted.divide) / (given.divide * wanted.multiply)

@@ -1,4 +1,4 @@
-"""YAML as people expect it: a key twice is an error, 10:20 is text, and every key knows its line."""
+"""Reading YAML without its surprises: repeated keys are errors, 10:20 is text, and the line of every key is known."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, read_text
 
 MAX_KEYS = 10_000
-"""Keys of a document at most. Chosen: fifty times what an experiment of 200 trials needs; half or twice changes
-nothing but how soon a hostile file is refused."""
+"""Largest number of keys of a document. Chosen: fifty times what an experiment of 200 trials needs; half or twice only
+changes how soon a malicious file is refused."""
 
 
 @dataclass(frozen=True)
 class YamlDocument:
-    """Content of a YAML file; `lines` maps the path to each key, as a tuple, to its line from 1."""
+    """Content of a YAML file; `lines` maps the path of each key, as a tuple, to its line, from 1."""
 
     content: Any
     lines: dict[tuple[Any, ...], int]
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader without YAML 1.1's surprises: no base-60 numbers (10:20), octals (010), dates or underscores."""
+    """Safe loader without base-60 numbers (10:20), octal numbers (010), dates and underscores in numbers of YAML 1.1."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -63,7 +63,7 @@ def read_yaml(path: Path) -> YamlDocument:
     Raises
     ------
     ExperimentError
-        If it cannot be read, is not YAML, holds no mapping or holds a key twice.
+        If it cannot be read, is not YAML, is not a mapping, or contains a key twice.
     """
     try:
         text = read_text(path)
@@ -113,8 +113,8 @@ def parse_yaml(text: str, file: str) -> YamlDocument:
 def _walk(
     node: Any, path: tuple[Any, ...], lines: dict[tuple[Any, ...], int], repeated: list[Problem], file: str
 ) -> None:
-    """Note the line of every key below a node, and every key that is written twice."""
-    # Aliases of aliases can stand for more keys than memory holds; no settings come near either limit.
+    """Record the line of every key below a node in `lines`, and every repeated key in `repeated`."""
+    # Nested aliases can expand to more keys than fit into memory; real settings are far below both limits.
     if len(path) > 20 or len(lines) > MAX_KEYS:
         raise ValueError("too large")
     if isinstance(node, yaml.MappingNode):
@@ -134,7 +134,7 @@ def _walk(
 
 
 def _syntax_problem(error: Exception, file: str) -> Problem:
-    """Where and why the text is not YAML, in one sentence."""
+    """Return the problem of a text that is not YAML, with its line."""
     mark = getattr(error, "problem_mark", None)
     reason = getattr(error, "problem", None) or "it cannot be understood"
     remedy = "use spaces (no tabs) to indent, a space after each colon, and quotes around text that contains : or #"
@@ -143,26 +143,26 @@ def _syntax_problem(error: Exception, file: str) -> Problem:
 
 
 def with_list(text: str, key: str, values: Sequence[str], file: str = "experiment.yaml") -> str:
-    r"""The text with a top-level key set to a list of plain words; all else, comments included, stays as it is.
+    r"""Return the text with a top-level key set to a list of words; everything else, comments included, is unchanged.
 
-    A list that stands in brackets on one line stays so, one with a line for each value too; a comment behind the value
-    or between its lines stays. The key is added at the end where there is none.
+    A list in brackets stays in brackets, and a list with one line per value stays so; comments after the value and
+    between its lines are kept. A missing key is added at the end.
 
     Parameters
     ----------
     text : YAML.
-    key : a key of the first level.
+    key : a top-level key.
     values : words of letters, digits and underscores.
     file : its name, for messages.
 
     Returns
     -------
-    the text, changed.
+    the changed text.
 
     Raises
     ------
     ExperimentError
-        If the text is not YAML, or what comes out would not hold just that (the key is an anchor's alias, say).
+        If the text is not YAML, or the change would alter other keys (for example if the value is an alias).
 
     Examples
     --------
@@ -185,20 +185,20 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
 
 
 def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, file: str) -> None:
-    """Make sure that a text in which a key was set holds what it should and nothing else has changed.
+    """Check that an edited text has exactly the expected content.
 
     Parameters
     ----------
-    changed : YAML.
-    expected : its content.
-    key : that was set.
-    shown : the value as a person would write it.
-    file : its name, for messages.
+    changed : the edited YAML.
+    expected : expected content.
+    key : key that was set.
+    shown : its value as YAML, for the message.
+    file : name of the file, for messages.
 
     Raises
     ------
     ExperimentError
-        If it does not.
+        If the content differs.
     """
     try:
         correct = parse_yaml(changed, file).content == expected
@@ -212,16 +212,16 @@ def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, fi
 
 
 def top_level_value(text: str, key: str) -> Any:
-    """The node of a top-level key's value, with its place in the text.
+    """Return the node of a top-level key's value, with its position in the text.
 
     Parameters
     ----------
     text : YAML.
-    key : a key of the first level.
+    key : a top-level key.
 
     Returns
     -------
-    yaml.Node; None where there is no such key, or no mapping.
+    yaml.Node; None if there is no such key, or the text is not a mapping.
     """
     loader = _Loader(text)
     try:
@@ -233,21 +233,25 @@ def top_level_value(text: str, key: str) -> Any:
 
 
 def _with_block_items(text: str, node: Any, values: Sequence[str]) -> str:
-    """A list with a line for each value: lines of values that go are removed, new ones follow the last that stays."""
+    """Set a list with one line per value: drop the lines of removed values, add new ones after the last that is kept.
+
+    If the order of the kept values changes, all lines are replaced.
+    """
     lines = text.splitlines(keepends=True)
     items = [(element.start_mark.line, str(getattr(element, "value", ""))) for element in node.value]
     indent = " " * node.start_mark.column
-    at = {value: line for line, value in items}
-    gone = {line for line, value in items if value not in values}
-    kept = [value for value in values if value in at]
-    if [value for _, value in items if value in values] != kept or list(values[: len(kept)]) != kept:
-        gone, kept = set(at.values()), []
-    new = [f"{indent}- {value}\n" for value in values[len(kept) :]]
-    after = max((at[value] for value in kept), default=node.start_mark.line - 1)
-    out: list[str] = []
+    line_of = {value: line for line, value in items}
+    dropped_lines = {line for line, value in items if value not in values}
+    kept_values = [value for value in values if value in line_of]
+    keeps_order = [value for _, value in items if value in values] == kept_values
+    if not keeps_order or list(values[: len(kept_values)]) != kept_values:
+        dropped_lines, kept_values = set(line_of.values()), []
+    new_lines = [f"{indent}- {value}\n" for value in values[len(kept_values) :]]
+    insert_after = max((line_of[value] for value in kept_values), default=node.start_mark.line - 1)
+    result: list[str] = []
     for number, line in enumerate(lines):
-        if number not in gone:
-            out.append(line if line.endswith("\n") or number < len(lines) - 1 else line + "\n")
-        if number == after:
-            out += new
-    return "".join(out if after >= 0 else [*new, *out])
+        if number not in dropped_lines:
+            result.append(line if line.endswith("\n") or number < len(lines) - 1 else line + "\n")
+        if number == insert_after:
+            result += new_lines
+    return "".join(result if insert_after >= 0 else [*new_lines, *result])

@@ -1,4 +1,4 @@
-"""A key of a YAML file set or cleared in place: every other character, comments included, stays as it is."""
+"""Setting or clearing a key of a YAML file in place, without changing any other character, comments included."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from vinetrack.core.yaml_document import parse_yaml, top_level_value, verify_edi
 _PLAIN_TEXT = re.compile(r"[A-Za-z_./][\w./ -]*")
 _YAML_WORDS = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
 _Edit = tuple[int, int, str]
-"""Text to put in place of that between two indices."""
+"""Start index, end index, and the text that replaces what lies between."""
 
 
 def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -> str:
-    r"""The text with a top-level key set to a value; all else stays as it is.
+    r"""Return the text with a top-level key set to a value; everything else is unchanged.
 
     Parameters
     ----------
     text : YAML.
-    key : a key of the first level.
-    value : a number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. Of a
-        mapping that has a line for each key, only lines whose value differs change.
+    key : a top-level key.
+    value : a number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. In a
+        mapping with one line per key, only lines whose value differs are changed.
     file : its name, for messages.
 
     Returns
     -------
-    the text, changed.
+    the changed text.
 
     Raises
     ------
     ExperimentError
-        If the text is not YAML, or what comes out would not hold just that (the key is an anchor's alias, say).
+        If the text is not YAML, or the change would alter other keys (for example if the value is an alias).
 
     Examples
     --------
@@ -61,7 +61,7 @@ def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -
 
 
 def _edits(text: str, node: Any, value: Any) -> list[_Edit]:
-    """Edits that turn the value at a node into another one."""
+    """Return the edits that replace the value at a node."""
     is_block = isinstance(node, yaml.CollectionNode) and not node.flow_style
     if isinstance(value, Mapping) and is_block and isinstance(node, yaml.MappingNode):
         return _mapping_edits(text, node, value)
@@ -69,18 +69,18 @@ def _edits(text: str, node: Any, value: Any) -> list[_Edit]:
         return [_lines_of(text, node.value[0], node)] if value is None and node.value else []
     begin, end = node.start_mark.index, node.end_mark.index
     if isinstance(value, Mapping) and begin == end:
-        # A blank key: its lines follow behind the comment that may stand after it.
+        # The key is blank: insert the lines of the mapping after the end of the line, which may hold a comment.
         after = text.find("\n", begin)
         lines = "".join(f"\n  {name}: {_inline(inner)}" for name, inner in value.items())
         return [(after, after, lines) if after >= 0 else (len(text), len(text), lines + "\n")]
     if value is None:
-        # The blank before the value goes with it.
+        # Remove the space before the value as well.
         return [(begin - 1 if begin < end and text[begin - 1] == " " else begin, end, "")]
     return [(begin, end, (" " if begin == end else "") + _inline(value))]
 
 
 def _mapping_edits(text: str, node: Any, value: Mapping[str, Any]) -> list[_Edit]:
-    """Edits of a mapping that has a line for each key."""
+    """Return the edits of a mapping with one line per key."""
     edits: list[_Edit] = []
     present = {}
     for name, inner in node.value:
@@ -100,7 +100,7 @@ def _mapping_edits(text: str, node: Any, value: Mapping[str, Any]) -> list[_Edit
 
 
 def _differs(text: str, node: Any, value: Any) -> bool:
-    """Whether the value at a node is another one."""
+    """Whether the value at a node differs from `value`."""
     shown = text[node.start_mark.index : node.end_mark.index]
     try:
         return bool(parse_yaml(f"v: {shown}\n", "").content["v"] != _plain(value))
@@ -109,13 +109,13 @@ def _differs(text: str, node: Any, value: Any) -> bool:
 
 
 def _lines_of(text: str, first: Any, last: Any) -> _Edit:
-    """An edit that removes the lines from one node (or pair of nodes) to another."""
+    """Return an edit that removes the lines from one node (or pair of nodes) to another."""
     start = first[0] if isinstance(first, tuple) else first
     return _line_start(text, start.start_mark.line), _line_start(text, _last_line(last) + 1), ""
 
 
 def _last_line(node: Any) -> int:
-    """Line, from 0, on which what a node holds ends; a block's own mark lies behind the comments that follow it."""
+    """Return the last line, from 0, of a node's content; the end mark of a block lies after comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _last_line(last[1] if isinstance(last, tuple) else last)
@@ -138,7 +138,7 @@ def _new_lines(key: str, value: Any) -> str:
 
 
 def _inline(value: Any) -> str:
-    """A value on one line."""
+    """Write a value on one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name}: {_inline(inner)}" for name, inner in value.items()) + "}"
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -153,7 +153,7 @@ def _inline(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value as YAML gives it back: lists for tuples."""
+    """Return the value as YAML would load it: tuples become lists."""
     if isinstance(value, Mapping):
         return {name: _plain(inner) for name, inner in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
