@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.problems import INTERNAL_ERROR, UserError
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.results.folder_layout import Results, read_json
@@ -138,10 +138,9 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     from vinetrack.pipeline.damping_stage import fit_law
     from vinetrack.pipeline.diagnosis_stage import diagnose_results
     from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
-    from vinetrack.pipeline.model_stage import INTERNAL_FAULT as MODEL_FAULT
     from vinetrack.pipeline.model_stage import fit_model
     from vinetrack.pipeline.report_stage import write_report
-    from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse_tracks, gather
+    from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse_tracks, gather
 
     settings = run_settings(SETTINGS)
     read = read_experiment(folder)
@@ -167,9 +166,9 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
         except Exception:
             return [f"{name}: {traceback.format_exc()}"]
     rows = [read_json(Results(results).analysed(name))["row"] for name in read.names if name not in read.left_out]
-    faults = [f"tracks: {row['trial']}: {row['reason']}" for row in rows if row["reason"] == INTERNAL_FAULT]
+    faults = [f"tracks: {row['trial']}: {row['reason']}" for row in rows if row["reason"] == TRIAL_NOT_ANALYSED]
     refused = {path.stem: read_json(path)["refused"] for path in (Results(results).fit, Results(results).diagnosis)}
-    return [*faults, *(f"{stage}: {reason}" for stage, reason in refused.items() if reason == MODEL_FAULT)]
+    return [*faults, *(f"{stage}: {reason}" for stage, reason in refused.items() if reason == INTERNAL_ERROR)]
 
 
 def main() -> None:

@@ -133,7 +133,7 @@ def test_refusals_are_sentences(arguments: tuple[object, ...], words: str) -> No
     done = run(*arguments)
     assert done.exit_code == 1
     assert words in done.output
-    assert "A fault of the program" not in done.output
+    assert "internal error of the program" not in done.output
 
 
 @pytest.mark.parametrize("text", ["8:4", "1:5", "4:20", "a", "4:5:6"])

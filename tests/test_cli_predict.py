@@ -98,7 +98,7 @@ def test_options_of_the_vine_beside_a_sheet_are_refused(tmp_path: Path) -> None:
     (tmp_path / "trials.csv").write_text(SHEET + "a,24,200,280,14,3,0\n")
     done = run("predict", tmp_path, "--payload-g", 5)
     assert done.exit_code == 1
-    assert "--payload-g '5' stands beside a sheet: write it in the sheet" in done.output
+    assert "--payload-g '5' is given in addition to a sheet: write it in the sheet" in done.output
 
 
 def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:

@@ -34,7 +34,7 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None
     assert list((tmp_path / ".snakemake" / "locks").glob("*.lock"))
     again = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert again.returncode == 0, again.stdout + again.stderr
-    assert f"broken off (process {first.pid})" in again.stdout
+    assert f"interrupted run (process {first.pid})" in again.stdout
     assert (results / "trials.csv").exists()
     assert not (results / OWNER_FILE).exists()
     assert not list(tmp_path.rglob(".tmp-*"))

@@ -118,7 +118,7 @@ def test_a_full_disk_is_said_as_such(vines: Path, tmp_path: Path, monkeypatch: p
     done = CliRunner().invoke(app, ["tracks", str(vines), str(tmp_path / "out")])
     assert done.exit_code == 1
     assert done.output.strip() == (
-        "The disk is full: make room and run the same command again; what was finished is kept."
+        "The disk is full: free some space and run the same command again; finished results are kept."
     )
 
 

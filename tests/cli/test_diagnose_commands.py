@@ -111,7 +111,7 @@ def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experimen
     ("arguments", "sentence"),
     [
         (("diagnose", "nowhere"), "nowhere"),
-        (("add", "air_drag", "nowhere"), "nowhere is no folder"),
+        (("add", "air_drag", "nowhere"), "nowhere is not a folder"),
     ],
 )
 def test_a_wrong_folder_is_one_sentence(arguments: tuple[str, ...], sentence: str) -> None:

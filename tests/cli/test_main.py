@@ -97,7 +97,7 @@ def test_effects_lists_every_effect_with_its_formula_and_units() -> None:
 def test_a_stage_without_its_input_says_what_to_run(tmp_path: Path) -> None:
     done = run("damping", tmp_path)
     assert done.exit_code == 1
-    assert "damping_points.csv does not exist: run the stage that makes it" in done.output
+    assert "damping_points.csv does not exist: run the stage that writes it" in done.output
 
 
 def test_settings_that_are_no_json_are_refused(tmp_path: Path) -> None:
@@ -138,4 +138,4 @@ def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch:
     assert "a: could not be analysed" in done.output
     assert "1 trials, 1 failed" in run("gather", folder, tmp_path / "r").output
     assert "ZeroDivisionError: unforeseen" in (tmp_path / "t.log").read_text()
-    assert "a fault of the program" in (tmp_path / "r" / "trials.csv").read_text()
+    assert "an internal error of the program" in (tmp_path / "r" / "trials.csv").read_text()

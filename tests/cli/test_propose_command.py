@@ -57,7 +57,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
     code, output = run("propose", results)
     assert code == 1
-    assert "is there already" in output
+    assert "exists already" in output
     elsewhere = shutil.copy(path, tmp_path)
     code, output = run("add", elsewhere, results, "--save")
     assert code == 1

@@ -68,12 +68,12 @@ def test_a_refit_prints_what_it_found_and_save_writes_the_model(copied: tuple[Pa
 
 def test_what_cannot_be_done_is_one_sentence(copied: tuple[Path, Path], tmp_path: Path) -> None:
     experiment, results = copied
-    assert "is no folder" in refused("explore", tmp_path / "nowhere")
+    assert "is not a folder" in refused("explore", tmp_path / "nowhere")
     assert "did you mean air_drag?" in refused("explore", results, "--add", "air_drg", "--save")
     assert "is one of the base effects" in refused("explore", results, "--drop", "gravity", "--save")
     assert "is no export format" in refused("explore", results, "--export", tmp_path / "a.doc")
     experiment.rename(tmp_path / "moved")
-    assert "has moved: say where it is with --experiment" in refused("explore", results, "--save")
+    assert "does not exist any more: give its new path with --experiment" in refused("explore", results, "--save")
     assert "Saved" in run("explore", results, "--experiment", tmp_path / "moved", "--save")
 
 
@@ -82,7 +82,7 @@ def test_a_port_that_is_taken_is_said(campaign: Campaign) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"Port {port} is taken" in refused("explore", campaign.folder, "--no-browser", "--port", port)
+        assert f"Port {port} is in use" in refused("explore", campaign.folder, "--no-browser", "--port", port)
 
 
 def test_without_bokeh_the_page_says_what_to_install(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,11 +131,11 @@ def test_a_search_that_is_stopped_or_fails_says_so_and_may_begin_again(
     assert ended.wait(60)
 
     def refused(*_: Any) -> WrittenProposal:
-        raise ResultsError("proposed_time.py is there already: move it away, or name another file with --to.")
+        raise ResultsError("proposed_time.py exists already: move it away, or give another file with --to.")
 
     searching(monkeypatch, refused)
     browser.click("propose")
-    browser.until(lambda: "is there already" in browser.text("proposal"))
+    browser.until(lambda: "exists already" in browser.text("proposal"))
     assert browser.model("propose").label == proposal.PROPOSE
     assert not browser.model("open_proposed").visible
 

@@ -128,7 +128,7 @@ def test_compare_prints_a_finished_folder_aligned_and_with_units(campaign: tuple
 def test_compare_of_a_folder_without_a_fit_says_what_to_run(tmp_path: Path) -> None:
     done = run("compare", tmp_path)
     assert done.exit_code == 1
-    assert "fit.json does not exist: run the stage that makes it, or snakemake for all" in done.output
+    assert "fit.json does not exist: run the stage that writes it, or all with snakemake" in done.output
 
 
 def test_tracks_are_read_back_as_they_were_written(campaign: tuple[Path, Path, str]) -> None:
@@ -224,6 +224,6 @@ def test_an_unforeseen_fault_stops_nothing_and_stands_in_the_log(
     results = analysed(experiment, tmp_path / "results")
     done = run("model", experiment, results, "--log", tmp_path / "log.txt")
     assert done.exit_code == 0
-    assert "a fault of the program" in done.output
+    assert "an internal error of the program" in done.output
     assert "surprise" in (tmp_path / "log.txt").read_text()
     assert source.exists()

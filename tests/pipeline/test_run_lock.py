@@ -52,7 +52,7 @@ def test_the_lock_of_a_killed_run_is_taken_away_and_said(tmp_path: Path, other_r
     other_run.kill()
     other_run.wait()
     (line,) = begin(tmp_path)
-    assert f"broken off (process {other_run.pid}) is taken away" in line
+    assert f"lock of an interrupted run (process {other_run.pid})" in line
     assert not (tmp_path / ".snakemake" / "locks" / "0.output.lock").exists()
 
 
@@ -70,7 +70,7 @@ def test_a_run_that_was_killed_and_not_yet_waited_for_is_dead(tmp_path: Path, ot
 
 
 def test_a_run_that_lives_is_named_and_keeps_its_lock(tmp_path: Path, other_run: subprocess.Popen[str]) -> None:
-    with pytest.raises(ExperimentError, match=f"is being written by process {other_run.pid}, since"):
+    with pytest.raises(ExperimentError, match=f"is being written by another run, process {other_run.pid}, started at"):
         begin(tmp_path)
     assert (tmp_path / ".snakemake" / "locks" / "0.output.lock").exists()
 
@@ -102,7 +102,7 @@ def test_a_run_on_another_computer_counts_as_alive(tmp_path: Path) -> None:
     entry = tmp_path / "results" / "vines" / OWNER_FILE
     begin(tmp_path)
     entry.write_text(json.dumps(json.loads(entry.read_text()) | {"pid": 1, "host": "elsewhere"}))
-    with pytest.raises(ExperimentError, match=rf"of the computer elsewhere.*remove .*{OWNER_FILE}"):
+    with pytest.raises(ExperimentError, match=rf"on the computer elsewhere.*delete .*{OWNER_FILE}"):
         begin(tmp_path)
 
 

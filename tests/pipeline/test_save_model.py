@@ -59,7 +59,7 @@ def test_a_list_at_the_end_without_a_line_end_is_kept_whole() -> None:
 
 
 def test_what_cannot_be_set_without_harm_is_refused_with_the_line_to_write() -> None:
-    with pytest.raises(ExperimentError, match=r"set it yourself: model: \[a\]"):
+    with pytest.raises(ExperimentError, match=r"set it by hand: model: \[a\]"):
         with_list("base: &m [x]\nmodel: *m\n", "model", ["a"])
 
 

@@ -64,21 +64,21 @@ def test_the_shipped_demonstration_is_found_wherever_snakemake_is_run(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
-    assert plan.nature
-    assert plan.nature.name == "demo.yaml"
+    assert plan.ground_truth
+    assert plan.ground_truth.name == "demo.yaml"
     assert plan.results == Path("results/demo")
     assert plan.measurements == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
 
 
 def test_another_experiment_is_none_of_the_laboratory(tmp_path: Path) -> None:
     experiment(tmp_path / "data" / "demo")
-    assert make_plan({"experiment": str(experiment(tmp_path / "v"))}, tmp_path).nature is None
+    assert make_plan({"experiment": str(experiment(tmp_path / "v"))}, tmp_path).ground_truth is None
 
 
-def test_every_shipped_experiment_has_its_own_nature(tmp_path: Path) -> None:
+def test_every_shipped_experiment_has_its_own_ground_truth(tmp_path: Path) -> None:
     for name in ("demo", "paper"):
         plan = make_plan({"experiment": f"data/{name}", "results": str(tmp_path)}, ROOT)
-        assert plan.nature == ROOT / "vinetrack" / "laboratory" / f"{name}.yaml"
+        assert plan.ground_truth == ROOT / "vinetrack" / "laboratory" / f"{name}.yaml"
         assert plan.published is (name == "paper")
         assert all(Path(path).parent.name in ("videos", "calibration", "tracks") for path in plan.measurements)
 
@@ -91,7 +91,7 @@ def test_a_missing_folder_names_the_one_that_was_probably_meant(tmp_path: Path) 
 
 def test_a_missing_folder_without_a_likeness_names_the_experiments_there_are(tmp_path: Path) -> None:
     experiment(tmp_path / "vines")
-    with pytest.raises(ExperimentError, match=r"there is .*vines"):
+    with pytest.raises(ExperimentError, match=r"existing experiments are .*vines"):
         find_experiment(tmp_path / "zzz" / "deep")
 
 
@@ -133,7 +133,7 @@ def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_p
 
 
 def test_a_folder_that_snakemake_would_take_for_a_wildcard_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match=r"has a brace .* in its path.*rename the folder"):
+    with pytest.raises(ExperimentError, match=r"has braces .* in its path.*rename the folder"):
         make_plan({"experiment": str(experiment(tmp_path / "v{1}"))}, tmp_path)
 
 
@@ -209,7 +209,7 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
     (tmp_path / name).mkdir()
     (tmp_path / name / "trials.csv").write_text("trial\n")
     reasons = [problem.message for problem in check_folder(tmp_path / name).problems]
-    assert reasons[0] == "has a brace or a word in < > in its path, which Snakemake cannot read"
+    assert reasons[0] == "has braces or a word in < > in its path, which Snakemake cannot handle"
 
 
 def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> None:

@@ -376,7 +376,7 @@ def _count_range(text: str, name: str, least: int, most: int) -> tuple[int, int]
     except ValueError:
         values = []
     if len(values) not in (1, 2) or not least <= values[0] <= values[-1] <= most:
-        raise typer.BadParameter(f"{text!r} is no range within {least}:{most}, such as 4:8", param_hint=name)
+        raise typer.BadParameter(f"{text!r} is not a range within {least}:{most}, such as 4:8", param_hint=name)
     return values[0], values[-1]
 
 

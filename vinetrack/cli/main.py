@@ -203,7 +203,7 @@ def _recording(
 
         read = _read(experiment)
         if trial not in [filmed.name for filmed in read.trials if filmed.video is not None]:
-            raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
+            raise typer.BadParameter(f"{trial!r} is not a trial with a recording in {experiment}", param_hint="TRIAL")
         with _activity_sign(f"tracking {trial}", log):
             outcome = analyse_recording(read, trial, results, _run_settings(settings))
         typer.echo(outcome)
@@ -281,7 +281,7 @@ def _figures(
         from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
 
         if of not in ("trials", "campaign", "all"):
-            raise typer.BadParameter(f"{of!r} is none of trials, campaign, all", param_hint="--of")
+            raise typer.BadParameter(f"{of!r} is not one of trials, campaign, all", param_hint="--of")
         chosen = _run_settings(settings).figures
         read = _read(experiment)
         if of != "campaign":
@@ -361,7 +361,7 @@ def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
     if not isinstance(names, list):
         raise typer.BadParameter('is not a JSON list such as ["t1", "t2"]', param_hint="--trials")
     if unknown := [name for name in names if name not in experiment.names]:
-        raise typer.BadParameter(f"{unknown[0]!r} is no trial of the sheet", param_hint="--trials")
+        raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
     return names
 
 
@@ -379,19 +379,21 @@ def _errors_as_sentences(log: Path | None) -> Iterator[None]:
     except ExperimentError as error:
         _exit_with("\n".join(format_problems(error.problems)))
     except KeyboardInterrupt:
-        _exit_with("Stopped; what was finished is kept.")
+        _exit_with("Stopped; finished results are kept.")
     except BrokenPipeError:
         # Whoever reads (`| head`) has seen enough; Python would complain once more when it closes the pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except Exception as error:
         if is_disk_full(error):
-            _exit_with("The disk is full: make room and run the same command again; what was finished is kept.")
+            _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
             _exit_with(str(error))
         place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
-        _exit_with(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")
+        _exit_with(
+            f"An internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}."
+        )
 
 
 def _exit_with(message: str) -> None:

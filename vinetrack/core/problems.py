@@ -16,6 +16,9 @@ CLOSE_NAME_RATIO = 0.6
 MAX_QUOTED_LENGTH = 60
 """Longest quotation of a value in a message. Chosen: half a line; a pasted paragraph would hide the message."""
 
+INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
+"""Reason given for a trial or stage that an unexpected exception stopped."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:

@@ -27,7 +27,7 @@ class YamlDocument:
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader without base-60 numbers (10:20), octal numbers (010), dates and underscores in numbers of YAML 1.1."""
+    """Safe loader without the base-60 numbers (10:20), octal numbers, dates and underscores of YAML 1.1."""
 
 
 _Loader.yaml_implicit_resolvers = {

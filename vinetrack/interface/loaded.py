@@ -187,10 +187,12 @@ def load(folder: Path | str) -> LoadedResults:
     >>> import vinetrack as vt
     >>> vt.load("nowhere")
     Traceback (most recent call last):
-    vinetrack.results.folder_layout.ResultsError: nowhere is no results folder: ...
+    vinetrack.results.folder_layout.ResultsError: nowhere is not a results folder, ...
     """
     folder = Path(folder)
     if not Results(folder).provenance.exists():
-        what = "it has no provenance.json" if folder.is_dir() else "it does not exist"
-        raise ResultsError(f"{folder} is no results folder: {what}; name the one that a run made, such as results/demo")
+        what = "because it has no provenance.json" if folder.is_dir() else "because it does not exist"
+        raise ResultsError(
+            f"{folder} is not a results folder, {what}: give the folder that a run made, such as results/demo"
+        )
     return LoadedResults(folder)

@@ -78,7 +78,7 @@ def _read_vine(text: str) -> dict[str, str]:
     match = _VINE.fullmatch(text)
     if match is None:
         remedy = "write diameter, wall and length in mm, µm, mm, such as 24x200x280"
-        raise ExperimentError([Problem(message="is no vine", column="--vine", value=text, remedy=remedy)])
+        raise ExperimentError([Problem(message="is not a vine", column="--vine", value=text, remedy=remedy)])
     return dict(
         zip(("diameter_mm", "thickness_um", "length_mm"), (part.strip() for part in match.groups()), strict=True)
     )
@@ -147,7 +147,7 @@ def _vine_inputs(asked: PredictionRequest, wanted: CampaignRequest) -> list[Pred
     """One for each vine."""
     if not wanted.vines:
         raise ExperimentError(
-            [Problem(message="is missing", column="--vine", remedy="name one or more, as 24x200x280")]
+            [Problem(message="is missing", column="--vine", remedy="name one or more, such as 24x200x280")]
         )
     vine_inputs = []
     for text in dict.fromkeys(wanted.vines):

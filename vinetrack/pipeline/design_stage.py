@@ -62,7 +62,7 @@ def read_range(column: str, text: str) -> tuple[float, float]:
     """
     values = [_cell(column, part) for part in text.split(":")]
     if len(values) > 2:
-        raise _refusal(column, text, "is no range", "write low:high, such as 5:25")
+        raise _refusal(column, text, "is not a range", "write low:high, such as 5:25")
     if values[0] > values[-1]:
         raise _refusal(column, text, "ends before it begins", "write the lower value first")
     return values[0], values[-1]

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.numbers import with_error
+from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.diagnosis_text import to_go_on, verdict_line
 from vinetrack.narrative.power_text import power_brief
 from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
-from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured_trials, model_errors
+from vinetrack.pipeline.model_stage import measured_trials, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
@@ -159,7 +160,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, model_errors()):
         return str(error)
     log.exception("no diagnosis could be made")
-    return INTERNAL_FAULT
+    return INTERNAL_ERROR
 
 
 def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dict[str, Any]:

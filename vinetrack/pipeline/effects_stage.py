@@ -43,7 +43,9 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
     user_effects = {} if experiment is None else effects_of(experiment)
     if name is None:
         if figure is not None:
-            raise ExperimentError([Problem(message="is a picture of one effect", file=str(figure), remedy="name it")])
+            raise ExperimentError(
+                [Problem(message="needs the name of one effect to draw", file=str(figure), remedy="give NAME")]
+            )
         return listing(
             [*(e for e in catalogue().values() if e.name not in user_effects), *user_effects.values()], user_effects
         )
@@ -138,7 +140,13 @@ def _write_picture(effect: Effect, path: Path) -> None:
 
     if path.suffix.lower() not in FORMATS:
         raise ExperimentError(
-            [Problem(message="is no kind of picture", file=str(path), remedy=f"end it in {', '.join(FORMATS)}")]
+            [
+                Problem(
+                    message="is not the name of a picture",
+                    file=str(path),
+                    remedy=f"end it in one of {', '.join(FORMATS)}",
+                )
+            ]
         )
     fig = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
     form = path.suffix.lower()[1:]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
 log = logging.getLogger(__name__)
-
-INTERNAL_FAULT = "a fault of the program, written down in the log of this stage"
 
 
 def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
@@ -245,7 +244,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, model_errors()):
         return str(error)
     log.exception("the model could not be fitted")
-    return INTERNAL_FAULT
+    return INTERNAL_ERROR
 
 
 def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import hand_corrected
 from vinetrack.figures.style import GREEN
 from vinetrack.narrative.verdict_summary import plain
@@ -110,7 +111,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     filmed = [filmed_trial.name for filmed_trial in read.trials if filmed_trial.video is not None]
     if trial not in filmed:
         known = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there is none"
-        raise ResultsError(f"{trial!r} is no trial with a recording in {read.folder}: {known}")
+        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {known}")
     settings = OverlaySettings(**(provenance.get("settings") or {}).get("overlays") or {})
     if seconds is not None:
         settings = settings.model_copy(update={"seconds": seconds})
@@ -155,7 +156,7 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
         return f"{trial.name}: no clip: {error}"
     except Exception:
         log.exception("%s: no clip", trial.name)
-        return f"{trial.name}: no clip: a fault of the program, written down in the log of this stage"
+        return f"{trial.name}: no clip: {INTERNAL_ERROR}"
     return ""
 
 
@@ -171,7 +172,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
     from vinetrack.video.write import write_clip
 
     if trial.video is None:
-        raise ResultsError(f"{trial.name} came without a recording; there is nothing to draw on")
+        raise ResultsError(f"{trial.name} has no recording to draw on")
     track = read_result(results.track(trial.name))
     shown = frames_to_show(track)
     rate = 1.0 / float(np.median(np.diff(track["time_s"].to_numpy()))) if len(track) > 1 else math.nan

@@ -1,4 +1,4 @@
-"""The same function over many trials in a few processes, with a bar a person can follow."""
+"""Applying a function to many trials in several processes, with a progress bar."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
 MIN_ITEMS_FOR_POOL = 8
-"""Below this many items a second process costs more to start than it saves. Chosen: starting a process takes as long as
-a few trials. At half small experiments take longer, at twice larger ones are not shared out."""
+"""Fewest items for which a second process is started. Chosen: starting a process takes as long as a few trials. At half
+small experiments take longer; at twice larger ones are not distributed."""
 
 
 def map_trials(
     function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int, label: str
 ) -> Iterator[Answer]:
-    """Yield `function(item)` for every item, in order; the bar shows on a terminal only.
+    """Yield `function(item)` for every item, in order, with a progress bar on a terminal.
 
-    `function` and items travel to other processes, so both must be picklable.
+    `function` and items are sent to other processes and must be picklable.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ def map_trials(
     items : sequence
         Arguments.
     n_workers : int
-        Number of processes; below 2 all is done in this one.
+        Number of processes; below 2, this process does all the work.
     label : str
-        Shown with the bar.
+        Text of the progress bar.
 
     Yields
     ------
@@ -52,9 +52,9 @@ def map_trials(
 
 
 def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
-    """Yield `function(item)` of every item as soon as it is there, in any order.
+    """Yield `function(item)` of every item as soon as it is ready, in any order.
 
-    `function` and items travel to other processes, so both must be picklable.
+    `function` and items are sent to other processes and must be picklable.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_w
     items : sequence
         Arguments.
     n_workers : int
-        Number of processes; below 2 all is done in this one.
+        Number of processes; below 2, this process does all the work.
 
     Yields
     ------
@@ -81,17 +81,17 @@ def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_w
 
 
 def _pool(n_workers: int) -> ProcessPoolExecutor:
-    """Processes that start as copies are ready at once; where the system cannot copy, they import what they need."""
+    """Return a pool of processes, forked on Linux, where they are ready at once, and spawned elsewhere."""
     method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
     context = multiprocessing.get_context(method)
     return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it ends, however it ends.
+    """End this worker when its parent process ends, even if the parent is killed.
 
-    A worker waits for its next argument on a pipe that the workers beside it hold open too: where a run is killed they
-    would wait for ever, each with the memory of what it did last.
+    A worker waits for its next argument on a pipe that the other workers hold open as well: after a killed run all of
+    them would wait forever and keep their memory.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None

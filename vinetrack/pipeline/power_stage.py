@@ -146,7 +146,7 @@ def _refuse_effect(name: str, power: Power) -> None:
     close = difflib.get_close_matches(name, known, 1, 0.6)
     remedy = f"did you mean {close[0]}?" if close else f"there are {', '.join(sorted(known))}"
     in_model = name in power.model
-    words = "is in the model already" if in_model else "is no candidate of these trials"
+    words = "is in the model already" if in_model else "is not a candidate for these trials"
     raise ExperimentError([Problem(message=words, column="--effect", value=name, remedy=remedy)])
 
 
@@ -356,7 +356,7 @@ def _size_of(text: str, entry: EffectPower) -> float:
         return float(text.partition("=")[2]) / factor
     except ValueError:
         remedy = f"write a number in {unit or 'the unit of the parameter'}"
-        problem = Problem(message="is no size", column="--effect", value=text, remedy=remedy)
+        problem = Problem(message="is not a size", column="--effect", value=text, remedy=remedy)
         raise ExperimentError([problem]) from None
 
 
@@ -389,7 +389,7 @@ def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCal
         if measured is None:
             problem = Problem(
                 message="needs measured trials", column="--calibrate", value=str(asked.target),
-                remedy="film first, or ask with --simulate how often such trials raise a false alarm",
+                remedy="run the trials first, or estimate the false-alarm rate with --simulate",
             )  # fmt: skip
             raise ExperimentError([problem])
         names = tuple(name for name in measured.names if name not in measured.added)

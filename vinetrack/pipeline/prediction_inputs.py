@@ -120,7 +120,9 @@ def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) ->
 
 def _refuse_beside_sheet(asked: PredictionRequest) -> None:
     problems = [
-        Problem(message="stands beside a sheet", column=option(name), value=text, remedy="write it in the sheet")
+        Problem(
+            message="is given in addition to a sheet", column=option(name), value=text, remedy="write it in the sheet"
+        )
         for name, text in asked.cells.items()
     ]
     if problems:
@@ -383,5 +385,5 @@ def check_figure(path: Path | None) -> None:
         If the ending names no format.
     """
     if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
-        remedy = f"let it end in {', '.join(FIGURE_FORMATS)}"
-        raise ExperimentError([Problem(message="is no picture's name", file=str(path), remedy=remedy)])
+        remedy = f"end it in one of {', '.join(FIGURE_FORMATS)}"
+        raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])

@@ -54,7 +54,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     results = Results(folder)
     diagnosis = read_diagnosis(results)
     if diagnosis is None:
-        raise ResultsError(f"{folder}: it has not been diagnosed; run vinetrack diagnose {folder}")
+        raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(
             f"{folder}: its verdict is `{diagnosis.final_verdict}`. A law of its own is proposed only for what no"
@@ -84,12 +84,12 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
         paths[0] = to
     for path in paths:
         if path.exists():
-            raise ResultsError(f"{path} is there already: move it away, or name another file with --to.")
+            raise ResultsError(f"{path} exists already: move it away, or give another file with --to.")
     for path, (_, text) in zip(paths, files, strict=True):
         write_text(path, text)
         remember(path)
         lines.append(f"Written to {path}. Read it; `vinetrack add {path} {folder}` fits it.")
     if files:
         settings = experiment.folder / "experiment.yaml"
-        lines.append(f"To have the diagnosis question it, name it under `effects:` of {settings}.")
+        lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
     return WrittenProposal(tuple(lines), tuple(paths))

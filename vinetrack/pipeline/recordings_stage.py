@@ -14,7 +14,7 @@ import numpy as np
 from vinetrack.core.files import is_disk_full
 from vinetrack.core.numbers import number
 from vinetrack.core.tables import write_bytes, write_json
-from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row, write_empty
+from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse, failed_row, write_empty
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     except Exception as error:
         if is_disk_full(error):
             raise  # a fault of the disk is none of this trial
-        reason, fault = INTERNAL_FAULT, traceback.format_exc()
+        reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
         write_empty(results, trial.name, failed_row(trial, reason))
     _draw_strip_figure(trial, results, measurement, reason, settings)
     return reason, fault

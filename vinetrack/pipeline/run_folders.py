@@ -1,4 +1,4 @@
-"""The folders of a run: an experiment's, found or the nearest named, and that of its results, which are of no other."""
+"""The folders of a run: that of the experiment, and that of its results, which belong to one experiment only."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vinetrack.core.problems import ExperimentError, Problem
 PACKAGE = Path(__file__).parents[1]
 
 CLAIM_FILE = "experiment.json"
-"""File of a results folder that names its experiment from the beginning of a run; `provenance.json` comes last."""
+"""File of a results folder that names its experiment from the start of a run; `provenance.json` is written last."""
 
 
 def find_experiment(folder: Path) -> Path:
-    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does.
+    """Return `folder` if it exists.
 
     Parameters
     ----------
     folder : Path
-        As the user named it.
+        The folder, as given by the user.
 
     Returns
     -------
@@ -31,7 +31,7 @@ def find_experiment(folder: Path) -> Path:
     Raises
     ------
     ExperimentError
-        If it does not exist.
+        If it does not exist; the message suggests a similar name or existing experiments.
     """
     if folder.exists():
         return folder
@@ -39,15 +39,15 @@ def find_experiment(folder: Path) -> Path:
     while not parent.is_dir():
         parent = parent.parent
     folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
-    wanted = folder.absolute().relative_to(parent).parts[0]
-    near = difflib.get_close_matches(wanted, folders, 1, 0.5)
-    sheets = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
-    if near:
-        remedy = f"did you mean {_shown(parent / near[0])}?"
-    elif sheets:
-        remedy = f"there is {', '.join(_shown(parent / name) for name in sheets)}"
+    missing = folder.absolute().relative_to(parent).parts[0]
+    close = difflib.get_close_matches(missing, folders, 1, 0.5)
+    experiments = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
+    if close:
+        remedy = f"did you mean {_shown(parent / close[0])}?"
+    elif experiments:
+        remedy = f"existing experiments are {', '.join(_shown(parent / name) for name in experiments)}"
     else:
-        remedy = f"the nearest that exists is {_shown(parent)}"
+        remedy = f"the nearest existing folder is {_shown(parent)}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
 
 
@@ -56,38 +56,38 @@ def _shown(path: Path) -> str:
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
-    """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
+    """Return the ground truth of a shipped virtual experiment; None for any other folder.
 
-    The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
+    The virtual laboratory has a file for each folder of `data/` that it makes, with the same name.
 
     Parameters
     ----------
-    folder : of an experiment.
-    base : the checkout in which `data/` may lie.
+    folder : experiment folder.
+    base : checkout that may contain `data/`.
 
     Returns
     -------
-    nature : the file of what is true.
+    path of the ground truth, or None.
     """
-    for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
-        shipped = base / "data" / nature.stem
+    for ground_truth in sorted((PACKAGE / "laboratory").glob("*.yaml")):
+        shipped = base / "data" / ground_truth.stem
         if folder.exists() and shipped.exists() and folder.samefile(shipped):
-            return nature
+            return ground_truth
     return None
 
 
 def refuse_shared_results(results: Path, experiment: Path) -> None:
-    """Refuse a results folder that holds another experiment's.
+    """Refuse a results folder that holds the results of another experiment.
 
     Parameters
     ----------
-    results : the folder, which need not exist.
-    experiment : whose results are to go there.
+    results : results folder, which need not exist.
+    experiment : experiment whose results are to be written there.
 
     Raises
     ------
     ExperimentError
-        If what is there was made from another experiment that still exists, naming both.
+        If the folder was made from another experiment that still exists; the message names both.
     """
     for name in ("provenance.json", CLAIM_FILE):
         try:
@@ -96,17 +96,20 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
             continue
         if made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
             message = f"holds the results of {made_from}, not of {experiment.absolute()}"
-            remedy = "name another folder (vinetrack run --results DIR, snakemake --config results=DIR), or rename one"
+            remedy = (
+                "choose another results folder (vinetrack run --results DIR, snakemake --config results=DIR), "
+                "or rename one of the two"
+            )
             raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
 
 
 def claim_results(results: Path, experiment: Path) -> None:
-    """Write down whose results a folder holds, before the first of them.
+    """Record to which experiment a results folder belongs, before the first result is written.
 
     Parameters
     ----------
-    results : the folder, made where it does not exist.
-    experiment : whose they are.
+    results : results folder; created if it does not exist.
+    experiment : experiment folder.
     """
     from vinetrack.core.tables import write_json
 
@@ -114,19 +117,19 @@ def claim_results(results: Path, experiment: Path) -> None:
 
 
 def path_problems(*folders: Path) -> list[Problem]:
-    """What is wrong with the names of folders, which Snakemake would say in its own words.
+    """Report folders whose path Snakemake would take for a pattern.
 
     Parameters
     ----------
-    folders : of an experiment or of results.
+    folders : folders of an experiment or of results.
 
     Returns
     -------
-    problems : an error for each that has braces or a word in angle brackets in its path.
+    problems : an error for each path with braces or a word in angle brackets.
     """
     return [
         Problem(
-            message="has a brace or a word in < > in its path, which Snakemake cannot read", file=str(folder),
+            message="has braces or a word in < > in its path, which Snakemake cannot handle", file=str(folder),
             remedy="rename the folder, or run the stages one by one with vinetrack",
         )
         for folder in folders
@@ -135,11 +138,11 @@ def path_problems(*folders: Path) -> list[Problem]:
 
 
 def has_wildcard(path: Path) -> bool:
-    """Whether Snakemake would take part of a path for a wildcard or a variable; it has no way to write such marks.
+    """Whether Snakemake would take part of a path for a wildcard or a variable, which cannot be escaped.
 
     Parameters
     ----------
-    path : any.
+    path : the path.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""Who writes a results folder: a run that was killed leaves nothing that keeps the next one from going on.
+"""Ownership of a results folder: only one run writes it at a time, and a killed run does not block the next one.
 
-Snakemake locks the files of a run and cannot tell afterwards whether that run still lives. So each run writes down, in
-its results, its process and when that began: a process number alone is given to another program in time.
+Snakemake locks the files of a run, but cannot tell later whether that run is still alive. Each run therefore records
+its process and the start time of that process in its results; a process id alone may be reused by another program.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_text
 
 START_TOLERANCE_S = 1.0
-"""Difference of two readings of one process's start. Derived: systems count it in hundredths of a second; a number that
-is given anew belongs to a process that began later by the time all others take, minutes at the least."""
+"""Largest difference between two readings of the start time of one process. Derived: systems count it in hundredths of
+a second; a process id is reused only after all others were used, minutes later at the earliest."""
 MIN_UNFINISHED_AGE_S = 60.0
-"""Age below which an unfinished file in the experiment may be somebody's save. Chosen: a save takes milliseconds; at
-half or twice nothing changes but on network drives."""
+"""Age from which an unfinished file in the experiment folder counts as abandoned; a younger one may be a save in
+progress. Chosen: a save takes milliseconds; half or twice matters on network drives only."""
 OWNER_FILE = ".run.json"
-"""File of a results folder that names the process that writes it."""
+"""File of a results folder that names the process writing it."""
 
-LOCK_REMOVED = "The lock of a run that was broken off"
+LOCK_REMOVED = "Removed the lock of an interrupted run"
 UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
-"""Names under which files are written before they take their own."""
+"""Temporary names of files that are being written."""
 
 
 NON_EXECUTING_OPTIONS = re.compile(
     r"-[a-zA-Z]*[nlhDS][a-zA-Z]*|--(dry-?run|unlock|lint|report|summary|detailed-summary|dag|rulegraph|filegraph|d3dag|list.*|help|"
     r"version|archive|print-compilation|cleanup-.*|delete-.*|containerize)(=.*)?"
 )
-"""Options of Snakemake with which it runs nothing."""
+"""Options of Snakemake with which it executes no jobs."""
 
 
 @dataclass(frozen=True)
 class RunOwner:
-    """A process that runs a workflow: its number, when it began (s since 1970), and on which computer."""
+    """A process that runs a workflow: its id, its start time (s since 1970), and its computer."""
 
     pid: int
     started_s: float
@@ -51,12 +51,12 @@ class RunOwner:
 
     @property
     def is_here(self) -> bool:
-        """Whether it ran on this computer, so that it can be known whether it still does."""
+        """Whether it belongs to this computer, so that its state can be determined."""
         return self.host == socket.gethostname()
 
     @property
     def is_alive(self) -> bool:
-        """Whether it still runs; a process of another computer counts as running."""
+        """Whether it is still running; a process of another computer is assumed to be."""
         if not self.is_here:
             return True
         started_s = _process_start_s(self.pid)
@@ -64,30 +64,30 @@ class RunOwner:
 
 
 def executes_nothing(options: Iterable[str]) -> bool:
-    """Whether Snakemake runs nothing with these options: it draws, lists, unlocks or says what it would do.
+    """Whether Snakemake executes no jobs with these options, as in a dry run, a listing, or an unlock.
 
     Parameters
     ----------
-    options : of its command line.
+    options : options of its command line.
 
     Returns
     -------
-    True where nothing is run.
+    True if no jobs are executed.
     """
     return any(NON_EXECUTING_OPTIONS.fullmatch(option) for option in options)
 
 
 def refuse_running(results: Path) -> None:
-    """Refuse results that a run which is still alive writes.
+    """Refuse a results folder that another running process writes.
 
     Parameters
     ----------
-    results : folder that is to be written.
+    results : results folder.
 
     Raises
     ------
     ExperimentError
-        Naming the process.
+        If there is such a process; the message names it.
     """
     owner = _read_owner(results / OWNER_FILE)
     if owner is not None and owner.pid != os.getpid() and owner.is_alive:
@@ -95,42 +95,41 @@ def refuse_running(results: Path) -> None:
 
 
 def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str], None]) -> None:
-    """Enter this process as the one that writes these results, and clear what a killed run left behind.
+    """Make this process the owner of a results folder, and clean up after a killed run.
 
-    Locks of a run that has ended are taken away, and files that were never finished; the entry goes when this process
-    ends.
+    Removes the locks and the unfinished files of a run that has ended. The ownership ends with this process.
 
     Parameters
     ----------
-    results : folder that is to be written.
-    experiment : its folder; unfinished files at its top are cleared as well.
-    working : folder in which Snakemake runs, which keeps its locks in `.snakemake`.
-    say : takes a line.
+    results : results folder.
+    experiment : experiment folder; unfinished files directly in it are removed as well.
+    working : folder in which Snakemake runs; its locks are in `.snakemake` there.
+    say : prints a line.
 
     Raises
     ------
     ExperimentError
-        If another run that is still alive writes these results, naming its process.
+        If another running process writes these results; the message names it.
     """
     refuse_running(results)
-    entry = (results / OWNER_FILE).absolute()  # Snakemake may end in another folder
-    owner = _read_owner(entry)
+    owner_file = (results / OWNER_FILE).absolute()  # Snakemake may change the working directory before it exits
+    owner = _read_owner(owner_file)
     if owner is not None and owner.pid != os.getpid() and _remove_locks(working, results):
-        say(f"{LOCK_REMOVED} (process {owner.pid}) is taken away; what it finished is kept.")
+        say(f"{LOCK_REMOVED} (process {owner.pid}); the results that it finished are kept.")
     started_s = _process_start_s(os.getpid()) or time.time()
-    write_text(entry, json.dumps(asdict(RunOwner(os.getpid(), started_s, socket.gethostname()))))
-    atexit.register(_remove_owner_file, entry, os.getpid())
+    write_text(owner_file, json.dumps(asdict(RunOwner(os.getpid(), started_s, socket.gethostname()))))
+    atexit.register(_remove_owner_file, owner_file, os.getpid())
     clear_unfinished(results.rglob("*"))
     clear_unfinished(experiment.glob("*"), older_than_s=MIN_UNFINISHED_AGE_S)
 
 
 def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
-    """Remove files that were being written when their program was killed.
+    """Remove unfinished files of a program that was killed.
 
     Parameters
     ----------
-    paths : where to look; only names that unfinished files have are touched.
-    older_than_s : age at least, s.
+    paths : paths to consider; only those with the temporary name of an unfinished file are removed.
+    older_than_s : minimum age, s.
     """
     for path in [path for path in paths if UNFINISHED_FILES.fullmatch(path.name)]:
         with contextlib.suppress(OSError):
@@ -138,33 +137,33 @@ def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
                 path.unlink()
 
 
-def _remove_owner_file(entry: Path, pid: int) -> None:
-    """Remove the entry of this process; a copy of it that was forked leaves it alone."""
+def _remove_owner_file(owner_file: Path, pid: int) -> None:
+    """Remove the owner file at exit, in the process that wrote it only, not in a fork of it."""
     if os.getpid() == pid:
         with contextlib.suppress(OSError):
-            entry.unlink(missing_ok=True)
+            owner_file.unlink(missing_ok=True)
 
 
 def _refusal(owner: RunOwner, results: Path) -> Problem:
-    message = f"is being written by process {owner.pid}"
-    remedy = "wait until it ends, or end it"
+    message = f"is being written by another run, process {owner.pid}"
+    remedy = "wait until it ends, or stop it"
     if not owner.is_here:
-        message += f" of the computer {owner.host}"
-        remedy = f"wait until it ends; if it no longer runs, remove {results / OWNER_FILE}"
+        message += f" on the computer {owner.host}"
+        remedy = f"wait until it ends; if it is no longer running, delete {results / OWNER_FILE}"
     since = time.strftime("%H:%M on %d %B", time.localtime(owner.started_s))
-    return Problem(message=f"{message}, since {since}", file=str(results), remedy=remedy)
+    return Problem(message=f"{message}, started at {since}", file=str(results), remedy=remedy)
 
 
-def _read_owner(entry: Path) -> RunOwner | None:
-    """Who has entered last and not left; an entry that cannot be read says nothing."""
+def _read_owner(owner_file: Path) -> RunOwner | None:
+    """Read the recorded owner; None if there is none, or the file cannot be read."""
     try:
-        return RunOwner(**json.loads(entry.read_text(encoding="utf-8")))
+        return RunOwner(**json.loads(owner_file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
 
 
 def _remove_locks(working: Path, results: Path) -> int:
-    """Remove Snakemake's locks that name files of these results; how many. Runs on other results keep theirs."""
+    """Remove Snakemake's locks on files of these results, not those of other results; return how many."""
     removed = 0
     inside = str(results.absolute()) + os.sep
     for lock in sorted((working / ".snakemake" / "locks").glob("*.lock")):
@@ -177,7 +176,7 @@ def _remove_locks(working: Path, results: Path) -> int:
 
 
 def _process_start_s(pid: int) -> float | None:
-    """When a process began, s since 1970; None where there is none, or only what is left of one that was killed."""
+    """Start time of a process, s since 1970; None if it does not exist or is a zombie."""
     import psutil
 
     try:

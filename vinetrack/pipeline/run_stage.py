@@ -1,4 +1,4 @@
-"""The command `vinetrack run`: the whole chain on one experiment, from anywhere, with the Snakefile of the package."""
+"""The command `vinetrack run`: run the Snakefile of the package on one experiment."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _SNAKEMAKE_LINES = re.compile(
     r"Rules claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting|"
     r"Removing output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
 )
-"""Lines of Snakemake about itself; format of version 9. What stages print is what is left."""
+"""Lines that Snakemake prints about itself; format of version 9. All other lines were printed by stages."""
 
 MAX_EXPLANATION_LINES = 12
-"""Chosen: lines of stages that are kept to explain a failure; a stage that stops says why in one to three."""
+"""Lines printed by stages that are kept to explain a failure. Chosen: a failing stage prints one to three."""
 
 STAGE_DONE_TEXT = {
-    "laboratory": "recordings of the virtual laboratory made",
+    "laboratory": "virtual measurements made",
     "recording": "recordings tracked",
     "tracks": "tracks analysed",
     "gather": "trials gathered",
@@ -52,40 +52,41 @@ STAGE_DONE_TEXT = {
     "diagnosis": "model diagnosed",
     "trial_figures": "figures of the trials drawn",
     "campaign_figures": "figures of the experiment drawn",
-    "paper": "paper's numbers set beside",
+    "paper": "comparison with the paper made",
     "overlays": "clips drawn",
     "report_page": "report written",
 }
 
 
 class RunError(UserError):
-    """A run that did not reach its end: which stage stopped it, and why."""
+    """A run that failed; the message names the stage and the reason."""
 
 
 @dataclass(frozen=True)
 class RunPaths:
-    """The experiment of a run and the folder of its results, both absolute."""
+    """The experiment folder and the results folder of a run, both absolute."""
 
     experiment: Path
     results: Path
 
 
 def run_paths(folder: Path, base: Path | None) -> RunPaths:
-    """Where a run reads and writes.
+    """Return the folders of a run.
 
     Parameters
     ----------
-    folder : the experiment's.
-    base : folder under which results go, in one named after the experiment; None for `results` beside the experiment.
+    folder : experiment folder.
+    base : folder in which the results folder, named after the experiment, is made; None for `results` beside the
+        experiment.
 
     Returns
     -------
-    paths : absolute.
+    paths : absolute paths.
 
     Raises
     ------
     ExperimentError
-        If there is no such experiment, or the results there are those of another.
+        If the experiment does not exist, or the results folder belongs to another experiment.
     """
     experiment = Path(os.path.normpath(find_experiment(folder).absolute()))
     name = experiment.name or "experiment"
@@ -95,12 +96,12 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
 
 
 def check_before_run(experiment: Path, say: Say) -> None:
-    """Say what is wrong with an experiment before its run.
+    """Print the problems of an experiment before its run.
 
     Parameters
     ----------
-    experiment : its folder.
-    say : takes a line.
+    experiment : experiment folder.
+    say : prints a line.
 
     Raises
     ------
@@ -112,30 +113,30 @@ def check_before_run(experiment: Path, say: Say) -> None:
     from vinetrack.pipeline.check_stage import check_folder
 
     if find_ground_truth(experiment, PACKAGE.parent):
-        return  # The virtual laboratory makes the recordings of the demonstration in the run itself.
-    checked = check_folder(experiment)
-    errors = [problem for problem in checked.problems if problem.severity == "error"]
-    read = read_experiment(experiment)
-    hopeless = {problem.trial for problem in errors}
-    if errors and ("" in hopeless or {trial.name for trial in read.trials} <= hopeless):
-        raise ExperimentError(checked.problems)
-    for line in [*checked.notes, *format_problems(checked.problems, 20 - len(checked.notes))]:
+        return  # The recordings of the demonstration do not exist yet: the run makes them.
+    report = check_folder(experiment)
+    errors = [problem for problem in report.problems if problem.severity == "error"]
+    trials = {trial.name for trial in read_experiment(experiment).trials}
+    faulty_trials = {problem.trial for problem in errors}  # "" stands for the experiment as a whole
+    if errors and ("" in faulty_trials or trials <= faulty_trials):
+        raise ExperimentError(report.problems)
+    for line in [*report.notes, *format_problems(report.problems, 20 - len(report.notes))]:
         say(line)
 
 
 def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
-    """Run Snakemake over an experiment, with a bar on a terminal and a line a stage elsewhere.
+    """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere.
 
     Parameters
     ----------
-    paths : of experiment and results.
-    cores : that it may use.
-    say : takes a line.
+    paths : folders of experiment and results.
+    cores : number of processor cores.
+    say : prints a line.
 
     Raises
     ------
     RunError
-        If a stage fails, with what it said.
+        If a stage fails, with its last output.
     ExperimentError
         If another run writes the same results.
     """
@@ -143,38 +144,38 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     claim_results(paths.results, paths.experiment)
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    # On the command line Snakemake reads values as YAML: ` #2` of a folder's name would be a comment.
-    named = log.with_name("run.json")
-    write_text(named, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
+    # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.
+    config_file = log.with_name("run.json")
+    write_text(config_file, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
     command = [
         sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), "--directory", str(paths.results),
         "--cores", str(cores), "--rerun-incomplete", "--quiet", "rules", "host",
-        "--configfile", str(named),
+        "--configfile", str(config_file),
     ]  # fmt: skip
-    with log.open("w", encoding="utf-8") as kept:
-        # A process of its own, so that Snakemake stops its jobs by itself when the user breaks off.
+    with log.open("w", encoding="utf-8") as log_file:
+        # In a process of its own, Snakemake stops its jobs itself when the user interrupts the run.
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace"
         ) as process:
             assert process.stdout is not None
-            failed, words = _follow(_copied_to(process.stdout, kept), say)
+            failed, last_lines = _follow(_copied_to(process.stdout, log_file), say)
         if process.returncode:
-            raise RunError(_failure_text(failed, words, log))
+            raise RunError(_failure_text(failed, last_lines, log))
 
 
 def _copied_to(lines: Iterable[str], file: TextIO) -> Iterator[str]:
-    """The lines without their ends, each written to the file before it is handed on."""
+    """Yield the lines without line ends, and copy each to the file."""
     for line in lines:
         file.write(line)
         yield line.rstrip("\n")
 
 
 def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
-    """Show how a run gets on; the stages that failed with their logs, and the last lines that stages printed."""
+    """Show the progress of a run; return the logs of the stages that failed, and the last lines that stages printed."""
     failed: dict[str, str] = {}
-    words: deque[str] = deque(maxlen=MAX_EXPLANATION_LINES)
+    last_lines: deque[str] = deque(maxlen=MAX_EXPLANATION_LINES)
     done: Counter[str] = Counter()
-    shown, rule, part = sys.stderr.isatty(), "", None
+    on_terminal, rule, part = sys.stderr.isatty(), "", None
     bar: Progress[int] | None = None
     for line in lines:
         if match := _FINISHED.match(line):
@@ -187,7 +188,7 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
                 text += f", part {part}"
             elif done[rule] > 1:
                 text = f"{done[rule]} {text}"
-            if shown:
+            if on_terminal:
                 bar = bar or progress(total, "run", unit="step")
                 bar.say(text)
                 bar.reach(steps)
@@ -201,34 +202,34 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
         elif line.startswith(LOCK_REMOVED):
             say(line)
         elif not _SNAKEMAKE_LINES.match(line):
-            words.append(line)
+            last_lines.append(line)
     if bar is not None:
         bar.__exit__(None, None, None)
-    return failed, list(words)
+    return failed, list(last_lines)
 
 
-def _failure_text(failed: dict[str, str], words: list[str], log: Path) -> str:
-    """Which stage stopped a run and what it printed."""
-    sentences = [line for line in words if line.strip()]
+def _failure_text(failed: dict[str, str], last_lines: list[str], log: Path) -> str:
+    """Name the stage that stopped a run, with its last output and its log."""
+    sentences = [line for line in last_lines if line.strip()]
     if not failed:
-        return "\n".join([*sentences, f"The run stopped; everything it printed is in {log}."])
+        return "\n".join([*sentences, f"The run stopped; its whole output is in {log}."])
     stages = ", ".join(failed)
     logs = ", ".join(path for path in failed.values() if path) or str(log)
     return "\n".join(
-        [*sentences[-3:], f"The run stopped in {stages}; its log is {logs}, everything printed is in {log}."]
+        [*sentences[-3:], f"The run stopped in {stages}; its log is {logs}, its whole output is in {log}."]
     )
 
 
 def run_lines(results: Path) -> list[str]:
-    """What to say of finished results: where the report is, and last the verdict.
+    """Summarise finished results for the terminal: failed trials, path of the report, reasons, and last the verdict.
 
     Parameters
     ----------
-    results : their folder.
+    results : results folder.
 
     Returns
     -------
-    lines : the verdict last.
+    lines, the verdict last.
     """
     from vinetrack.pipeline.diagnosis_stage import diagnosis_lines
     from vinetrack.results.folder_layout import Results, read_result

@@ -65,8 +65,10 @@ def look_at_folder(target: Path, risk: float | None = None, experiment: Path | N
     diagnosis, pairs, folder = _diagnose_target(target, experiment)
     before = read_ledger(folder / LEDGER)
     if before is not None and risk is not None and risk != before.risk:
-        remedy = f"leave it at {before.risk:g}, or begin another campaign without {folder / LEDGER}"
-        problem = Problem(message="was stated otherwise before", column="--risk", value=f"{risk:g}", remedy=remedy)
+        remedy = f"keep {before.risk:g}, or delete {folder / LEDGER} to start a new campaign"
+        problem = Problem(
+            message="differs from the risk stated at the first look", column="--risk", value=f"{risk:g}", remedy=remedy
+        )
         raise ExperimentError([problem])
     ledger = before or Ledger(DEFAULT_RISK if risk is None else risk)
     mark, look = _data_fingerprint(pairs), look_at(diagnosis, len(pairs), ledger.risk)
@@ -98,7 +100,9 @@ def _diagnose_target(target: Path, experiment: Path | None) -> tuple[Diagnosis, 
         return stored, measured_trials(read, results)[0], read.folder
     read = read_experiment(find_experiment(target))
     if all(trial.track is None for trial in read.trials):
-        raise ResultsError(f"{target} holds recordings: run `vinetrack run {target}`, then give its results folder")
+        raise ResultsError(
+            f"{target} holds recordings: track them first with `vinetrack run {target}`, then give its results folder"
+        )
     return diagnose(read, ladder=False), pairs_of(read)[0], read.folder
 
 
@@ -159,8 +163,8 @@ def read_ledger(path: Path) -> Ledger | None:
             str(content.get("next") or ""),
         )
     except (ValueError, KeyError, TypeError):
-        remedy = "put it aside, and the campaign begins anew"
-        raise ExperimentError([Problem(message="is no ledger of a campaign", value=str(path), remedy=remedy)]) from None
+        remedy = "move it away to start a new campaign"
+        raise ExperimentError([Problem(message="is not a campaign ledger", value=str(path), remedy=remedy)]) from None
 
 
 def ledger_lines(ledger: Ledger) -> list[str]:

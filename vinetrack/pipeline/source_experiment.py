@@ -1,4 +1,4 @@
-"""From a results folder back to the experiment it was made from, and a model written back to `experiment.yaml`."""
+"""The experiment that a results folder was made from, and saving a model to its `experiment.yaml`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
-    """The experiment that a results folder was made from, by its `provenance.json`.
+    """Read the experiment that a results folder was made from, as stated by its `provenance.json`.
 
     Parameters
     ----------
     folder : results folder.
     experiment : Path, optional
-        Where the experiment is now, if it has moved.
+        New path of the experiment, if it has moved.
 
     Returns
     -------
@@ -28,7 +28,7 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
     Raises
     ------
     ResultsError
-        If it is no results folder, or its experiment has moved.
+        If it is not a results folder, or its experiment has moved.
     ExperimentError
         If the experiment cannot be read.
     """
@@ -36,13 +36,18 @@ def read_source_experiment(folder: Path, experiment: Path | None = None) -> Expe
 
     results = Results(folder)
     if not folder.is_dir():
-        raise ResultsError(f"{folder} is no folder: name the one that snakemake made, results/NAME")
+        raise ResultsError(f"{folder} is not a folder: give the results folder of a run, such as results/NAME")
     if not results.provenance.exists():
-        raise ResultsError(f"{folder} is no results folder: it has no {results.provenance.name}; run snakemake first")
-    where = experiment or Path(str(read_json(results.provenance)["experiment"]))
-    if not where.is_dir():
-        raise ResultsError(f"{where}, the experiment of {folder}, has moved: say where it is with --experiment PATH")
-    return read_experiment(where)
+        raise ResultsError(
+            f"{folder} is not a results folder, because it has no {results.provenance.name}: run vinetrack run or "
+            "snakemake first"
+        )
+    path = experiment or Path(str(read_json(results.provenance)["experiment"]))
+    if not path.is_dir():
+        raise ResultsError(
+            f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
+        )
+    return read_experiment(path)
 
 
 SETTINGS = "experiment.yaml"
@@ -50,9 +55,9 @@ BOM = b"\xef\xbb\xbf"
 
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` of an experiment, in a whole file or not at all; return the path of the settings.
+    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings.
 
-    A mark at the beginning of the file and its line ends stay; a file in another encoding becomes UTF-8.
+    A byte-order mark and the line ends of the file are kept; other encodings are converted to UTF-8.
 
     Parameters
     ----------
@@ -60,7 +65,7 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     names : sequence of str
         Effects of the model.
     files : sequence of str
-        Files of own effects in that folder that `effects:` has to name as well, where it does not yet.
+        Files of the user's own effects in that folder, to be added to `effects:` if it does not list them.
 
     Returns
     -------
@@ -69,9 +74,9 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     Raises
     ------
     ExperimentError
-        If the settings cannot be read, or the key cannot be set without harm to what else is there.
+        If the settings cannot be read, or the key cannot be set without altering other settings.
     TableError
-        If the file is no text.
+        If the file is not text.
     """
     from vinetrack.core.tables import read_text, write_bytes
     from vinetrack.core.yaml_document import with_list
@@ -80,10 +85,10 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     path = folder / SETTINGS
     before = path.read_bytes() if path.exists() else b""
     text = read_text(path) if before else ""
-    named = list(read_experiment_settings(path).effects) if before and files else []
-    new = [name for name in files if name not in named]
+    listed = list(read_experiment_settings(path).effects) if before and files else []
+    new = [name for name in files if name not in listed]
     if new:
-        text = with_list(text, "effects", [*named, *new], path.name)
+        text = with_list(text, "effects", [*listed, *new], path.name)
     text = with_list(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")

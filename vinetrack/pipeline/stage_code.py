@@ -1,8 +1,8 @@
-"""Which code a stage of the workflow runs, read from the imports, so that an edit reruns what it makes stale.
+"""The code that a stage of the workflow depends on, found from its imports, so that an edit reruns outdated stages.
 
-Starting from the modules that a stage's command calls, every import of a vinetrack module is followed, those inside
-functions included; imports for the type checker alone are not. A module also depends on the files beside it that it
-names in a string: effects (`"*.py"`), templates, style sheets, yaml files.
+Starting from the modules that a stage's command calls, every import of a vinetrack module is followed, including those
+inside functions but not those for the type checker only. A module also depends on files beside it that it names in a
+string: effects (`"*.py"`), templates, style sheets, YAML files.
 
 The sources are scanned with regular expressions: parsing 300 files takes 1.3 s, scanning those of all stages 0.15 s,
 and Snakemake waits for it at every start. A test compares the scan with the syntax trees of all files.
@@ -19,38 +19,38 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 
-_INTAKE = ("experiment.folder", "experiment.settings")
+_EXPERIMENT_READERS = ("experiment.folder", "experiment.settings")
 STAGE_MODULES = {
     "laboratory": ("laboratory.__main__",),
-    "recording": ("pipeline.recordings_stage", *_INTAKE),
-    "tracks": ("pipeline.tracks_stage", *_INTAKE),
-    "gather": ("pipeline.tracks_stage", *_INTAKE),
-    "damping": ("pipeline.damping_stage", *_INTAKE),
-    "model": ("pipeline.model_stage", *_INTAKE),
-    "diagnosis": ("pipeline.diagnosis_stage", *_INTAKE),
-    "figures": ("pipeline.figures_stage", *_INTAKE),
-    "paper": ("pipeline.paper_stage", *_INTAKE),
-    "overlays": ("pipeline.overlays_stage", *_INTAKE),
-    "report": ("pipeline.report_stage", *_INTAKE),
+    "recording": ("pipeline.recordings_stage", *_EXPERIMENT_READERS),
+    "tracks": ("pipeline.tracks_stage", *_EXPERIMENT_READERS),
+    "gather": ("pipeline.tracks_stage", *_EXPERIMENT_READERS),
+    "damping": ("pipeline.damping_stage", *_EXPERIMENT_READERS),
+    "model": ("pipeline.model_stage", *_EXPERIMENT_READERS),
+    "diagnosis": ("pipeline.diagnosis_stage", *_EXPERIMENT_READERS),
+    "figures": ("pipeline.figures_stage", *_EXPERIMENT_READERS),
+    "paper": ("pipeline.paper_stage", *_EXPERIMENT_READERS),
+    "overlays": ("pipeline.overlays_stage", *_EXPERIMENT_READERS),
+    "report": ("pipeline.report_stage", *_EXPERIMENT_READERS),
 }
-"""Modules that the command of each stage calls. The command line itself is not among them: it only hands options on,
-and an edit of a help text should not rerun an analysis."""
+"""Modules that the command of each stage calls. The command line itself is left out: it only passes options on, and an
+edit of a help text should not rerun an analysis."""
 
 _TYPE_CHECKING_BLOCK = re.compile(r"^if TYPE_CHECKING:\n(?:(?:[ \t]+[^\n]*)?\n)+", re.MULTILINE)
 _FROM = re.compile(r"^[ \t]*from (vinetrack[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 _IMPORT = re.compile(r"^[ \t]*import (vinetrack[\w.]*)", re.MULTILINE)
 _RESOURCES = re.compile(r"""\bfiles\("(vinetrack[\w.]*)"\)""")
 _STRING = re.compile(r'"([^"\n]+)"')
-_HOLE = re.compile(r"\{[^}]*\}")
+_PLACEHOLDER = re.compile(r"\{[^}]*\}")
 
 
 def code_hash(stage: str, package: Path = PACKAGE) -> str:
-    """Hash of the code that a stage runs; as a `params:` of a rule it makes Snakemake rerun what an edit made stale.
+    """Return a hash of the code of a stage, which as a parameter of its rule makes Snakemake rerun it after an edit.
 
     Parameters
     ----------
     stage : a key of `STAGE_MODULES`.
-    package : folder of the package, by default the one that is running.
+    package : folder of the package; the running one by default.
 
     Returns
     -------
@@ -63,14 +63,14 @@ def code_hash(stage: str, package: Path = PACKAGE) -> str:
 
 
 def stage_files(stage: str, package: Path = PACKAGE) -> list[Path]:
-    """Every file of the package that a stage runs or reads, sorted; see `code_hash` for the parameters.
+    """Return all files of the package that a stage runs or reads, sorted.
 
     Parameters
     ----------
     stage : str
         A key of `STAGE_MODULES`.
     package : Path
-        Folder of the package, by default the one that is running.
+        Folder of the package; the running one by default.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def stage_files(stage: str, package: Path = PACKAGE) -> list[Path]:
 
 @lru_cache(maxsize=1024)
 def _files_used(path: Path, package: Path) -> tuple[Path, ...]:
-    """Files of the package that one file imports or names; each file is scanned once in a process."""
+    """Files of the package that one file imports or names; each file is scanned once per process."""
     if path.suffix != ".py":
         return ()
     text = _content(path).decode("utf-8")
@@ -99,9 +99,10 @@ def _files_used(path: Path, package: Path) -> tuple[Path, ...]:
 
 
 def imported_names(text: str) -> set[str]:
-    r"""Dotted names below `vinetrack` that a source imports at run time: modules, and what is taken from them.
+    r"""Return the dotted names below `vinetrack` that a source imports at run time: modules and their members.
 
-    `from vinetrack.core import published` gives `core` and `core.published`: only the files tell which is a module.
+    `from vinetrack.core import published` gives `core` and `core.published`: the text alone does not tell whether
+    `published` is a module.
 
     Parameters
     ----------
@@ -128,17 +129,17 @@ def imported_names(text: str) -> set[str]:
 
 @lru_cache(maxsize=4096)
 def _module_files(name: str, package: Path) -> tuple[Path, ...]:
-    """The file of a module and the `__init__.py` that Python runs before it; none where the name is no module.
+    """File of a module and the `__init__.py` that Python runs before it; empty if the name is not a module.
 
-    The package's own `__init__.py` counts only where something is taken from it: it loads nothing by itself.
+    The `__init__.py` of vinetrack itself counts only if something is imported from it: it loads nothing.
     """
     if not name:
         return (package / "__init__.py",)
     folder = package.joinpath(*name.split("."))
     file = folder.with_suffix(".py")
     if file.is_file():
-        before = file.with_name("__init__.py")
-        return (file, before) if file.parent != package and before.is_file() else (file,)
+        init_file = file.with_name("__init__.py")
+        return (file, init_file) if file.parent != package and init_file.is_file() else (file,)
     return (folder / "__init__.py",) if (folder / "__init__.py").is_file() else ()
 
 
@@ -147,15 +148,15 @@ def _folder(name: str, package: Path) -> Path:
 
 
 def _named_beside(path: Path, text: str) -> list[Path]:
-    """Files beside a module that it names in a string; all of a folder. `*` and `{…}` stand for anything."""
+    """Files beside a module, or folders of them, that it names in a string; `*` and `{…}` match any text."""
     neighbours = {entry.name: entry for entry in _entries(path.parent)}
     named: list[Path] = []
     for string in dict.fromkeys(_STRING.findall(text)):
         if string in neighbours:
             named.append(neighbours[string])
         elif "." in string and ("*" in string or "{" in string):
-            pattern = _HOLE.sub("*", string)
-            # Without an ending of its own (`*.*`, `*`) a pattern is a path elsewhere, not a choice of these files.
+            pattern = _PLACEHOLDER.sub("*", string)
+            # A pattern without a definite suffix (`*.*`, `*`) refers to files elsewhere.
             if re.search(r"\.\w+$", pattern):
                 named += [neighbours[name] for name in fnmatch.filter(neighbours, pattern)]
     return [file for entry in named for file in (_data_files(entry) if entry.is_dir() else [entry])]
@@ -163,13 +164,13 @@ def _named_beside(path: Path, text: str) -> list[Path]:
 
 @lru_cache(maxsize=256)
 def _entries(folder: Path) -> tuple[Path, ...]:
-    """Files of a folder, and those of its folders that are no packages."""
+    """Files of a folder, and its subfolders that are not packages."""
     entries = [entry for entry in sorted(folder.iterdir()) if entry.name != "__pycache__"]
     return tuple(entry for entry in entries if entry.is_file() or not (entry / "__init__.py").exists())
 
 
 def _data_files(folder: Path) -> list[Path]:
-    """All files under a folder that is no package, or those of a package that are not modules."""
+    """All files below a folder; of a package, only those that are not modules."""
     is_package = (folder / "__init__.py").exists()
     files: Iterable[Path] = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
     return [path for path in files if not (is_package and path.suffix == ".py")]
@@ -181,6 +182,6 @@ def _content(path: Path) -> bytes:
 
 
 def forget_scans() -> None:
-    """Read all files anew at the next call: for a process in which the sources change."""
+    """Clear all caches, for a process in which the sources change."""
     for cached in (_files_used, _module_files, _entries, _content):
         cached.cache_clear()

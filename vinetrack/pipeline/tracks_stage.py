@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial, Window
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.pipeline.pool import map_trials
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-INTERNAL_FAULT = "could not be analysed: a fault of the program, written down in the log of this stage"
+TRIAL_NOT_ANALYSED = f"could not be analysed: {INTERNAL_ERROR}"
 
 
 def analyse_tracks(
@@ -136,8 +137,8 @@ def analyse(
         write_empty(results, trial.name, failed_row(trial, str(error)))
         return str(error), ""
     except Exception:
-        write_empty(results, trial.name, failed_row(trial, INTERNAL_FAULT))
-        return INTERNAL_FAULT, traceback.format_exc()
+        write_empty(results, trial.name, failed_row(trial, TRIAL_NOT_ANALYSED))
+        return TRIAL_NOT_ANALYSED, traceback.format_exc()
     write_csv(results.track(trial.name), _track_table(summary.track))
     write_csv(results.kinematics(trial.name), _kinematics_table(summary.kinematics))
     windows = [_window_row(trial.name, window) for window in summary.windows.values()]

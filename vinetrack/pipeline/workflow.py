@@ -1,6 +1,6 @@
-"""What the Snakefile needs to know before anything runs: which experiment, which trials, which files.
+"""Plan of a workflow for the Snakefile: the experiment, its trials, and the input and output files.
 
-Light on purpose: it is imported every time Snakemake looks at the workflow, before the first job.
+Imports stay light: Snakemake loads this module at every start and in every job.
 """
 
 from __future__ import annotations
@@ -39,48 +39,45 @@ PAPER_TABLES = (
     "paper_speeds",
     "paper_speed_curves",
 )
-"""Tables that an experiment gets besides where published numbers are set beside it."""
+"""Additional tables of an experiment that is compared with published numbers."""
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
-"""The rules, in the package: `vinetrack run` runs them from anywhere, the Snakefile of a checkout includes them."""
+"""The rules: `vinetrack run` runs this file from anywhere, and the Snakefile of a checkout includes it."""
 
 TRIALS_PER_JOB = 100
-"""Chosen: trials that come as tracks, and trials whose figures are drawn, in one job of the workflow.
-
-With every file that a job writes Snakemake notes all files that the job reads, 50 µs each: 1,000 trials in one job took
-it six minutes, more than the work itself. At half there are twice as many processes to start, 2 to 4 s each; at twice,
-twice as many notes a trial, 60 ms.
-"""
+"""Largest number of tracks analysed, or of trial figures drawn, in one job of the workflow. Chosen: for every file that
+a job writes, Snakemake records all files that the job reads, 50 µs each, so that 1,000 trials in one job took it six
+minutes, more than the work itself. At half there are twice as many processes to start, 2 to 4 s each; at twice, twice
+as many records per trial, 60 ms."""
 
 
 @dataclass(frozen=True)
 class WorkflowPlan:
-    """One run of the workflow.
+    """Inputs and outputs of one run of the workflow.
 
-    `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
-    come as recordings, each with its own inputs; `read_from` the tracks and traces of the others;
-    `inputs` what all are read from; `unwatched` a fingerprint of inputs
-    that cannot stand in a rule; `nature` what is true in a shipped virtual experiment, whose measurements are made on
-    first use by the virtual laboratory, and None in anybody's own; `published` whether the paper's numbers are set
-    beside those of this experiment.
+    `trials` are all trials that get files (a trial with a faulty row gets empty ones); `filmed` maps those that are
+    recordings to their input files, `track_inputs` the others to their tracks and traces. `inputs` are all input files
+    that Snakemake watches; `unwatched` is a fingerprint of those whose path cannot be written in a rule. `ground_truth`
+    is the file from which the virtual laboratory makes the measurements of a shipped experiment on first use, None for
+    any other experiment. `published` says whether the results are compared with the numbers of the paper.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
     filmed: Mapping[str, tuple[str, ...]]
-    read_from: Mapping[str, tuple[str, ...]]
+    track_inputs: Mapping[str, tuple[str, ...]]
     inputs: tuple[Path, ...]
     unwatched: str
     settings: RunSettings
-    nature: Path | None
+    ground_truth: Path | None
     published: bool
 
     @property
     def sheets(self) -> list[str]:
-        """The trial sheet and, where there are any, the settings and corrections beside it."""
+        """The trial sheet, and the settings and corrections if they exist."""
         return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
 
     @property
@@ -90,7 +87,7 @@ class WorkflowPlan:
 
     @property
     def measurements(self) -> list[str]:
-        """What the virtual laboratory makes of a shipped experiment's sheet: recordings and a target, or tracks."""
+        """Files that the virtual laboratory makes for a shipped experiment: recordings and a target, or tracks."""
         return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
 
     def result(self, *parts: str) -> str:
@@ -99,51 +96,51 @@ class WorkflowPlan:
 
     @property
     def tracked(self) -> tuple[str, ...]:
-        """Trials that do not come as recordings."""
+        """Trials that are not recordings."""
         return tuple(trial for trial in self.trials if trial not in self.filmed)
 
     def track_files(self, trials: Iterable[str]) -> list[str]:
-        """The tracks and traces of trials that do not come as recordings.
+        """Return the tracks and traces of trials that are not recordings.
 
         Parameters
         ----------
-        trials : names; one that failed at the sheet has no files.
+        trials : names of trials; a trial with a faulty row has no files.
 
         Returns
         -------
         list of str
             Paths.
         """
-        return [path for trial in trials for path in self.read_from.get(trial, ())]
+        return [path for trial in trials for path in self.track_inputs.get(trial, ())]
 
     @staticmethod
     def parts(stage: str, trials: Sequence[str]) -> dict[str, list[str]]:
-        """Trials shared out over the jobs of a stage.
+        """Distribute trials over the jobs of a stage.
 
         Parameters
         ----------
-        stage : its name.
-        trials : names.
+        stage : name of the stage.
+        trials : names of trials.
 
         Returns
         -------
         dict of str to list of str
-            Names of the trials by the name of the job: the stage's own where one job does for all.
+            Names of trials by name of the job, which is that of the stage if there is only one job.
         """
         shares = [list(trials[first : first + TRIALS_PER_JOB]) for first in range(0, len(trials), TRIALS_PER_JOB)]
         return {stage if len(shares) == 1 else f"{stage}_{number}": share for number, share in enumerate(shares, 1)}
 
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
-        """One result for each of these trials, by default all.
+        """Return the path of one result for each trial.
 
         Parameters
         ----------
         folder : str
-            Folder among the results.
+            Subfolder of the results.
         suffix : str
-            End of each file's name.
+            Suffix of the files.
         trials : iterable of str, optional
-            Names; all trials by default.
+            Names of trials; all by default.
 
         Returns
         -------
@@ -154,12 +151,12 @@ class WorkflowPlan:
 
     @property
     def clips(self) -> list[str]:
-        """The folder of clips, where there is anything to make one of and they are wanted."""
+        """The folder of clips, if there are recordings and the settings ask for clips."""
         return [self.result("overlays")] if self.filmed and self.settings.overlays.of != "none" else []
 
     @staticmethod
     def one_of(names: Iterable[str]) -> str:
-        """A pattern that these names match and nothing else does.
+        """Return a regular expression that matches exactly these names.
 
         Parameters
         ----------
@@ -175,25 +172,25 @@ class WorkflowPlan:
 
     @property
     def figure_list(self) -> str:
-        """Which figures of the whole experiment had content: those without are not written."""
+        """The list of the figures of the whole experiment that were drawn; figures without content are not."""
         return self.result("figures", "campaign.json")
 
     @property
     def paper_tables(self) -> list[str]:
-        """Tables that set the paper's numbers beside ours; none where they were not asked for."""
+        """Tables of the comparison with the paper; none if it was not requested."""
         return [self.result(f"{name}.csv") for name in PAPER_TABLES] if self.published else []
 
     def paper_figures(self) -> list[tuple[str, str, str]]:
-        """Figures that stand beside the paper's: name, format and path."""
+        """Figures of the comparison with the paper: name, format and path."""
         return self._figures(PAPER_FIGURES, "") if self.published else []
 
     def trial_figures(self, trials: Iterable[str] | None = None) -> list[tuple[str, str, str]]:
-        """Figures of single trials.
+        """Return the figures of single trials.
 
         Parameters
         ----------
         trials : iterable of str, optional
-            Names; all trials by default.
+            Names of trials; all by default.
 
         Returns
         -------
@@ -212,27 +209,28 @@ class WorkflowPlan:
         return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
 
     def stage_settings(self, *keys: str) -> str:
-        """The settings a stage depends on, or all of them, as JSON: a change of others leaves its results alone.
+        """Settings that a stage depends on, as JSON; without keys, all but the paths.
 
-        Paths are no settings of a stage: the same folder may be written with a slash at its end or without.
+        A stage reruns only if one of these changes. Paths are left out, since the same folder can be written in several
+        ways.
         """
         chosen = set(keys) or set(type(self.settings).model_fields) - {"experiment", "results"}
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
 def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """Read the settings and the experiment's sheet.
+    """Plan a run: read the settings and the sheet, and list the input files.
 
     Parameters
     ----------
     config : mapping
-        Snakemake's `config`, the command line included.
+        Snakemake's `config`, including `--config`.
     base : Path
-        Folder of the Snakefile; the shipped demonstration is found from there, wherever Snakemake is run.
+        Folder of the Snakefile, from which the shipped demonstration is found wherever Snakemake is run.
 
     Returns
     -------
-    Plan
+    WorkflowPlan
 
     Raises
     ------
@@ -242,15 +240,15 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
 
-    # Beside the Snakefile of a checkout lies `data`; the rules of the package are two folders further down.
+    # In a checkout, `data` lies beside the Snakefile, and two folders above the Snakefile of the package.
     base = base if (base / "data").is_dir() else PACKAGE.parent
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
     folder = Path(settings.experiment)
     if not folder.exists() and find_ground_truth(base / folder, base):
         folder = base / folder
-    nature = find_ground_truth(folder, base)
-    is_virtual = nature is not None
+    ground_truth = find_ground_truth(folder, base)
+    is_virtual = ground_truth is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
     if problems := path_problems(folder, results):
@@ -274,7 +272,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         for trial in experiment.trials
         if trial.video is not None
     }
-    read_from = {
+    track_inputs = {
         trial.name: tuple(
             path.as_posix() for path in (trial.track, trial.pressure_trace) if path is not None and path in watched
         )
@@ -286,25 +284,25 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         results=results,
         trials=trials,
         filmed=filmed,
-        read_from=read_from,
+        track_inputs=track_inputs,
         inputs=tuple(watched),
         unwatched=_fingerprint(inputs),
         settings=settings,
-        nature=nature,
+        ground_truth=ground_truth,
         published=experiment.settings.published is not None,
     )
 
 
 def _fingerprint(inputs: Iterable[Path]) -> str:
-    """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
+    """Size and modification time of the inputs that Snakemake cannot watch, so that their changes cause a rerun."""
     stats = [(path.name, path.stat()) for path in inputs if has_wildcard(path) and path.exists()]
     return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
 
 
 def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
+    """Call `make_plan`; print its problems in at most 20 lines and exit with status 1.
 
-    For the Snakefile: an exception there would be printed with Snakemake's own stack.
+    For the Snakefile, where an exception would be printed with Snakemake's traceback.
 
     Parameters
     ----------
@@ -315,7 +313,7 @@ def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
     Returns
     -------
-    Plan
+    WorkflowPlan
     """
     try:
         return make_plan(config, base)
@@ -328,11 +326,11 @@ def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 def begin_run_or_exit(plan: WorkflowPlan) -> None:
     """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`.
 
-    Where Snakemake only shows what it would do nothing is begun; it does not tell a Snakefile, its command line does.
+    Nothing is begun if Snakemake executes no jobs (a dry run, for example), which only its command line tells.
 
     Parameters
     ----------
-    plan : of this run.
+    plan : plan of this run.
     """
     from vinetrack.pipeline.run_lock import begin_run, executes_nothing
 
@@ -346,16 +344,16 @@ def begin_run_or_exit(plan: WorkflowPlan) -> None:
 
 
 def print_report_path_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
-    """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
+    """Print the path of the report as the last line of this process, if the report is newer than all inputs.
 
-    Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
+    Snakemake's `onsuccess` runs before its closing lines, and not at all if there was nothing to do.
 
     Parameters
     ----------
     plan
-        Of this run.
+        Plan of this run.
     quiet : bool
-        Say nothing.
+        Print nothing.
     """
     if not quiet:
         atexit.register(_print_report_path, plan)
@@ -371,7 +369,7 @@ def _print_report_path(plan: WorkflowPlan) -> None:
 
 
 def shell_prefix() -> str:
-    """Line before every shell command that puts this Python's programs first: no environment need be activated."""
+    """Return a prefix for all shell commands that puts this Python first in PATH: no environment need be activated."""
     return f'set -euo pipefail; export PATH={shlex.quote(str(Path(sys.executable).parent))}:"$PATH"; '.replace(
         "{", "{{"
     ).replace("}", "}}")

@@ -394,7 +394,7 @@ def read_result(path: Path) -> pd.DataFrame:
             na_values={column: ["", "NaN"] for column in numbers},
         )
     except FileNotFoundError:
-        raise ResultsError(f"{path} does not exist: run the stage that makes it, or snakemake for all") from None
+        raise ResultsError(f"{path} does not exist: run the stage that writes it, or all with snakemake") from None
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
     for column in TRUTH_COLUMNS.intersection(columns):
@@ -416,7 +416,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ResultsError(f"{path} does not exist: run the stage that makes it, or snakemake for all") from None
+        raise ResultsError(f"{path} does not exist: run the stage that writes it, or all with snakemake") from None
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
     return content
