@@ -42,7 +42,7 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
     done = track(clip, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert f"{len(scene.frames)} frames of 640 × 160 px, 8 bit" in done.stdout
-    assert "Rate of capture not known; it plays at 60 a second" in done.stdout
+    assert "Capture rate unknown; it plays at 60 per second" in done.stdout
     table = pd.read_csv(tmp_path / "out" / "track.csv")
     assert list(table) == [
         "frame", "time_s", "edge_px", "edge_sigma_px", "edge_systematic_px", "x_px", "y_px", "flag",
@@ -83,7 +83,7 @@ def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> 
     folder = write_images(tmp_path / "shots", scene.frames)
     done = track(folder, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
-    assert "Rate of capture not known: no times without --fps" in done.stdout
+    assert "Capture rate unknown: without --fps there are no times" in done.stdout
 
 
 def test_a_wrong_path_is_told_with_the_nearest_name(clip: Path) -> None:

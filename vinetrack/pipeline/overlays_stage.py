@@ -1,4 +1,4 @@
-"""Recordings with the tracked edge and the models' edges drawn, slowed down, as `overlays/<trial>.mp4`."""
+"""Slowed-down clips of recordings with tracked and modelled edges, `overlays/<trial>.mp4`."""
 
 from __future__ import annotations
 
@@ -36,23 +36,22 @@ log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 
 FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0
-"""Pictures a second between which a clip plays: faster is lost on a screen, slower is a slide show. Chosen: 30 a second
-is what players and eyes follow, 4 still reads as motion. At half or twice clips play jerkily or skip frames; nothing
-else depends on it."""
+"""Limits of the playback rate of a clip, frames per second. Chosen: 30 is what players and eyes can follow, and 4 is
+still perceived as motion. At half or twice clips play jerkily or skip frames; nothing else depends on it."""
 
 MARGIN_FRAMES = 8
-"""Frames of rest before and after the motion that a clip shows. Chosen: a third of a second at 25 a second, so that
-start and end are seen."""
+"""Frames before and after the motion that a clip shows. Chosen: a third of a second at 25 frames per second, so that
+start and end are visible."""
 
 FEWEST_POINTS = 5
-"""Points known in pixels and in metres without which a prediction has no place in the picture. Derived: a parabola
-takes three, two more show whether it fits."""
+"""Fewest points known in pixels and in metres for drawing a prediction into the picture. Derived: a parabola takes
+three, and two more test its fit."""
 
 
 def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySettings, n_workers: int = 1) -> list[str]:
-    """Write the clips that the settings ask for; return a line for every one that could not be made.
+    """Write the clips that the settings request; return a line for every clip that could not be made.
 
-    A recording that cannot be drawn never stops the others. The folder is there afterwards, with or without clips.
+    A recording that cannot be drawn does not stop the others. The folder is created even without clips.
 
     Parameters
     ----------
@@ -61,7 +60,7 @@ def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySetting
     folder
         Results folder.
     settings
-        Which trials, width and duration.
+        Choice of trials, width and duration.
     n_workers : int
         Number of processes.
 
@@ -78,7 +77,7 @@ def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySetting
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
-    """Write the clip of one trial of a results folder, as its run was set; return its path.
+    """Write the clip of one trial of a results folder with the settings of its run; return its path.
 
     Parameters
     ----------
@@ -87,9 +86,9 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     trial : str
         Name of the trial.
     experiment : Path, optional
-        Where the results came from; None for where the folder itself says.
+        Path of the experiment; None for the one recorded in the results.
     seconds : float, optional
-        About how long the clip is to play, s; None for what the run was set to.
+        Approximate duration of the clip, s; None for that of the run.
 
     Returns
     -------
@@ -100,7 +99,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     ResultsError
         If there is no such trial, or no clip of it can be made.
     ExperimentError
-        If the experiment is not where it was.
+        If the experiment cannot be read.
     """
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import OverlaySettings
@@ -110,8 +109,8 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     read = read_experiment(experiment or Path(str(provenance["experiment"])))
     filmed = [filmed_trial.name for filmed_trial in read.trials if filmed_trial.video is not None]
     if trial not in filmed:
-        known = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there is none"
-        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {known}")
+        existing = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there are none"
+        raise ResultsError(f"{trial!r} is not a trial with a recording in {read.folder}: {existing}")
     settings = OverlaySettings(**(provenance.get("settings") or {}).get("overlays") or {})
     if seconds is not None:
         settings = settings.model_copy(update={"seconds": seconds})
@@ -119,7 +118,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
 
 
 def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
-    """Filmed trials to draw: of every condition the first that was tracked, or all of those, or none.
+    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none.
 
     Parameters
     ----------
@@ -149,6 +148,7 @@ def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str
 
 
 def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:
+    """Write the clip of one trial; return why it could not be made, or blank."""
     try:
         _write_overlay(trial, results, settings)
     except ResultsError as error:
@@ -166,7 +166,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
     Raises
     ------
     ResultsError
-        If it came without a recording, was not tracked, or its recording cannot be read.
+        If it has no recording, was not tracked, or its recording cannot be read.
     """
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.write import write_clip
@@ -187,7 +187,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
 
 
 def frames_to_show(track: pd.DataFrame) -> range:
-    """Frames from a little before the edge moves until a little after it has stopped.
+    """Return the range of frames in which the edge moves, with `MARGIN_FRAMES` before and after.
 
     Parameters
     ----------
@@ -204,29 +204,31 @@ def frames_to_show(track: pd.DataFrame) -> range:
         If no edge was found.
     """
     edge = track["edge_px"].to_numpy(dtype=float)
-    known = np.flatnonzero(np.isfinite(edge))
-    if known.size < FEWEST_POINTS:
+    tracked = np.flatnonzero(np.isfinite(edge))
+    if tracked.size < FEWEST_POINTS:
         raise ResultsError("its edge was not found, so there is nothing to draw")
     low, high = float(np.nanmin(edge)), float(np.nanmax(edge))
-    begun = known[edge[known] > low + 0.01 * (high - low)][0]
-    ended = known[edge[known] < high - 0.002 * (high - low)][-1]
-    return range(max(int(begun) - MARGIN_FRAMES, 0), min(int(ended) + MARGIN_FRAMES, int(known[-1])) + 1)
+    start = tracked[edge[tracked] > low + 0.01 * (high - low)][0]
+    end = tracked[edge[tracked] < high - 0.002 * (high - low)][-1]
+    return range(max(int(start) - MARGIN_FRAMES, 0), min(int(end) + MARGIN_FRAMES, int(tracked[-1])) + 1)
 
 
 def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
-    """Pictures a second, and every how many frames one is taken, so that the clip lasts about `seconds`.
+    """Return playback rate and stride of a clip that lasts about `seconds`.
 
     Parameters
     ----------
     n_frames : int
-        Frames to show.
+        Number of frames to show.
     seconds : float
-        Wanted duration, s.
+        Desired duration, s.
 
     Returns
     -------
     play_fps : float
+        Frames per second.
     stride : int
+        Every how many frames of the recording one is shown.
 
     Examples
     --------
@@ -257,7 +259,7 @@ def _pictures(
     analysed = read_json(results.analysed(trial.name))
     line = analysed.get("axis")
     if line is None:
-        raise ResultsError(f"{results.analysed(trial.name)} does not say where the axis is: run snakemake again")
+        raise ResultsError(f"{results.analysed(trial.name)} does not state the axis: run snakemake again")
     axis = axis_from_entry(line)
     mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
     tube_px = 1e3 * trial.diameter_m / mm_per_px
@@ -279,16 +281,16 @@ def draw_over(
 
     Parameters
     ----------
-    recording : opened.
-    view : how the picture is laid out.
-    edges : what is drawn, px along the axis of the view.
-    time_ms : of every frame since release, shape (n_frames,); NaN where the rate of capture is not known.
-    shown : first and last frame.
+    recording : an inspected recording.
+    view : layout of the clip.
+    edges : edges to draw, px along the axis of the view.
+    time_ms : time of every frame since release, shape (n_frames,); NaN if the capture rate is unknown.
+    shown : range of frames to show.
     stride : every how many frames one is shown.
 
     Yields
     ------
-    pictures of the clip, RGB, uint8, shape (height, width, 3).
+    frames of the clip, RGB, uint8, shape (height, width, 3).
     """
     from vinetrack.figures.overlay import compose, levels
     from vinetrack.video.frames import iterate_frames
@@ -305,27 +307,27 @@ def draw_over(
 
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
-    """How far along its axis each picture of a recording was moved by a shaken camera, px, shape (n_frames,).
+    """Return the shift of each frame along the axis due to camera shake, px; 0 for a camera at rest.
 
     Parameters
     ----------
     line : mapping
-        `axis` of `analysed/<trial>.json`; it says nothing of a camera that stood still.
+        `axis` of `analysed/<trial>.json`; without `shake_px` if the camera was at rest.
     n_frames : int
-        Frames of the recording.
+        Number of frames of the recording.
 
     Returns
     -------
     array, shape (n_frames,)
     """
     shake_px = np.zeros(n_frames)
-    known_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
-    shake_px[: known_px.size] = known_px
+    stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
+    shake_px[: stored_px.size] = stored_px
     return shake_px
 
 
 def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
-    """The tracked edge, those that were predicted where there are any, and the time of release, s.
+    """Return the tracked edge, the predicted edges if there are any, and the time of release, s.
 
     Parameters
     ----------
@@ -354,21 +356,23 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
     predicted = read_result(path)
     to_px = position_to_px(track)
     added = _added_effects(results)
-    names = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
+    labels = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
     time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
-    for column, name in names.items():
-        known = predicted[["time_s", column]].dropna()
-        if not name or known.empty:
+    for column, label in labels.items():
+        prediction = predicted[["time_s", column]].dropna()
+        if not label or prediction.empty:
             continue
-        # Before the first frame of the fit and after its last the model says nothing, and nothing is drawn.
-        position_m = np.interp(time_s, known["time_s"], known[column], left=math.nan, right=math.nan)
-        off_mm = 1e3 * (position_m - measured_m)
-        edges.append(Edge(name, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), off_mm))
+        # There is no prediction before the first and after the last frame of the fit.
+        position_m = np.interp(time_s, prediction["time_s"], prediction[column], left=math.nan, right=math.nan)
+        error_mm = 1e3 * (position_m - measured_m)
+        edges.append(Edge(label, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), error_mm))
     return [*edges, *corrected], _release_s(trial, results, track)
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
-    """A function from metres to pixels along the axis, by what the track holds in both: lens and tilt bend it a little.
+    """Return the conversion from metres to pixels along the axis, fitted to the points of a track.
+
+    It is a quadratic polynomial, since lens distortion and tilt make it slightly nonlinear.
 
     Parameters
     ----------
@@ -390,12 +394,12 @@ def position_to_px(track: pd.DataFrame) -> Any:
     if len(both) < FEWEST_POINTS or np.ptp(metres) <= 0:
         raise ResultsError("too few of its positions are known in pixels and in metres")
     middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
-    bent = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
-    return bent
+    quadratic = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
+    return quadratic
 
 
 def _added_effects(results: Results) -> str:
-    """The effects that the diagnosis added, in words; blank where there is none."""
+    """Return the effects that the diagnosis added, in words; blank if there are none."""
     diagnosis = read_diagnosis(results)
     return " and ".join(map(plain, diagnosis.effects)) if diagnosis is not None else ""
 

@@ -1,4 +1,4 @@
-"""One recording to its track, kinematics, strip figure and row; whatever is wrong with it is its own affair."""
+"""Analysis of one recording: track, kinematics, strip figure and summary row; a failure is confined to its trial."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
     name : str
         Name of the trial.
     folder : results folder.
-    settings : of the run.
+    settings : settings of the run.
 
     Returns
     -------
     str
-        A line for a person: what was found, or why it failed.
+        A line for the terminal: what was found, or why it failed.
     """
     trial = experiment.trial(name)
     results = Results(folder)
@@ -53,21 +53,24 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
 
 
 def _outcome(results: Results, trial: Trial) -> str:
-    """How many frames of a trial show where the edge was, and its sizes beside those of the sheet, in words."""
+    """Say in how many frames the edge was found, and compare measured sizes with those of the sheet."""
     track = read_result(results.track(trial.name))
     row = read_json(results.analysed(trial.name))["row"]
-    words = f"edge known in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
+    frames = f"edge found in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
     sizes = (
         ("tube", row["tube_width_mm"], "mm wide", trial.diameter_m),
         ("growth", row["growth_mm"], "mm", trial.length_m),
     )
-    sizes_seen = [
-        f"{what} {number(seen)} {unit} (sheet {1e3 * stated:g})" for what, seen, unit, stated in sizes if seen
+    measured_sizes = [
+        f"{name} {number(measured)} {unit} (sheet {1e3 * stated:g})"
+        for name, measured, unit, stated in sizes
+        if measured
     ]
-    return "; ".join([words, f"{number(row['mm_per_px'], 4)} mm/px", *sizes_seen])
+    return "; ".join([frames, f"{number(row['mm_per_px'], 4)} mm/px", *measured_sizes])
 
 
 def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:
+    """Measure and analyse a recording; return the reason of a failure and a traceback, as `analyse` does."""
     from vinetrack.tracks.importers import TrackError, attach_pressure, read_pressure_trace
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.measure import measure_recording
@@ -75,9 +78,9 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     measurement = None
     try:
         measurement = measure_recording(trial, experiment.settings, experiment.folder)
-        differing = _contradictions(trial, measurement)
+        contradictions = _contradictions(trial, measurement)
         track = measurement.tracking.track
-        track = replace(track, notes=(*track.notes, *(problem.reason for problem in differing)))
+        track = replace(track, notes=(*track.notes, *(problem.reason for problem in contradictions)))
         if trial.pressure_trace is not None:
             track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
         reason, fault = analyse(
@@ -91,15 +94,15 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             tube_width_mm=1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
         )
         view = _calibration_and_axis(measurement, getattr(experiment.settings.calibration, "image", None))
-        contradictions = [{"column": problem.column, "reason": problem.reason} for problem in differing]
+        entries = [{"column": problem.column, "reason": problem.reason} for problem in contradictions]
         path = results.analysed(trial.name)
-        write_json(path, read_json(path) | view | {"contradictions": contradictions})
+        write_json(path, read_json(path) | view | {"contradictions": entries})
     except (RecordingError, TrackError) as error:
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
     except Exception as error:
         if is_disk_full(error):
-            raise  # a fault of the disk is none of this trial
+            raise  # a full disk is not a fault of this trial
         reason, fault = TRIAL_NOT_ANALYSED, traceback.format_exc()
         write_empty(results, trial.name, failed_row(trial, reason))
     _draw_strip_figure(trial, results, measurement, reason, settings)
@@ -107,12 +110,12 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
 
 
 def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
-    """Every size and exposure in the picture that differs from the sheet.
+    """Return the measured sizes and exposures that contradict the sheet, as warnings.
 
     Raises
     ------
     RecordingError
-        Where one differs beyond what lens and ruler can make.
+        If a difference is larger than lens and ruler can explain.
     """
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.recording_facts import exposure_problems, size_problems, tracked_facts
@@ -126,7 +129,7 @@ def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
 
 
 def _calibration_and_axis(measurement: Measurement, image: str | None) -> dict[str, Any]:
-    """What the scale of a recording rests on, and the axis its `edge_px` counts along."""
+    """Return the calibration of a recording, and the axis along which its `edge_px` is measured, as JSON entries."""
     from vinetrack.video.curved_axis import axis_entry
 
     calibration = measurement.calibration

@@ -1,4 +1,4 @@
-"""The command `vinetrack campaign`: a folder's sequence of looks, kept in a ledger beside its sheet."""
+"""The command `vinetrack campaign`: sequential looks at a growing set of trials, recorded in a ledger."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.result import Diagnosis
 
 LEDGER = "campaign.json"
-"""Name of the ledger, beside the sheet. A convention."""
+"""File name of the ledger, beside the sheet. Convention."""
 
 DEFAULT_RISK = 0.03
-"""Risk of stopping with a wrong name where none is stated. Chosen: three campaigns in a hundred; at half or twice a
-campaign takes about a tenth more or fewer trials, for the risk enters by its logarithm."""
+"""Default risk of stopping with a wrong effect. Chosen: three campaigns in a hundred; at half or twice, a campaign
+takes about a tenth more or fewer trials, since the number depends on the logarithm of the risk."""
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """The looks at a campaign, in order. `risk` was stated at the first and stays; `marks` tell the data of each."""
+    """The looks at a campaign, in order.
+
+    `risk` is stated at the first look and cannot change; `marks` are fingerprints of the data of each look; `next_text`
+    says what to do next.
+    """
 
     risk: float
     looks: tuple[CampaignLook, ...] = ()
@@ -36,26 +40,26 @@ class Ledger:
     next_text: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As the ledger holds it."""
+        """Return the content of the ledger file."""
         looks = [{**look.to_json(), "data": mark} for look, mark in zip(self.looks, self.marks, strict=True)]
         return {"risk": self.risk, "looks": looks, "next": self.next_text}
 
 
 def look_at_folder(target: Path, risk: float | None = None, experiment: Path | None = None) -> Ledger:
-    """CampaignLook at a campaign once more, and write its ledger.
+    """Add a look at a campaign to its ledger.
 
     Parameters
     ----------
     target : a results folder, whose diagnosis is read, or an experiment of measured tracks, which is diagnosed.
     risk : float, optional
-        Of stopping with a wrong name; it cannot be changed once a look was taken.
+        Risk of stopping with a wrong effect; it cannot be changed after the first look.
     experiment : Path, optional
-        The experiment of a results folder, if it has moved.
+        New path of the experiment of a results folder, if it has moved.
 
     Returns
     -------
     Ledger
-        With a further look where there are other trials than at the last, or the last one replaced.
+        With a further look; if the data have not changed since the last look, that one is replaced.
 
     Raises
     ------
@@ -63,14 +67,14 @@ def look_at_folder(target: Path, risk: float | None = None, experiment: Path | N
         If there is nothing to look at, or another risk was stated before.
     """
     diagnosis, pairs, folder = _diagnose_target(target, experiment)
-    before = read_ledger(folder / LEDGER)
-    if before is not None and risk is not None and risk != before.risk:
-        remedy = f"keep {before.risk:g}, or delete {folder / LEDGER} to start a new campaign"
+    previous = read_ledger(folder / LEDGER)
+    if previous is not None and risk is not None and risk != previous.risk:
+        remedy = f"keep {previous.risk:g}, or delete {folder / LEDGER} to start a new campaign"
         problem = Problem(
             message="differs from the risk stated at the first look", column="--risk", value=f"{risk:g}", remedy=remedy
         )
         raise ExperimentError([problem])
-    ledger = before or Ledger(DEFAULT_RISK if risk is None else risk)
+    ledger = previous or Ledger(DEFAULT_RISK if risk is None else risk)
     mark, look = _data_fingerprint(pairs), look_at(diagnosis, len(pairs), ledger.risk)
     looks, marks = ledger.looks, ledger.marks
     if marks and marks[-1] == mark:
@@ -81,7 +85,7 @@ def look_at_folder(target: Path, risk: float | None = None, experiment: Path | N
 
 
 def _diagnose_target(target: Path, experiment: Path | None) -> tuple[Diagnosis, Sequence[tuple[Trial, Track]], Path]:
-    """Diagnosis, trials with their tracks, and the folder of the sheet."""
+    """Return the diagnosis of the target, its trials with their tracks, and the folder of its sheet."""
     from vinetrack.diagnosis.diagnose import diagnose
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
@@ -107,7 +111,7 @@ def _diagnose_target(target: Path, experiment: Path | None) -> tuple[Diagnosis, 
 
 
 def _data_fingerprint(pairs: Sequence[tuple[Trial, Track]]) -> str:
-    """A short text that changes with the trials and their positions."""
+    """Return a short hash of the trials and their positions."""
     code = hashlib.sha256()
     for trial, track in pairs:
         code.update(trial.name.encode())
@@ -116,21 +120,21 @@ def _data_fingerprint(pairs: Sequence[tuple[Trial, Track]]) -> str:
 
 
 def _next_step(diagnosis: Diagnosis, look: CampaignLook) -> str:
-    """What to do next, in a sentence or two."""
+    """Say what to do next, in one or two sentences."""
     if look.decision == STOP:
-        return "Stop: film no more for this question."
+        return "Stop: this question needs no further trials."
     advice = diagnosis.next_experiment
     if advice is not None and advice.get("text"):
         return str(advice["text"])
     further = trials_to_go(look)
     if further:
-        return f"About {further} further trials like those so far, by how the evidence has grown."
+        return f"Run about {further} further trials like those so far, by the growth of the log-likelihood ratio."
     if look.verdict == ADEQUATE:
         return (
-            "Widen what varies: other pressures, payloads, chambers, connectors or vines. Or choose the effect and the "
-            "size that matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says which trials would show it."
+            "Vary more: other pressures, payloads, chambers, connectors or vines. Or choose an effect and a size that "
+            "matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says which trials would detect it."
         )
-    return "Widen what varies from trial to trial: other pressures, payloads, chambers, connectors or vines."
+    return "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
 
 
 def read_ledger(path: Path) -> Ledger | None:
@@ -138,17 +142,17 @@ def read_ledger(path: Path) -> Ledger | None:
 
     Parameters
     ----------
-    path : of the file.
+    path : path of the ledger.
 
     Returns
     -------
     Ledger or None
-        None where there is none.
+        None if the file does not exist.
 
     Raises
     ------
     ExperimentError
-        If it is not one of ours.
+        If the file is not a ledger.
     """
     import json
 
@@ -168,11 +172,11 @@ def read_ledger(path: Path) -> Ledger | None:
 
 
 def ledger_lines(ledger: Ledger) -> list[str]:
-    """Return what `vinetrack campaign` prints: a row a look, why it goes on or stops, what to do next.
+    """Return the output of `vinetrack campaign`: one row per look, the reason of the decision, and what to do next.
 
     Parameters
     ----------
-    ledger : with one look at least.
+    ledger : ledger with at least one look.
 
     Returns
     -------
@@ -189,10 +193,9 @@ def ledger_lines(ledger: Ledger) -> list[str]:
     ]  # fmt: skip
     head = ("look", "trials", "verdict", "named", "ln ratio", "needed", "")
     last = ledger.looks[-1]
-    why = f"{last.decision.capitalize()}: {last.why}."
     return [
         *table(rows, head, align=">><<>><"),
-        f"Risk of stopping with a wrong name, at any of the looks: {100 * ledger.risk:g} %.",
-        why,
+        f"Risk of stopping with a wrong effect, over all looks: {100 * ledger.risk:g} %.",
+        f"{last.decision.capitalize()}: {last.why}.",
         *([] if last.decision == STOP else [f"Next: {ledger.next_text}"]),
     ]

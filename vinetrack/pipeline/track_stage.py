@@ -1,4 +1,4 @@
-"""One recording and nothing else: its leading edge as a table, a strip and a clip, for `vinetrack track`."""
+"""The command `vinetrack track`: the leading edge of a single recording as a table, a strip figure and a clip."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from vinetrack.video.measure import Measurement
 
 TABLE, STRIP, CLIP = "track.csv", "strip.png", "overlay.mp4"
-"""Names of what is written."""
+"""Names of the output files."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
-    """What a person says of the recording; NaN and None where nothing is said.
+    """Options of the command; NaN and None for those not given.
 
-    `fps` and `exposure_us` are those of capture. The scale is `mm_per_px`, or the `calibration:` of the settings file
-    that `calibration` names. `body`: what moves does so as a whole. `out` is the folder for what is written.
+    `fps` is the capture rate, `exposure_us` the exposure of a frame. The scale is `mm_per_px`, or the `calibration:` of
+    the settings file `calibration`. `body`: the object moves as a whole. `out` is the output folder.
     """
 
     fps: float = math.nan
@@ -46,7 +46,7 @@ class TrackOptions:
 
     @property
     def scaled(self) -> bool:
-        """Whether positions come out in metres too."""
+        """Whether there is a scale, so that positions are also given in metres."""
         return math.isfinite(self.mm_per_px) or self.calibration is not None
 
 
@@ -56,19 +56,19 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
     Parameters
     ----------
     path : a film, a stack, or a folder of pictures.
-    options : what is known of it.
-    say : prints a line: what was understood of the file comes before the work.
+    options : options of the command.
+    say : prints a line; facts about the file are printed before tracking starts.
 
     Returns
     -------
-    mapping of what was understood, what was found and what was written, units in the keys.
+    mapping with facts about the file, results of tracking, and paths of output files, units in the keys.
 
     Raises
     ------
     UserError
-        In one sentence, where the recording cannot be used or shows no motion.
+        If the recording cannot be used or shows no motion.
     ExperimentError
-        Where the settings file that holds the calibration cannot be read.
+        If the settings file with the calibration cannot be read.
     """
     from vinetrack.video.frames import RecordingError, inspect_recording
     from vinetrack.video.measure import measure_recording
@@ -77,8 +77,8 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
     try:
         recording = inspect_recording(_recording_path(path))
         rate = _capture_fps(recording, options)
-        understood = _recording_facts(recording, rate)
-        for line in _recording_lines(understood):
+        recording_facts = _recording_facts(recording, rate)
+        for line in _recording_lines(recording_facts):
             say(line)
         trial = Trial(
             name=path.stem,
@@ -86,7 +86,7 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
             capture_fps=rate if math.isfinite(rate) else 1.0,
             capture_fps_is_playback=True,
             exposure_s=options.exposure_us / 1e6 if math.isfinite(rate) else math.nan,
-            # Without a scale a unit is a pixel: the tracker asks for no more.
+            # Without a scale, the unit of length is one pixel.
             m_per_px=options.mm_per_px / 1e3 if options.scaled else 1.0,
             travel_ratio=1.0 if options.body else 2.0,
             axis=options.axis,
@@ -101,20 +101,20 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
         raise UserError(str(error)) from None
     table = _table(measurement, options.scaled)
     written = _write(options.out or Path(f"{recording.path.stem}_track"), measurement, table, options.scaled, rate)
-    seen = _tracking_facts(measurement, table, options, rate)
-    for line in _tracking_lines(seen):
+    tracking_facts = _tracking_facts(measurement, table, options, rate)
+    for line in _tracking_lines(tracking_facts):
         say(line)
     say("Written: " + ", ".join(map(str, written.values())))
-    return understood | seen | {"written": written}
+    return recording_facts | tracking_facts | {"written": written}
 
 
 def _recording_path(path: Path) -> Path:
-    """The recording that is named.
+    """Return the path if it can be a single recording.
 
     Raises
     ------
     UserError
-        Where there is none, or a folder of several.
+        If it does not exist, is an empty folder, or a folder with films.
     """
     from vinetrack.video.frames import CONTAINERS, IMAGES
 
@@ -136,12 +136,12 @@ def _recording_path(path: Path) -> Path:
 
 
 def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
-    """Settings that hold the calibration alone, and the folder from which its picture counts.
+    """Return settings with only the calibration, and the folder to which the path of its picture is relative.
 
     Raises
     ------
     UserError
-        Where the file that should hold it does not, or two scales are given.
+        If the file has no calibration, or two scales are given.
     """
     if options.calibration is None:
         return ExperimentSettings(), Path()
@@ -151,24 +151,24 @@ def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
     if file.is_dir():
         file = file / "experiment.yaml"
     if not file.is_file():
-        raise UserError(f"{file}: there is no such file; --calibration names an experiment.yaml, or its folder")
+        raise UserError(f"{file}: there is no such file; --calibration takes an experiment.yaml, or its folder")
     calibration = read_experiment_settings(file).calibration
     if calibration is None:
-        raise UserError(f"{file}: holds no calibration; write one in it, or give --mm-per-px")
+        raise UserError(f"{file}: has no calibration; add one, or give --mm-per-px")
     return ExperimentSettings(calibration=calibration), file.parent
 
 
 def _capture_fps(recording: Recording, options: TrackOptions) -> float:
-    """Rate of capture, Hz, of the file where it states it, else the given one; NaN where neither is known."""
-    true_fps = recording.capture_fps
-    if true_fps is None:
+    """Capture rate, Hz: that stated by the file, else that given by the user; NaN if neither is known."""
+    stated_fps = recording.capture_fps
+    if stated_fps is None:
         return options.fps
-    if math.isfinite(options.fps) and abs(options.fps / true_fps - 1) > 1e-3:
+    if math.isfinite(options.fps) and abs(options.fps / stated_fps - 1) > 1e-3:
         raise UserError(
-            f"{recording.path.name}: --fps is {options.fps:g}, but the file itself states a rate of capture of "
-            f"{true_fps:g}; leave --fps out"
+            f"{recording.path.name}: --fps is {options.fps:g}, but the file states a capture rate of {stated_fps:g}; "
+            "leave --fps out"
         )
-    return true_fps
+    return stated_fps
 
 
 def _recording_facts(recording: Recording, rate: float) -> dict[str, Any]:
@@ -187,43 +187,47 @@ def _recording_facts(recording: Recording, rate: float) -> dict[str, Any]:
     }
 
 
-def _recording_lines(understood: dict[str, Any]) -> list[str]:
-    n_frames, plays = understood["declared_frames"], understood["playback_fps"]
-    picture = f"{understood['width_px']} × {understood['height_px']} px, {understood['bit_depth']} bit"
+def _recording_lines(facts: dict[str, Any]) -> list[str]:
+    n_frames, playback_fps = facts["declared_frames"], facts["playback_fps"]
+    picture = f"{facts['width_px']} × {facts['height_px']} px, {facts['bit_depth']} bit"
     count = "an unknown number of frames" if n_frames is None else f"{n_frames} frames"
-    first = f"{understood['recording']}: {count} of {picture}"
-    if math.isfinite(understood["capture_fps"]):
-        by = "stated by the file" if understood["capture_fps_from_file"] else "as given"
-        lasts = f": {number(understood['duration_s'])} s" if math.isfinite(understood["duration_s"]) else ""
-        second = f"Captured at {understood['capture_fps']:g} frames a second, {by}{lasts}"
-        if math.isfinite(understood["exposure_us"]):
-            second += f"; exposure {understood['exposure_us']:g} µs"
+    first = f"{facts['recording']}: {count} of {picture}"
+    if math.isfinite(facts["capture_fps"]):
+        origin = "stated by the file" if facts["capture_fps_from_file"] else "as given"
+        duration = f": {number(facts['duration_s'])} s" if math.isfinite(facts["duration_s"]) else ""
+        second = f"Captured at {facts['capture_fps']:g} frames per second, {origin}{duration}"
+        if math.isfinite(facts["exposure_us"]):
+            second += f"; exposure {facts['exposure_us']:g} µs"
     else:
-        played = f"; it plays at {plays:.4g} a second" if plays else ""
-        second = f"Rate of capture not known{played}: no times without --fps"
+        playback = f"; it plays at {playback_fps:.4g} per second" if playback_fps else ""
+        second = f"Capture rate unknown{playback}: without --fps there are no times"
     return [f"{first}.", f"{second}."]
 
 
 def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
-    """A row a frame: edge along the axis and its place in the picture, with their error; metres where scaled."""
+    """One row per frame: the edge along the axis and in the picture, with errors, and in metres if there is a scale."""
     import pandas as pd
 
     tracking = measurement.tracking
     track = tracking.track
-    place = tracking.axis.points(track.edge_px + tracking.shake_px)
-    slow_m = track.lead_position_systematic_m
-    assert slow_m is not None
+    edge_xy_px = tracking.axis.points(track.edge_px + tracking.shake_px)
+    systematic_m = track.lead_position_systematic_m
+    assert systematic_m is not None
     columns = {
         "frame": np.arange(len(track.time_s)),
         "time_s": track.time_s,
         "edge_px": track.edge_px,
         "edge_sigma_px": track.lead_position_sigma_m / measurement.m_per_px,
-        "edge_systematic_px": slow_m / measurement.m_per_px,
-        "x_px": place[:, 0],
-        "y_px": place[:, 1],
+        "edge_systematic_px": systematic_m / measurement.m_per_px,
+        "x_px": edge_xy_px[:, 0],
+        "y_px": edge_xy_px[:, 1],
     }
     if scaled:
-        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m, "systematic_m": slow_m}
+        columns |= {
+            "position_m": track.lead_position_m,
+            "sigma_m": track.lead_position_sigma_m,
+            "systematic_m": systematic_m,
+        }
     return pd.DataFrame(columns | {"flag": track.flag})
 
 
@@ -292,18 +296,18 @@ def _tracking_facts(
     }
 
 
-def _tracking_lines(seen: dict[str, Any]) -> list[str]:
-    ends = (*seen["axis"]["from_px"], *seen["axis"]["to_px"])
+def _tracking_lines(facts: dict[str, Any]) -> list[str]:
+    ends = (*facts["axis"]["from_px"], *facts["axis"]["to_px"])
     axis = "Axis ({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)
-    axis += ", a curve" if "via_px" in seen["axis"] else ""
-    width = f"; tube {number(seen['tube_width_px'])} px wide" if math.isfinite(seen["tube_width_px"]) else ""
-    metres = f" = {number(seen['growth_mm'])} mm" if math.isfinite(seen["growth_mm"]) else ""
-    speed = f"{number(seen['fastest_px_per_frame'])} px a frame"
-    speed += f" = {number(seen['fastest_m_s'])} m/s" if math.isfinite(seen["fastest_m_s"]) else ""
-    error = f"; ± {number(seen['edge_sigma_px'], 2)} px a point" if math.isfinite(seen["edge_sigma_px"]) else ""
+    axis += ", a curve" if "via_px" in facts["axis"] else ""
+    width = f"; tube {number(facts['tube_width_px'])} px wide" if math.isfinite(facts["tube_width_px"]) else ""
+    millimetres = f" = {number(facts['growth_mm'])} mm" if math.isfinite(facts["growth_mm"]) else ""
+    speed = f"{number(facts['fastest_px_per_frame'])} px per frame"
+    speed += f" = {number(facts['fastest_m_s'])} m/s" if math.isfinite(facts["fastest_m_s"]) else ""
+    error = f"; ± {number(facts['edge_sigma_px'], 2)} px per point" if math.isfinite(facts["edge_sigma_px"]) else ""
     return [
-        f"{axis}, {'given' if seen['axis_given'] else 'found from the motion'}{width}.",
-        f"Edge followed in {seen['n_known']} of {seen['n_frames']} frames: it moves by "
-        f"{number(seen['growth_px'])} px{metres}, at most {speed}{error}.",
-        *(f"warning: {note}" for note in seen["notes"]),
+        f"{axis}, {'given' if facts['axis_given'] else 'found from the motion'}{width}.",
+        f"Edge found in {facts['n_known']} of {facts['n_frames']} frames: it moves by "
+        f"{number(facts['growth_px'])} px{millimetres}, at most {speed}{error}.",
+        *(f"warning: {note}" for note in facts["notes"]),
     ]

@@ -1,6 +1,6 @@
-"""From measured positions to tracks, kinematics and one row a trial.
+"""Analysis of trials that are tracks: track, kinematics and summary row of each, and the tables of all trials.
 
-A bad trial writes its reason and never stops the rest.
+A trial that fails writes its reason and never stops the others.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def analyse_tracks(
     n_workers: int = 1,
     only: Collection[str] | None = None,
 ) -> list[str]:
-    """Analyse every trial that comes as a track; write `tracks/`, `kinematics/` and `analysed/` of each.
+    """Analyse all trials that are tracks; write the files of each in `tracks/`, `kinematics/` and `analysed/`.
 
-    Trials whose row of the sheet is at fault get empty files here too.
+    Trials with a faulty row of the sheet get empty files.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def analyse_tracks(
     folder
         Results folder.
     settings
-        Of the run.
+        Settings of the run.
     n_workers : int
         Number of processes.
     only : collection of str, optional
@@ -71,7 +71,7 @@ def analyse_tracks(
     Returns
     -------
     list of str
-        A line for every trial that failed: its name and why.
+        A line for every trial that failed: its name and the reason.
     """
     results = Results(folder)
     failed = {name: reason for name, reason in experiment.failed.items() if only is None or name in only}
@@ -90,7 +90,7 @@ def analyse_tracks(
 
 
 def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experiment: Experiment) -> tuple[str, str]:
-    """Analyse one track, in a worker; return why it failed and the traceback of an unforeseen error, blank if none."""
+    """Analyse one track in a worker process; return as `analyse` does."""
     from vinetrack.tracks.importers import TrackError, load_track
 
     try:
@@ -105,7 +105,7 @@ def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experi
 def analyse(
     trial: Trial, track: Track, results: Results, settings: RunSettings, experiment: Experiment, **columns: float
 ) -> tuple[str, str]:
-    """From a track to the files of one trial; `columns` of `trials.csv` are known to the caller alone.
+    """Analyse the track of one trial, and write its files.
 
     Parameters
     ----------
@@ -116,18 +116,18 @@ def analyse(
     results
         Results folder.
     settings
-        Of the run.
+        Settings of the run.
     experiment
-        Names the model in use.
+        Experiment whose settings name the model in use.
     **columns : float
-        Columns of `trials.csv` that the caller knows.
+        Further columns of `trials.csv`.
 
     Returns
     -------
     reason : str
-        Why the trial failed; blank where it did not.
+        Why the trial failed; blank if it did not.
     fault : str
-        Traceback of an unforeseen error; blank where there was none.
+        Traceback of an unexpected exception; blank if there was none.
     """
     from vinetrack.kinematics.summary import TrialError, summarise_trial
 
@@ -149,7 +149,7 @@ def analyse(
 
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
-    """Put what every trial gave into `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
+    """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     folder
         Results folder.
     settings
-        Of the run.
+        Settings of the run.
 
     Returns
     -------
@@ -184,8 +184,8 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     )
     points = _frame([c["point"] for c in analysed.values() if c["point"]], POINT_COLUMNS)
     write_csv(results.points, mark_left_out(points))
-    places = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
-    write_csv(results.conditions, condition_table(table, experiment.trials, **places))
+    evaluated_at = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
+    write_csv(results.conditions, condition_table(table, experiment.trials, **evaluated_at))
     write_csv(results.trials, table)
     for row in table.itertuples():
         log.info("%s: %s %s", row.trial, row.status, row.reason)
@@ -193,7 +193,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
 
 def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Trials whose axis was found askew to that of most others that grow as they do, as ones that failed."""
+    """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
     from vinetrack.video.axis_agreement import askew_trials, slope_deg
 
     failed: dict[str, dict[str, Any]] = {}
@@ -208,15 +208,15 @@ def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]
     for names, agreed in askew_trials(slopes_deg, experiment.trials):
         for name in names:
             reason = (
-                f"its growth axis was found askew to that of {agreed} other recordings: something else that moves, "
-                "such as a door, was taken for the tube; give its axis (column `axis`), even where the camera turned"
+                f"its growth axis was found askew to that of {agreed} other recordings: another moving object, such as "
+                "a door, was taken for the tube; state its axis in the column `axis`, even if the camera was turned"
             )
             failed[name] = {"row": failed_row(experiment.trial(name), reason), "windows": [], "point": None}
     return failed
 
 
 def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
-    """Rows as a table of these columns, without rows too; a number that JSON could not hold is NaN again."""
+    """Return rows, or none, as a table with typed columns; a number that JSON stores as null becomes NaN."""
     import pandas as pd
 
     frame = pd.DataFrame(rows, columns=list(columns))
@@ -228,12 +228,12 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
 
 
 def model_of(experiment: Experiment) -> Model:
-    """The model in use; every process makes its own, since a user's effects cannot travel between processes.
+    """Return the model in use; each process makes its own, since a user's effects cannot be pickled.
 
     Parameters
     ----------
     experiment
-        Its settings name the effects.
+        Experiment whose settings name the effects.
 
     Returns
     -------
@@ -244,7 +244,6 @@ def model_of(experiment: Experiment) -> Model:
 
 @lru_cache(maxsize=1)
 def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
-    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
     from vinetrack.dynamics.model import make_model
     from vinetrack.effects import load_effect
 
@@ -252,7 +251,7 @@ def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
 
 
 def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
-    """The row of `trials.csv` of a trial that could not be analysed.
+    """Return the row of `trials.csv` of a trial that failed.
 
     Parameters
     ----------
@@ -269,7 +268,7 @@ def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
 
 
 def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
-    """Files of a trial without results: headers alone, and its row.
+    """Write the files of a trial without results: tables with headers only, and its row.
 
     Parameters
     ----------
@@ -286,13 +285,13 @@ def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
 
 
 def _bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
-    """A row of `trials.csv` for a trial without results."""
+    """Return a row of `trials.csv` for a trial without results."""
     blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
     return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}
 
 
 def _track_table(track: Track) -> pd.DataFrame:
-    """A track as `tracks/<trial>.csv` holds it: one row a frame, `frame` counted from 0."""
+    """Return a track as the table `tracks/<trial>.csv`: one row per frame, `frame` counted from 0."""
     import pandas as pd
 
     columns = (
@@ -309,7 +308,7 @@ def _track_table(track: Track) -> pd.DataFrame:
 
 
 def _kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
-    """Kinematics as `kinematics/<trial>.csv` holds them."""
+    """Return kinematics as the table `kinematics/<trial>.csv`."""
     import pandas as pd
 
     return pd.DataFrame({column: getattr(kinematics, column) for column in KINEMATICS_COLUMNS})
