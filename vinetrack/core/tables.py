@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_TABLE_BYTES = 200_000_000
-"""Largest file read as a table; a larger one is probably a recording named in the wrong column. Chosen: an hour of
-positions at 1000 frames per second takes 150 MB. At half such a file is refused; at twice more memory is used before a
-recording is refused."""
+"""Largest file read as a table; a larger one is probably a recording in the wrong column. Chosen: an hour of positions
+at 1000 frames per second takes 150 MB. At half such a file is refused; at twice a recording takes more memory first."""
 
 STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard output
 
@@ -326,8 +325,7 @@ def safe_join(folder: Path, relative: str) -> Path:
     vinetrack.core.tables.TableError: leads out of the experiment folder: move the file into it, or put a link there
     """
     text = relative.strip().replace("\\", "/")
-    # Refuse control characters, surrogates, line and paragraph separators. Unusual spaces are allowed: macOS puts them
-    # into the names of recordings.
+    # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
         raise TableError("contains characters that no path should have: type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
