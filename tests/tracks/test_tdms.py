@@ -106,7 +106,7 @@ def test_segments_go_on_where_the_last_ended(tmp_path: Path) -> None:
         (two_channels()[:-9], "cut short"),
         (two_channels() + b"TDSm", "cut short"),
         (segment([entry("/'g'/'volts'", TIME_S)], TIME_S.tobytes()), "lacks a channel pressure_kPa (found: volts)"),
-        (segment([entry("/'g'/'pressure_kPa'", TIME_S)], TIME_S.tobytes()), "says no times"),
+        (segment([entry("/'g'/'pressure_kPa'", TIME_S)], TIME_S.tobytes()), "states no times"),
         (segment([entry("/'g'/'pressure_kPa'", TIME_S, NI_Number_Of_Scales=1.0)], TIME_S.tobytes()), "NI_Scale"),
         (segment([entry("/'g'/'pressure_kPa'", 0x1269)], TIME_S.tobytes()), "DAQmx"),
         (segment([entry("/'g'/'pressure_kPa'", TIME_S)], TIME_S.tobytes(), flags=128), "DAQmx"),

@@ -48,7 +48,7 @@ def flag_end_of_body(track: Track) -> Track:
     flag = track.flag.astype("<U80")
     for row in rows[end + 1 :]:
         flag[row] = join_flags(str(flag[row]), "after_end")
-    note = f"the body {what} after {track.time_s[rows[end]]:.5g} s: the end of its way; later points are not used"
+    note = f"the body {what} after {track.time_s[rows[end]]:.5g} s: the end of its motion; later points are not used"
     return replace(track, flag=flag, notes=(*track.notes, note))
 
 

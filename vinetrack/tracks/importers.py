@@ -129,7 +129,7 @@ def _read_positions(table: Table) -> Track:
     if "sigma_m" in table.columns:
         sigma_m = table.numbers("sigma_m", blank_is_nan=True)
         if np.any(sigma_m < 0):
-            raise TrackError(f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative: mend it")
+            raise TrackError(f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative: correct it")
         if np.any(sigma_m == 0):
             notes.append("A sigma_m of 0 is taken as unknown.")
             sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
@@ -145,7 +145,7 @@ def _read_positions(table: Table) -> Track:
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
-    """Read a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels: times in s and gauge pressures in Pa.
+    """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def _as_csv(path: Path) -> str:
     try:
         size = file_size(path)
         if size > LARGEST_TDMS_BYTES:
-            raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB: keep the pressure alone")
+            raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB: keep only its pressure channels")
         columns = tdms_columns(path.read_bytes())
     except OSError as error:
         raise TrackError(f"cannot be read: {error.strerror}") from None
@@ -221,6 +221,7 @@ def _as_csv(path: Path) -> str:
 
 
 def _require(table: Table, *columns: str) -> None:
+    """Refuse a table that lacks one of these columns."""
     if missing := [column for column in columns if column not in table.columns]:
         present = ", ".join(table.columns[:8]) or "none"
         raise TrackError(

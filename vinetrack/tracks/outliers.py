@@ -220,9 +220,7 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
     for row in outlying:
         flag[row] = join_flags(str(flag[row]), "rejected")
     rejected = replace(track, flag=flag)
-    note = (
-        f"{_points_lie(outlying.size)} far off the motion around and left out: {', '.join(_places(rejected, outlying))}"
-    )
+    note = f"{_outliers_are_left_out(outlying.size)}: {', '.join(_places(rejected, outlying))}"
     return replace(rejected, notes=(*track.notes, note))
 
 
@@ -245,12 +243,14 @@ def rejected_points_note(tracks: Mapping[str, Track]) -> str:
     if not places:
         return ""
     more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
-    return f"{_points_lie(len(places))} far off the motion around and left out: {', '.join(places[:MOST_NAMED])}{more}."
+    return f"{_outliers_are_left_out(len(places))}: {', '.join(places[:MOST_NAMED])}{more}."
 
 
-def _points_lie(points: int) -> str:
-    """A number of points as the beginning of a sentence, with its verb."""
-    return "1 point lies" if points == 1 else f"{points} points lie"
+def _outliers_are_left_out(points: int) -> str:
+    """The beginning of a sentence about rejected points."""
+    if points == 1:
+        return "1 point lies far off the motion around it and is left out"
+    return f"{points} points lie far off the motion around them and are left out"
 
 
 def _places(track: Track, outlying: NDArray[np.int_]) -> list[str]:

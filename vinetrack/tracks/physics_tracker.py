@@ -273,7 +273,7 @@ def read_export(table: Table) -> Track:
 
 
 def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
-    """Factor from a column's unit to SI."""
+    """Factor that converts a column's unit to SI."""
     name, unit = column
     if unit and unit not in units:
         raise TrackError(f"column {name[:30]!r} has an unknown unit: use one of {', '.join(units)}")
@@ -296,7 +296,7 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     if not known.any():
         return np.full(len(points), np.nan), ""
     if np.max(np.abs(points[known])) > LARGEST_NUMBER:
-        raise TrackError("holds a position too large to be one: mend it")
+        raise TrackError("holds a position too large to be one: correct it")
     if points.shape[1] == 1:
         net = points[known][-1, 0] - points[known][0, 0]
         return (-points[:, 0], "Turned round so that position grows.") if net < 0 else (points[:, 0], "")

@@ -46,7 +46,7 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     Examples
     --------
     >>> unrounded_times(np.round(np.arange(100) / 240, 3))[1]
-    'Times are rounded to 1 ms; evenly spaced ones, 4.17 ms apart, are taken instead.'
+    'Times are rounded to 1 ms; evenly spaced ones, 4.17 ms apart, are used instead.'
     """
     digit_s = _last_digit_s(time_s) if time_s.size >= FEWEST_TIMES else 0.0
     if digit_s == 0:
@@ -58,7 +58,7 @@ def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     if not step_s > 0 or off_s > TOLERANCE_DIGITS * digit_s or off_s < 0.5 * LEAST_DIGIT_PART * step_s:
         return time_s, ""
     rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
-    return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are taken instead."
+    return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are used instead."
 
 
 def _last_digit_s(time_s: Floats) -> float:

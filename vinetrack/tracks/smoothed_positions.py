@@ -69,7 +69,7 @@ so."""
 class Smoothing:
     """A filter: polynomials of this degree (0 is a moving average) through a window of so many frames.
 
-    One frame in `decimation` carries the same information.
+    Every `decimation`-th smoothed frame carries the information of all.
     """
 
     window: int

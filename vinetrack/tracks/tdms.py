@@ -73,7 +73,7 @@ def tdms_columns(data: bytes) -> dict[str, Floats]:
     if not any(name.startswith("time") for name in columns):
         step = float(pressure.properties.get("wf_increment", 0.0))
         if not step > 0:
-            raise TrackError("says no times: write a channel time_s, or the waveform's increment (wf_increment)")
+            raise TrackError("states no times: write a channel time_s, or the waveform's increment (wf_increment)")
         start = float(pressure.properties.get("wf_start_offset", 0.0))
         columns["time_s"] = np.asarray(start + step * np.arange(len(_values("", pressure))), dtype=float)
     return dict(_in_own_unit(name, values) for name, values in columns.items())

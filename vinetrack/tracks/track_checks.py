@@ -46,7 +46,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
         i = int(wrong[0]) + 1
         place = f"line {lines[i]}, column time_s: " if lines else ""
         raise TrackError(
-            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s): sort or mend the rows"
+            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s): sort or correct the rows"
         )
 
 
@@ -107,7 +107,7 @@ def new_track(
         count = int(np.sum(known))
         raise TrackError(f"has {count} point{'s' * (count != 1)}: at least {FEWEST_POINTS} are needed")
     if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
-        raise TrackError("holds a time or position too large to be one: mend it")
+        raise TrackError("holds a time or position too large to be one: correct it")
     check_times(time_s)
     first, last = lead_position_m[known][[0, -1]]
     backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()

@@ -39,11 +39,14 @@ twice none is."""
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions along the axis by frame, px, from any of the trackers.
+    """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,).
 
-    `reach_px` is how much of the strip must be visible ahead of a position; `is_edge` is False where only the arrival
-    of whatever comes along the axis was followed, to about a pixel. Further fields are those of `edge.EdgeFit` and
-    `body.BodyFit`.
+    `sigma_px` is the random error by the likelihood, `apart_sigma_px` what is added to it in quadrature (disagreement
+    of bands, start of growth), `bands_sigma_px` the part of that which is independent between frames, `slow_px` the
+    error that neighbouring frames share; `unsure` marks poor fits. `reach_px` is how much of the strip must be visible
+    ahead of a position; `end` says how the motion of a body ended. `width_px` is the width of a tube and its standard
+    error; `seen_exposure` the exposure that the blur shows and the speed at which it does, see `edge.EdgeFit`.
+    `is_edge` is False where only the arrival of whatever comes along the axis was followed, to about a pixel.
     """
 
     edge_px: Floats

@@ -211,12 +211,14 @@ def _read_or_none(file: Path) -> NDArray[Any] | None:
 
 
 def _pages(path: Path) -> int:
+    """Number of pages of a TIFF stack."""
     import cv2
 
     return int(cv2.imcount(str(path), cv2.IMREAD_ANYDEPTH))
 
 
 def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
+    """Pages of a TIFF stack in order, up to the first that cannot be read."""
     import cv2
 
     count = recording.declared_frames or 0
@@ -231,6 +233,7 @@ def _stack_pages(recording: Recording) -> Iterator[NDArray[Any]]:
 
 
 def _dng_pages(tiff: Any) -> Iterator[Any]:
+    """Pages of a DNG file with their sub-pages."""
     for page in tiff.pages:
         yield page
         yield from page.pages or ()

@@ -60,7 +60,7 @@ def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
     """
     frame = number[end.last_frame]
     if end.turns_back:
-        return f"the body turns back after frame {frame}: a bounce, or the end of its way; later frames are not used"
+        return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
     return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
 
 

@@ -318,6 +318,7 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
 
 
 def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
+    """Cells of one recording's row."""
     axis = "–"
     if facts.axis is not None:
         ends = (*facts.axis.from_px, *facts.axis.to_px)

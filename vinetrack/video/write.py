@@ -56,6 +56,7 @@ def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: floa
 
 
 def _encode(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int) -> int:
+    """Encode the pictures to a file and return their number."""
     import av
 
     count, stream = 0, None
@@ -77,6 +78,7 @@ def _encode(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, 
 
 
 def _stream(container: Any, width: int, height: int, play_fps: float, crf: int) -> Any:
+    """A video stream of reproducible H.264 in BT.709 colours."""
     stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     stream.codec_context.thread_count = 1
