@@ -1,4 +1,4 @@
-"""The command: what the page does without it, its refusals, and a server for this machine alone that Ctrl-C ends."""
+"""The command: functions without the page, refusals, and a local server that Ctrl-C ends."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_refit_prints_what_it_found_and_save_writes_the_model(copied: tuple[Pa
     assert read_experiment_settings(settings).model[-1] == "yield_pressure"
 
 
-def test_what_cannot_be_done_is_one_sentence(copied: tuple[Path, Path], tmp_path: Path) -> None:
+def test_an_impossible_request_is_refused_in_one_sentence(copied: tuple[Path, Path], tmp_path: Path) -> None:
     experiment, results = copied
     assert "is not a folder" in refused("explore", tmp_path / "nowhere")
     assert "did you mean air_drag?" in refused("explore", results, "--add", "air_drg", "--save")
@@ -77,7 +77,7 @@ def test_what_cannot_be_done_is_one_sentence(copied: tuple[Path, Path], tmp_path
     assert "Saved" in run("explore", results, "--experiment", tmp_path / "moved", "--save")
 
 
-def test_a_port_that_is_taken_is_said(campaign: Campaign) -> None:
+def test_a_port_in_use_is_reported(campaign: Campaign) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -100,7 +100,7 @@ async def _origin_of_elsewhere(address: str) -> str:
     return "let in"
 
 
-def test_the_server_is_for_this_machine_alone_and_ends_by_ctrl_c(campaign: Campaign) -> None:
+def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Campaign) -> None:
     with Served(campaign.folder, "--port", "0") as served:
         address = served.address
         with urllib.request.urlopen(address, timeout=60) as answer:
@@ -132,7 +132,7 @@ async def _answers_socket(address: str, host: str) -> int:
 
 @pytest.fixture
 def bare_server():
-    """A server whose page nobody opens."""
+    """A server without an open page."""
     server = start_server(None, 0)
     yield server
     server.stop()
@@ -164,7 +164,7 @@ def test_the_two_names_of_this_machine_are_answered(bare_server, name: str) -> N
 
 
 def _own_address() -> str:
-    """An address of this machine other than the loopback's; of a machine without any, one that nobody listens at."""
+    """An address of this machine other than the loopback address, or else one without a listener."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

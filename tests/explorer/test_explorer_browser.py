@@ -1,4 +1,4 @@
-"""The whole page in a real browser: load, choose, drag, tick, refit, watch the error fall, scrub, save.
+"""The page in a real browser: load, select, drag, tick, refit, watch the error fall, step through frames, save.
 
 Twenty-four trials of the demonstration, which lacks reservoir depletion; one of them filmed.
 """
@@ -48,7 +48,7 @@ def floors(visitor: Visitor) -> np.ndarray:
     return np.array(visitor.value("error_bars", "data.floor"), dtype=float)
 
 
-def test_the_page_asks_nobody_but_this_machine(visitor: Visitor) -> None:
+def test_the_page_makes_no_requests_to_other_machines(visitor: Visitor) -> None:
     asked = {request for request in visitor.chrome.requests if not request.startswith("data:")}
     assert asked
     assert all(request.startswith(("http://127.0.0.1:", "ws://127.0.0.1:")) for request in asked)
@@ -62,8 +62,8 @@ def test_a_condition_is_chosen_by_its_button(visitor: Visitor) -> None:
     visitor.until("$residual_curves.data.xs.length === 24", "them to come back")
 
 
-def test_a_drag_moves_the_curves_while_the_hand_moves(visitor: Visitor) -> None:
-    """Each of thirty moves shows before the hand lets go; how soon is measured by `benchmarks/explorer_speed.py`."""
+def test_dragging_a_slider_moves_the_curves_continuously(visitor: Visitor) -> None:
+    """Each of thirty moves is drawn before the release; `benchmarks/explorer_speed.py` measures the delay."""
     visitor.until("$numbers.text.includes('<table>')", "the fit of the model in use", 300)
     before = errors(visitor)
     visitor.time_redraws(SIZE)
@@ -148,11 +148,11 @@ def test_page_and_figures_follow_a_dark_screen(visitor: Visitor) -> None:
         assert (sum(map(int, back[4:-1].split(","))) < 150) == (screen == "dark")
 
 
-def test_a_finger_scrolls_the_page_over_a_figure_too(visitor: Visitor) -> None:
+def test_a_swipe_over_a_figure_scrolls_the_page(visitor: Visitor) -> None:
     for name in ("motion", "errors"):
         events = f"Bokeh.index.find_one({visitor.model(name)}).canvas_view.events_el"
         assert visitor.chrome.run(f"getComputedStyle({events}).touchAction") == "pan-y"
 
 
-def test_the_browser_had_nothing_to_complain_of(visitor: Visitor) -> None:
+def test_the_browser_logged_no_errors(visitor: Visitor) -> None:
     assert visitor.chrome.complaints == []

@@ -1,4 +1,4 @@
-"""Fits in the background: the missing effect found, progress told, a fit given up, faults in a sentence."""
+"""Background fits: the missing effect is found, progress reported, a fit cancelled, errors given in a sentence."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted
 
 
 @pytest.mark.parametrize(("known", "asked"), [(-1e9, [False]), (1e9, [False, True]), (math.nan, [False, True])])
-def test_other_starts_are_tried_where_the_first_leads_not_to_the_known_fit(
+def test_other_starts_are_tried_if_the_first_does_not_reach_the_known_fit(
     campaign: Campaign, first: Fitted, monkeypatch: pytest.MonkeyPatch, known: float, asked: list[bool]
 ) -> None:
     seen: list[bool] = []
@@ -75,14 +75,14 @@ def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campa
     assert overall_m(back.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
 
 
-def test_a_bad_beginning_is_left_behind(campaign: Campaign, first: Fitted) -> None:
-    """A time constant dragged to nothing is tried again from its default."""
+def test_a_bad_start_is_replaced_by_the_default(campaign: Campaign, first: Fitted) -> None:
+    """A time constant dragged to zero is refitted from its default."""
     choice = first.choice.with_effect("supply_refill").with_size("supply_refill.tau", 1e-6)
     found = fit_choice(campaign, first.fit, choice)
     assert found.fit.log_likelihood >= first.fit.log_likelihood - 0.5
 
 
-def test_numbers_that_hang_together_are_named(first: Fitted) -> None:
+def test_correlated_parameters_are_named(first: Fitted) -> None:
     lines = correlated_pairs_text(first.fit)
     assert all("correlation" in line for line in lines)
     tied = replace(first.fit, covariance=first.fit.covariance * 0 + 1.0)
@@ -91,7 +91,7 @@ def test_numbers_that_hang_together_are_named(first: Fitted) -> None:
 
 
 class Heard:
-    """What a job says, and when it has ended."""
+    """Records the callbacks of a job."""
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
@@ -102,7 +102,7 @@ class Heard:
         return FitJob(work, on_progress=self.steps.append, on_success=self.found.append, on_failure=self.reasons.append)  # type: ignore[arg-type]
 
 
-def test_a_job_tells_and_ends(campaign: Campaign, first: Fitted) -> None:
+def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
     heard = Heard()
     job = heard.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
     job.wait(60)
@@ -111,7 +111,7 @@ def test_a_job_tells_and_ends(campaign: Campaign, first: Fitted) -> None:
     assert heard.found[0].fit.model.names == first.fit.model.names
 
 
-def test_a_job_that_is_given_up_is_heard_of_no_more() -> None:
+def test_a_cancelled_job_calls_no_callback() -> None:
     heard, begun = Heard(), threading.Event()
 
     def endless(watch: Watch) -> Fitted:
@@ -133,7 +133,7 @@ def test_a_job_that_is_given_up_is_heard_of_no_more() -> None:
 
 
 @pytest.mark.parametrize(("error", "said"), [(FitError("no start"), "no start"), (ZeroDivisionError(), FAULT)])
-def test_a_job_that_fails_says_why_in_a_sentence(error: Exception, said: str) -> None:
+def test_a_failed_job_gives_the_reason_in_a_sentence(error: Exception, said: str) -> None:
     heard = Heard()
 
     def fail(_: Watch) -> Fitted:
@@ -143,7 +143,7 @@ def test_a_job_that_fails_says_why_in_a_sentence(error: Exception, said: str) ->
     assert heard.reasons == [said]
 
 
-def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
+def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
     background = BackgroundFit(campaign)
     news: list[bool] = []
 
@@ -163,7 +163,7 @@ def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
     background.remove_listener(hear)
 
 
-def test_what_a_person_waits_for_only_ever_comes_nearer() -> None:
+def test_progress_never_decreases() -> None:
     waiting = FitProgress()
     waiting.begin(100.0)
     assert waiting.state(100.5, "refitting")[1] == "refitting · 0.5 s"

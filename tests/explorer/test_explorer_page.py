@@ -1,4 +1,4 @@
-"""The page without a browser: what a person does to its models, and what the page makes of it."""
+"""The page without a browser: user input to its models, and the resulting state of the page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_it_opens_with_the_model_in_use(browser: Browser) -> None:
     assert "N·(s/m)ⁿ" in browser.text("numbers")
 
 
-def test_a_slider_puts_its_effect_in_and_moves_the_curves(browser: Browser) -> None:
+def test_a_slider_adds_its_effect_and_moves_the_curves(browser: Browser) -> None:
     before = [list(part) for part in browser.model("model_curves").data["ys"]]
     browser.model(GAMMA).value = 1.2
     browser.turn()
@@ -127,14 +127,14 @@ def test_a_fit_can_be_stopped(browser: Browser) -> None:
     browser.click("as_fitted")
 
 
-def test_moving_a_size_ends_a_fit_that_is_under_way(browser: Browser) -> None:
+def test_moving_a_size_cancels_a_running_fit(browser: Browser) -> None:
     browser.model("tick_supply_refill").active = True
     browser.model("size_air_drag.C_D").value = 2.0
     assert browser.model("refit").label == "Refit"
     assert "cancelled" in browser.text("status")
 
 
-def test_of_a_track_only_the_page_says_so_and_shows_where_the_edge_was(browser: Browser) -> None:
+def test_for_a_track_the_page_says_so_and_shows_the_position_of_the_edge(browser: Browser) -> None:
     assert "there is no recording to show" in browser.text("film_caption")
     assert "tracked" in browser.text("film_caption")
     browser.model("film_frame").value = 40
@@ -151,7 +151,7 @@ def test_of_a_track_only_the_page_says_so_and_shows_where_the_edge_was(browser: 
 
 
 @pytest.mark.parametrize(("form", "head"), [("csv", b"model,condition"), ("svg", b"<?xml"), ("png", b"\x89PNG")])
-def test_figure_and_data_can_be_taken_along(browser: Browser, form: str, head: bytes) -> None:
+def test_figure_and_data_can_be_exported(browser: Browser, form: str, head: bytes) -> None:
     browser.click(f"export_{form}")
     given = browser.page.save_panel._download.data
     assert given["name"] == [f"vines_explorer.{form}"]
@@ -201,7 +201,7 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, background: Backgroun
     torn.page.close()
 
 
-def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
+def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
     browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from vinetrack.dynamics.simulate import SimulationError

@@ -1,4 +1,4 @@
-"""The button that has an effect proposed where no known one explains the trials; the search is tried elsewhere."""
+"""The button that proposes an effect if no known one explains the trials; the search itself is tested elsewhere."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
 
 @pytest.fixture
 def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
-    """A page of it, and what it has opened instead."""
+    """A page of it, and the pages opened in its place."""
     reopened: list[BackgroundFit] = []
     background = BackgroundFit(unexplained).begin()
     background.wait(240)
@@ -58,7 +58,7 @@ def searching(monkeypatch: pytest.MonkeyPatch, search: Callable[..., WrittenProp
     monkeypatch.setattr(proposal, "propose_effect", search)
 
 
-def test_the_effect_proposed_is_opened_fitted_and_saved_with_its_file(
+def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     opened: tuple[Browser, list[BackgroundFit]], unexplained: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser, reopened = opened
@@ -108,7 +108,7 @@ def _fitted_commands(page: Browser) -> str:
     return page.text("commands")
 
 
-def test_a_search_that_is_stopped_or_fails_says_so_and_may_begin_again(
+def test_a_stopped_or_failed_search_is_reported_and_can_be_restarted(
     opened: tuple[Browser, list[BackgroundFit]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser, _ = opened
@@ -145,13 +145,13 @@ def test_a_search_that_is_stopped_or_fails_says_so_and_may_begin_again(
     assert not browser.model("open_proposed").visible
 
 
-def test_it_is_not_offered_where_a_known_effect_may_explain_the_trials(campaign: Campaign) -> None:
+def test_it_is_not_offered_if_a_known_effect_may_explain_the_trials(campaign: Campaign) -> None:
     browser = Browser(BackgroundFit(campaign))
     assert not browser.model("propose_panel").visible
     browser.page.close()
 
 
-def test_a_file_that_is_no_effect_is_said(unexplained: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_effect_file_is_reported(unexplained: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
     path = unexplained.experiment.folder / "torn.py"
     path.write_text("def tail_force(", encoding="utf-8")
     searching(monkeypatch, lambda *_: WrittenProposal((), (path,)))

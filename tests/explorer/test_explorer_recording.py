@@ -1,4 +1,4 @@
-"""A recording for scrubbing: where edges lie in its picture, and what is said of a trial without one."""
+"""A recording in the explorer: positions of edges in its picture, and the message for a trial without one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vinetrack.video.axis import Axis
 
 
 def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
-    """A bar whose right end moves by 8 px a frame."""
+    """A bar whose right end moves by 8 px per frame."""
     return write_bars(path, 20 + 8.0 * np.arange(count), width, height)
 
 
@@ -39,7 +39,7 @@ def test_a_wide_recording_is_kept_as_wide_as_the_page_shows_it(tmp_path: Path) -
     assert film.scale == 0.5
 
 
-def test_a_file_that_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_recording_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"not a film")
     film = DecodedRecording(tmp_path / "a.mp4").decode()
     assert film.complete
@@ -47,7 +47,7 @@ def test_a_file_that_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
     assert "a.mp4" in film.error
 
 
-def test_a_film_nobody_wants_any_more_stops(tmp_path: Path) -> None:
+def test_decoding_stops_when_cancelled(tmp_path: Path) -> None:
     film = DecodedRecording(write_clip(tmp_path / "a.mp4"))
     film.decode(lambda one: one.cancel())
     assert not film.complete
@@ -69,13 +69,13 @@ def view(angle: float = 0.0) -> RecordingView:
     )
 
 
-def test_positions_of_the_model_find_their_place_by_those_of_the_track() -> None:
+def test_positions_of_the_model_are_mapped_to_pixels_by_the_track() -> None:
     one = view()
     along = one.along_px(np.array([0.0, 0.0125, 0.1, -0.01]))
     np.testing.assert_allclose(along, [10.0, 22.5, 110.0, 0.0], atol=1e-9)
 
 
-def test_a_track_of_one_point_places_nothing() -> None:
+def test_a_track_of_one_point_gives_no_pixels() -> None:
     bare = replace(view(), edge_px=np.full(20, np.nan))
     assert np.isnan(bare.along_px(np.array([0.0, 0.1]))).all()
 
@@ -87,12 +87,12 @@ def test_an_edge_is_drawn_across_the_axis() -> None:
     np.testing.assert_allclose(ys, (70.0, 70.0))
 
 
-def test_an_edge_goes_along_with_a_shaken_picture() -> None:
+def test_an_edge_follows_a_shaken_picture() -> None:
     assert view().across(20.0, 3) == view().across(22.0)
     assert view().across(20.0, 4) == view().across(20.0)
 
 
-def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaign) -> None:
+def test_a_trial_with_only_a_track_is_reported_to_have_no_recording(campaign: Campaign) -> None:
     words = recording_view(Results(campaign.folder), campaign.trials[0].data.trial)
     assert isinstance(words, str)
     assert "came as a track (d24_24kPa_1.csv): there is no recording to show" in words

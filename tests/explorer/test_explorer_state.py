@@ -1,4 +1,4 @@
-"""From a choice to curves and errors: those of the comparison where nothing was moved, physics where something was."""
+"""Curves and errors of a choice: those of the comparison without changes, and physically right ones with changes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from vinetrack.results.folder_layout import ResultsError
 GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"
 
 
-def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) -> None:
+def test_without_changes_the_errors_are_those_of_the_comparison(campaign: Campaign) -> None:
     table = pd.read_csv(campaign.folder / "comparison.csv").set_index("condition")
     errors = errors_m(campaign, simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign))))
     for condition, error in errors.items():
@@ -55,8 +55,8 @@ def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) ->
         assert campaign.floors_m[condition] == pytest.approx(table.loc[condition, "replicate_floor_m"])
 
 
-def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> None:
-    """Of a rest that is seen only vaguely no point is fitted, and still it tells where the vine began."""
+def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> None:
+    """No point of a doubtful rest is fitted, but it still determines the origin."""
     experiment = make_experiment(tmp_path / "vines", SMALL[:4])
     for path in (experiment / "tracks").iterdir():
         table = pd.read_csv(path)
@@ -72,7 +72,7 @@ def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> 
 
 
 def test_where_no_rest_was_filmed_release_and_origin_stay_near_the_track(campaign: Campaign) -> None:
-    """At constant speed the two are one: neither runs away, of vines of 0.2 m."""
+    """At constant speed release and origin are confounded: neither may diverge, with vines of 0.2 m."""
     blind = replace(campaign, trials=tuple(replace(seen, origin_known=False) for seen in campaign.trials))
     start = choice_in_use(blind)
     for n in (0.2, 0.37, 0.7):
@@ -107,7 +107,7 @@ def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
         np.testing.assert_allclose(with_it.growth_m, bare.growth_m, atol=1e-9)
 
 
-def test_curves_do_not_depend_on_where_releases_are_looked_for_from(campaign: Campaign) -> None:
+def test_curves_do_not_depend_on_the_start_of_the_alignment(campaign: Campaign) -> None:
     start = choice_in_use(campaign)
     far = simulate_curves(campaign, sized_model(campaign, start.with_size("eversion_damping.n", 0.6)))
     cold, warm = (
@@ -118,7 +118,7 @@ def test_curves_do_not_depend_on_where_releases_are_looked_for_from(campaign: Ca
         assert one.release_s == pytest.approx(other.release_s, abs=2e-6)
 
 
-def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
+def test_a_motion_is_given_in_the_coordinates_of_its_track(campaign: Campaign) -> None:
     curves = simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign)))
     seen, motion = campaign.trials[0], curves[0]
     positions = motion.lead_position_m(seen.data.time_s)
@@ -132,7 +132,7 @@ def traced(seen: ExplorerTrial) -> ExplorerTrial:
     return replace(seen, data=replace(seen.data, trace=trace))
 
 
-def test_a_motion_that_follows_a_measured_pressure_keeps_its_release(campaign: Campaign) -> None:
+def test_a_motion_under_a_measured_pressure_keeps_its_release(campaign: Campaign) -> None:
     other = replace(campaign, trials=tuple(map(traced, campaign.trials)))
     start = choice_in_use(campaign)
     bare, along = (
@@ -146,8 +146,8 @@ def test_a_motion_that_follows_a_measured_pressure_keeps_its_release(campaign: C
     assert [motion.release_s for motion in simulate_curves(other, far, along)] == [motion.release_s for motion in along]
 
 
-def test_a_slider_simulates_every_trial_once_a_move(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The alignment shifts what was simulated; how long a move takes is in `benchmarks/explorer_speed.py`."""
+def test_a_slider_move_simulates_every_trial_once(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The alignment shifts the simulated curve; `benchmarks/explorer_speed.py` measures the time of a move."""
     simulated: list[int] = []
 
     def counted(model: vt.Model, trials: Sequence[Trial], *more: Any, **named: Any) -> list[Trajectory]:
@@ -204,7 +204,7 @@ def test_own_effects_may_be_chosen(tmp_path: Path) -> None:
 # ---- choices ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_effect_goes_in_at_the_end_and_keeps_its_size_when_it_goes_out(campaign: Campaign) -> None:
+def test_an_effect_is_added_at_the_end_and_keeps_its_size_when_removed(campaign: Campaign) -> None:
     choice = choice_in_use(campaign).with_effect("air_drag").with_size("air_drag.C_D", 0.7)
     assert choice.effects[-1] == "air_drag"
     assert added_and_dropped(campaign, choice) == (["air_drag"], [])
@@ -214,7 +214,7 @@ def test_an_effect_goes_in_at_the_end_and_keeps_its_size_when_it_goes_out(campai
     assert choice.with_effect("air_drag") is choice
 
 
-def test_a_choice_is_written_in_words_as_on_the_command_line(campaign: Campaign) -> None:
+def test_a_choice_is_made_from_options_of_the_command_line(campaign: Campaign) -> None:
     start = choice_in_use(campaign)
     choice = choice_from_options(campaign, start, ["leak"], [], [f"{GAMMA}=1.2", "eversion_damping.B=6"])
     assert choice.effects[-2:] == ("leak", "reservoir_depletion")
@@ -234,14 +234,14 @@ def test_a_choice_is_written_in_words_as_on_the_command_line(campaign: Campaign)
         ([], [], ["air_drag.C_D=-1"], "outside its bounds, 0 to 200"),
     ],
 )
-def test_what_there_is_not_is_refused_in_a_sentence(
+def test_unknown_names_and_values_are_refused_in_a_sentence(
     campaign: Campaign, add: list[str], drop: list[str], sizes: list[str], words: str
 ) -> None:
     with pytest.raises(ChoiceError, match=words):
         choice_from_options(campaign, choice_in_use(campaign), add, drop, sizes)
 
 
-def test_sliders_reach_from_nothing_to_what_is_plausible_and_hold_what_was_fitted() -> None:
+def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value() -> None:
     drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
     assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
     low, high = slider_range("air_drag.C_D", drag, 17.0)
@@ -259,7 +259,7 @@ def test_sliders_reach_from_nothing_to_what_is_plausible_and_hold_what_was_fitte
 # ---- labels, lines, files, commands ----------------------------------------------------------------------------------
 
 
-def test_a_condition_is_called_by_what_tells_it_from_the_others(campaign: Campaign) -> None:
+def test_a_condition_is_labelled_by_its_distinguishing_settings(campaign: Campaign) -> None:
     assert [campaign.labels[name] for name in campaign.conditions] == ["24 kPa", "36 kPa", "48 kPa, 20 g"]
     thick = Trial(name="a", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=24e3)
     other = replace(thick, diameter_m=0.024, thickness_m=2e-4, length_m=0.2)
@@ -271,7 +271,7 @@ def test_a_condition_is_called_by_what_tells_it_from_the_others(campaign: Campai
     assert len(set(condition_labels({"a": thick, "b": thick}).values())) == 2
 
 
-def test_lines_are_in_milliseconds_and_millimetres_and_no_longer_than_can_be_seen(campaign: Campaign) -> None:
+def test_lines_are_in_milliseconds_and_millimetres_and_thinned(campaign: Campaign) -> None:
     curves = simulate_curves(campaign, sized_model(campaign, choice_in_use(campaign)))
     shown = [0, 1, 2]
     lines, left = measured_lines(campaign, shown), residual_lines(campaign, curves, shown)
@@ -284,7 +284,7 @@ def test_lines_are_in_milliseconds_and_millimetres_and_no_longer_than_can_be_see
     assert len(range(*plotted_rows(10_000, 2000).indices(10_000))) <= 260
 
 
-def test_error_bars_have_a_row_a_condition_first_on_top(campaign: Campaign) -> None:
+def test_error_bars_have_a_row_per_condition_with_the_first_on_top(campaign: Campaign) -> None:
     now = dict.fromkeys(campaign.conditions, 2e-3)
     rows = error_bars(campaign, now, {}, campaign.floors_m, [campaign.conditions[0]])
     assert rows["label"] == ["48 kPa, 20 g", "36 kPa", "24 kPa"]
@@ -303,7 +303,7 @@ def test_each_vine_has_its_colour(campaign: Campaign) -> None:
     assert vine_colours(campaign) == [("measured", "#0072B2")]
 
 
-def test_the_curves_go_out_as_a_table_and_as_a_figure(campaign: Campaign) -> None:
+def test_the_curves_are_exported_as_a_table_and_as_a_figure(campaign: Campaign) -> None:
     choice = choice_in_use(campaign)
     curves = simulate_curves(campaign, sized_model(campaign, choice))
     table = curve_table(campaign, choice, curves, range(6))
@@ -316,7 +316,7 @@ def test_the_curves_go_out_as_a_table_and_as_a_figure(campaign: Campaign) -> Non
         export_bytes(campaign, choice, curves, [0], "xls")
 
 
-def test_the_page_says_the_command_for_what_it_shows(campaign: Campaign) -> None:
+def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> None:
     start = choice_in_use(campaign)
     folder = campaign.folder.as_posix()
     assert commands(campaign, start, start, fitted=True) == [f"vinetrack compare {folder}"]

@@ -1,4 +1,4 @@
-"""Figures of a whole experiment, from tables written by hand: what is drawn and said, and that nothing overlaps."""
+"""Figures of a whole experiment, from tables written by hand: content, text, and no overlaps."""
 
 from __future__ import annotations
 

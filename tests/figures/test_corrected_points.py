@@ -42,12 +42,12 @@ def test_a_strip_without_corrections_says_nothing_of_them(tracking: Tracking) ->
     assert "corrected" not in words(replace(tracking, track=plain))
 
 
-def test_a_time_put_right_is_no_point_corrected_by_hand() -> None:
+def test_a_corrected_time_does_not_count_as_a_point_corrected_by_hand() -> None:
     flags = ["corrected", "gap;retimed", "", "rejected;corrected", "corrected;gap;retimed"]
     assert list(hand_corrected(flags)) == [True, False, False, True, True]
 
 
-def test_what_earlier_releases_wrote_is_read_as_a_time_put_right() -> None:
+def test_the_flags_of_earlier_releases_are_read_as_corrected_times() -> None:
     assert list(hand_corrected(["gap;corrected", "doubtful;gap;corrected"])) == [False, False]
     assert list(with_flag(["gap;corrected", "corrected;gap"], "retimed")) == [True, False]
     assert join_flags("gap;corrected", "doubtful") == "doubtful;gap;retimed"

@@ -1,4 +1,4 @@
-"""Pictures of designs: labelled with units, with everything on them that was asked for."""
+"""Figures of designs: complete, and labelled with units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures of a diagnosis, from tables written by hand: what is drawn where, in which colour, and what is said."""
+"""Figures of a diagnosis, from tables written by hand: positions, colours and text."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_ladder_without_replicates_or_left_out_errors_is_drawn_with_what_there
     assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["in sample", "on left-out conditions"]
 
 
-def test_no_ladder_is_said() -> None:
+def test_a_missing_ladder_is_stated() -> None:
     assert "No model was fitted" in draw_ladder(steps("").iloc[:0]).texts[0].get_text()
 
 
@@ -132,7 +132,7 @@ def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() ->
     assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
 
 
-def test_one_that_was_not_fitted_is_as_long_as_its_score_and_one_that_makes_it_worse_has_no_length() -> None:
+def test_the_bar_of_an_unfitted_candidate_is_its_score_and_that_of_a_worse_fit_has_no_length() -> None:
     table = ranking(
         ("leak", "physical", "refitted", -67.0, False), ("air_drag", "physical", "screened", math.nan, False)
     ).assign(sigma=[-4.1, -7.0])
@@ -154,13 +154,13 @@ def test_the_longest_of_lists_is_cut_and_rounds_stand_below_each_other() -> None
     assert in_bounds(fig)
 
 
-def test_no_candidate_is_said() -> None:
+def test_missing_candidates_are_stated() -> None:
     assert draw_candidates([]).texts
     assert draw_candidates([("one", ranking())]).texts
 
 
 @pytest.mark.parametrize("draw", [draw_where, draw_drift, draw_missing_force])
-def test_a_table_that_is_not_there_is_said(draw) -> None:  # type: ignore[no-untyped-def]
+def test_an_empty_table_is_stated(draw) -> None:  # type: ignore[no-untyped-def]
     assert draw(pd.DataFrame()).texts
 
 
@@ -176,7 +176,7 @@ def groups() -> pd.DataFrame:
     return pd.DataFrame([*rows, rows[-1] | gamma])
 
 
-def test_a_parameter_that_drifts_is_drawn_against_what_it_should_not_know() -> None:
+def test_a_drifting_parameter_is_drawn_against_the_condition() -> None:
     (ax,) = draw_drift(groups(), "air drag").axes
     assert ax.get_xlabel() == "pressure (kPa)"
     assert ax.get_title(loc="left") == "B against pressure, N = 6"
@@ -192,7 +192,7 @@ def test_values_that_differ_between_vines_stand_side_by_side() -> None:
     assert [label.get_text() for label in ax.get_xticklabels()] == ["thin", "thick"]
 
 
-def test_the_missing_force_is_drawn_against_each_thing_it_may_hang_on() -> None:
+def test_the_missing_force_is_drawn_against_each_variable() -> None:
     point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05, "condition": ""}
     against = ("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa")
     rows = [point | {"against": name, "condition": c} for name in against for c in ("", "a", "b")]
@@ -213,7 +213,7 @@ def cells(after: float = 0.1e-3) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_the_misfit_is_coloured_by_side_and_numbered_where_it_is_beyond_scatter() -> None:
+def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() -> None:
     before, after = draw_where(cells(), "air drag").axes
     sides = [to_hex(patch.get_facecolor()) for patch in before.patches]
     assert sides == [BLUE.lower()] * 4 + [VERMILLION.lower()] * 4

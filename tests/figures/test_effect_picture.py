@@ -1,4 +1,4 @@
-"""What an effect does, drawn: the table behind the picture, and the picture."""
+"""The figure of one effect: its table and its drawing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The learned force as a curve or a map, with units, and blank where no trial has been."""
+"""The learned force as a curve or a map, with units, and blank outside the range of the trials."""
 
 from __future__ import annotations
 
@@ -54,5 +54,5 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
     assert [len(ax.lines) for ax in (force, error)] == [1, 1]
 
 
-def test_a_table_that_is_not_there_is_said() -> None:
+def test_an_empty_table_is_stated() -> None:
     assert draw_learned_force(pd.DataFrame()).texts

@@ -1,4 +1,4 @@
-"""Model and measurement drawn: from one condition to forty, and none."""
+"""Figures of model and measurement: one condition, forty, and none."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_without_a_fit_the_figure_says_so(draw) -> None:  # type: ignore[no-unty
     assert "was not fitted" in fig.texts[0].get_text()
 
 
-def test_of_many_conditions_those_that_the_model_misses_by_most_are_drawn() -> None:
+def test_of_many_conditions_those_with_the_largest_error_are_drawn() -> None:
     table, trajectories = campaign(MAX_PANELS + 5, n_trials=1)
     table["rms_position_m"] = np.linspace(1e-3, 2e-3, len(table))
     fig = draw_model_comparison(table, trajectories)

@@ -1,4 +1,4 @@
-"""Frames of a clip: every edge where it belongs, in its own colour, with scale, time and names."""
+"""Frames of a clip: every edge at its position and in its colour, with scale, time and names."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_each_edge_stands_where_it_is_along_the_axis() -> None:
         assert np.mean(columns_of(picture, colour)) == pytest.approx(place, abs=1)
 
 
-def test_edges_that_agree_are_all_seen() -> None:
+def test_edges_that_agree_are_all_visible() -> None:
     picture = compose(view(), grey(), 1, 12.0, edges(200.0, 200.0, 200.0))
     for colour in (TRACKED, BEFORE, AFTER):
         assert np.mean(columns_of(picture, colour)) == pytest.approx(220, abs=1)

@@ -1,4 +1,4 @@
-"""Figures that stand beside the paper's, from tables written by hand: what is drawn, and that nothing is cut off."""
+"""Figures for comparison with the paper, from tables written by hand: content, and nothing cut off."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_trials_of_other_sizes_have_no_place_beside_fig_6() -> None:
     assert "printed size" in words(draw_paper_damping(points().iloc[-1:], damping(), {1: 0.57}, 0.37))
 
 
-def test_trials_that_never_get_steady_are_said_to() -> None:
+def test_trials_without_a_steady_speed_are_reported() -> None:
     never = points().assign(used=False, eligible=False)
     assert "steady speed" in words(draw_paper_damping(never, damping(), {1: 0.57, 4: 6.44}, 0.37))
     literal = draw_paper_damping(points().assign(used=False), damping(), {1: 0.57, 4: 6.44}, 0.37)

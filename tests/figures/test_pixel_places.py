@@ -1,4 +1,4 @@
-"""Edges that gather at a place within a pixel are told from edges that fall anywhere."""
+"""Pixel locking is distinguished from a uniform distribution of edges within a pixel."""
 
 from __future__ import annotations
 

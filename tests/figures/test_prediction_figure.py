@@ -1,4 +1,4 @@
-"""The picture of what is predicted: everything on it, labelled, whether vines get there or not."""
+"""The figure of predictions: complete and labelled, whether vines reach their end or not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def words(pictures: list[PredictionPicture]) -> str:
     return " | ".join([*texts, *ticks, *(text.get_text() for text in fig.texts)])
 
 
-def test_one_condition_shows_what_leaves_it_open() -> None:
+def test_one_condition_shows_its_uncertainty_budget() -> None:
     said = words([picture()])
     for expected in ("leading edge y (mm)", "ẏ (m/s)", "tension of the tail (N)", "growth y/L", "y/L = 0.95"):
         assert expected in said

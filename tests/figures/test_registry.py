@@ -1,4 +1,4 @@
-"""The registry of figures: every entry has all that pages and workflow ask of it."""
+"""The registry of figures: every entry has all that pages and workflow need."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Speed, efficiency and payload drawn: what is shown and said, and that nothing overlaps; tables written by hand."""
+"""Figures of speed, efficiency and payload, from tables written by hand: content, text, and no overlaps."""
 
 from __future__ import annotations
 

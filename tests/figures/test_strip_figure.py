@@ -1,4 +1,4 @@
-"""The strip of a recording: where its edge is drawn, and flagged frames told from others; from arrays by hand."""
+"""The strip of a recording, from arrays written by hand: position of the edge, and marks of flagged frames."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_smaller_picture_holds_the_means_of_the_larger() -> None:
     assert shrunk(picture, 10) is picture
 
 
-def test_a_strip_weighs_little_in_a_page() -> None:
+def test_a_strip_is_small_in_a_page() -> None:
     body, _, _ = compact_svg(render(draw_strip("a", tracking(900, 320), 1e-3), ["svg"])["svg"].decode(), "p", {})
     assert len(body) < 40_000
     assert "matrix(" in body

@@ -1,4 +1,4 @@
-"""Pictures made small: the same coordinates to a tenth of a point, fewer elements, text as text, smaller images."""
+"""Compact SVG: the same coordinates to a tenth of a point, fewer elements, text as text, smaller images."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_images_are_recoded_and_stay_what_they_show() -> None:
     assert np.mean(np.abs(back - shade)) < 12
 
 
-def test_what_is_no_picture_is_refused() -> None:
+def test_a_file_that_is_not_svg_is_refused() -> None:
     with pytest.raises(ValueError, match="not an SVG"):
         compact_svg("<svg", "p", {})
 

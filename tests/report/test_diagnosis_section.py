@@ -1,4 +1,4 @@
-"""What the page says of a diagnosis, for every verdict, for one that was refused, and for none."""
+"""The section on the diagnosis, for every verdict, for a refused diagnosis, and without one."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_identifiers_are_unique_and_every_link_of_the_page_leads_somewhere(verdi
     assert inner <= set(ids)
 
 
-def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None:
+def test_a_missing_effect_has_its_certainty_its_size_and_the_error_before_and_after() -> None:
     found = {fact.question: fact for fact in facts(diagnosis(), ladder("", "reservoir_depletion"))}
     assert found["Significance"].answer == "20 σ"
     assert found["Significance"].note == "next best: leak, worse by Δχ² = 50.0, not plausible"
@@ -95,7 +95,7 @@ def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None
     assert found["Damping exponent"].answer == "n = 0.3700 ± 0.0040"
 
 
-def test_the_size_on_the_first_screen_has_the_interval_with_others_left_open() -> None:
+def test_the_size_on_the_first_screen_has_the_interval_with_confounders_left_free() -> None:
     content = diagnosis()
     (row,) = [row for row in content["rounds"][0]["ranking"] if row["effect"] == "reservoir_depletion"]
     row["numbers"] = [number("reservoir_depletion.gamma", "γ", 1.17, 0.004)]
@@ -117,7 +117,7 @@ def test_the_size_on_the_first_screen_has_the_interval_with_others_left_open() -
         (("air_drag", "inlet_loss"), "2 of 4 candidates fit equally well"),
     ],
 )
-def test_where_no_other_was_fitted_it_says_of_how_many_it_is_the_answer(answers: tuple[str, ...], words: str) -> None:
+def test_without_a_fitted_rival_the_number_of_candidates_is_stated(answers: tuple[str, ...], words: str) -> None:
     content = diagnosis("missing" if len(answers) == 1 else "ambiguous")
     rows = [candidate(name, 400.0, in_answer_set=True) for name in answers]
     rows += [candidate(name, None, status="screened") for name in ("leak", "gas_inertia")]
@@ -142,7 +142,7 @@ def test_what_is_left_after_the_last_effect_is_said(final: str, words: str) -> N
     assert words in meaning(diagnosis(final_verdict=final))
 
 
-def test_what_cannot_be_told_apart_has_the_size_of_each_and_the_next_trial() -> None:
+def test_tied_candidates_have_their_sizes_and_the_next_trial() -> None:
     content = diagnosis("ambiguous")
     questions = [fact.question for fact in facts(content, None)]
     assert questions == ["Significance", "If air drag", "If inlet loss", "Damping exponent"]
@@ -154,14 +154,14 @@ def test_what_cannot_be_told_apart_has_the_size_of_each_and_the_next_trial() -> 
     assert "film a ruler and a strobe" in html
 
 
-def test_adequate_says_what_could_still_hide() -> None:
+def test_adequate_lists_upper_limits_on_undetected_effects() -> None:
     html = shown(diagnosis("adequate"))
     assert "Upper limits on undetected effects" in html
     assert "<details open>" in html
     assert facts(diagnosis("adequate"), None)[0].question == "Most significant candidate"
 
 
-def test_the_most_suspicious_is_so_by_its_score_not_by_what_a_wrong_sign_would_gain() -> None:
+def test_the_most_significant_candidate_is_chosen_by_score_not_by_a_gain_with_the_wrong_sign() -> None:
     content = diagnosis("adequate")
     wrong = candidate("fold_inertia", 900.0, status="screened", sigma=0.0)
     right = candidate("air_drag", 2.0, status="screened", sigma=1.4)
@@ -176,7 +176,7 @@ def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() 
     assert fact.note == "19 σ better, but needs more gas than there is"
 
 
-def test_what_could_still_hide_is_in_the_unit_of_its_number() -> None:
+def test_upper_limits_are_in_the_displayed_unit() -> None:
     row = candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")})
     table = upper_limit_table([Candidate.from_json(row)])
     assert table is not None
@@ -214,7 +214,7 @@ def test_ties_are_named_most_alike_first() -> None:
     assert tied_pairs(Round.from_json({"verdict": ""})) == []
 
 
-def test_how_the_numbers_moved_stands_side_by_side() -> None:
+def test_the_parameters_of_all_models_are_in_one_table() -> None:
     table = moved_table(moved())
     assert table is not None
     assert list(table.head) == ["Parameter", "initial model", "+ reservoir depletion"]
@@ -242,7 +242,7 @@ def test_the_ladder_is_a_table_of_numbers_too() -> None:
     assert '<td class="number">10.0</td>' in html
 
 
-def test_what_an_effect_is_is_said_beside_its_name() -> None:
+def test_an_effect_is_described_with_its_name() -> None:
     html = shown(
         diagnosis(), summaries={"reservoir_depletion": "The pressure falls while it grows.", "leak": "A hole."}
     )
@@ -250,7 +250,7 @@ def test_what_an_effect_is_is_said_beside_its_name() -> None:
     assert "A hole." not in html
 
 
-def test_what_drifts_is_said_once_and_what_does_not_is_not() -> None:
+def test_drifting_parameters_are_listed_once_and_others_are_not() -> None:
     content = diagnosis()
     content["where"].append(content["drift"][0]["sentence"])
     content["drift"].append({"sentence": "n rises by 1 %.", "significant": False})
@@ -330,7 +330,7 @@ def test_numbers_are_said_in_units_that_read_well() -> None:
     assert [verdict_summary.size(one) for one in shown] == ["k (v) = 2.50 ± 0.10 kPa", "k (v) = 2.50 kPa"]
 
 
-def test_names_are_listed_as_a_person_says_them() -> None:
+def test_names_are_listed_with_and_before_the_last() -> None:
     assert listed(["air_drag"]) == "air drag"
     assert listed(["air_drag", "leak", "gravity"], "or") == "air drag, leak or gravity"
     assert listed([]) == ""

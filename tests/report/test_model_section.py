@@ -1,4 +1,4 @@
-"""What the page says of the model in use, from tables written by hand."""
+"""The section on the model in use, from tables written by hand."""
 
 from __future__ import annotations
 

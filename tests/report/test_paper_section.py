@@ -1,4 +1,4 @@
-"""The paper's numbers as a section of the report: both tables, every row, and what is said of the marks."""
+"""The section on the paper's numbers: both tables, every row, and the explanation of the marks."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_the_calibration_is_listed_with_its_error_and_what_it_rests_on() -> None
     assert SHARED_ERROR.replace("'", "&#39;") in html
 
 
-def test_the_error_of_the_scale_is_said_to_be_apart_from_random_error() -> None:
+def test_the_error_of_the_scale_is_stated_separately_from_random_error() -> None:
     assert "stated separately from the random error" in SHARED_ERROR
 
 
@@ -84,7 +84,7 @@ def test_a_scale_of_the_sheet_has_an_unknown_error_and_a_row_for_each_value() ->
 
 
 @pytest.mark.parametrize("unknown", [None, math.nan])
-def test_an_error_that_is_not_known_is_said_so(unknown: float | None) -> None:
+def test_an_unknown_error_is_stated_as_unknown(unknown: float | None) -> None:
     (row,) = calibration_table({"a": recording(scale_rel_sigma=unknown)})
     assert row["error"] == "unknown"
 

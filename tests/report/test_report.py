@@ -1,4 +1,4 @@
-"""The page, from tables written by hand: what its first screen says, that it is one file, and that nothing gets out."""
+"""The report, from tables written by hand: its first screen, a single file, and no external requests."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Tags(HTMLParser):
 
 
 def downloaded(href: str | None) -> str:
-    """The file behind a data address."""
+    """The file in a data URI."""
     head, _, data = (href or "").partition(",")
     assert head.startswith("data:")
     return base64.b64decode(data).decode() if head.endswith("base64") else unquote(data)
@@ -226,7 +226,7 @@ def test_the_motion_of_a_trial_is_one_click_away_thinned_to_what_is_shown() -> N
     assert 100 < len(lines) <= 1 + MAX_DATA_ROWS
 
 
-def test_a_section_of_another_room_stands_before_the_trials() -> None:
+def test_a_further_section_comes_before_the_trials() -> None:
     table = ReportTable("Numbers", ("what", "value"), [("n", "0.37"), (EVIL, "1")], frozenset({1}), "by hand")
     figure = ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
     html = page(sections=[ReportSection("paper", "The paper", [EVIL], [table], [figure])])
@@ -251,7 +251,7 @@ def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None
         assert gone not in svg
 
 
-def test_a_small_curve_marks_the_steady_stretch() -> None:
+def test_a_sparkline_marks_the_steady_window() -> None:
     time_s = np.linspace(0, 1, 50)
     svg = speed_sparkline(time_s, np.ones(50), (0.5, 1.0))
     steady = re.search(r'class="steady" points="([^"]+)"', svg)
@@ -263,7 +263,7 @@ def test_a_small_curve_marks_the_steady_stretch() -> None:
 
 
 @pytest.mark.parametrize("speed", [np.full(50, np.nan), np.array([1.0])])
-def test_a_small_curve_of_nothing_is_blank(speed: np.ndarray) -> None:
+def test_a_sparkline_without_data_is_blank(speed: np.ndarray) -> None:
     assert speed_sparkline(np.linspace(0, 1, speed.size), speed, (np.nan, np.nan)) == ""
 
 

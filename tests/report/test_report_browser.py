@@ -1,4 +1,4 @@
-"""The page in a real browser: it complains of nothing, asks for nothing, follows the screen, and prints."""
+"""The report in a real browser: no errors, no requests, adapts to the colour scheme, and prints."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def motion() -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A page with everything a page can have."""
+    """A page with all optional parts."""
     folder = tmp_path_factory.mktemp("page")
     steps = ladder("", "reservoir_depletion")
     pictures = {"ladder": svg_of(draw_ladder(steps)), "before_after": svg_of(draw_before_after("24 kPa", motion()))}
@@ -67,7 +67,7 @@ def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
         yield browser
 
 
-def test_it_complains_of_nothing_and_asks_for_nothing_beyond_itself(chrome: Chrome, address: str) -> None:
+def test_the_browser_logs_no_errors_and_makes_no_requests(chrome: Chrome, address: str) -> None:
     chrome.open(address)
     assert chrome.complaints == []
     asked = {request.split(":", 1)[0] for request in chrome.requests if not request.startswith("about:")}

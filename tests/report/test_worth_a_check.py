@@ -1,4 +1,4 @@
-"""An error of measurement that falls short of its threshold is named as worth a check; an effect is not."""
+"""A measurement error just below its threshold is listed as worth a check; an effect is not."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinetrack.narrative.verdict_text import explain
 
 
 def round_of(effect: str, kind: str, sigma: float) -> SimpleNamespace:
-    """A round that finds nothing, in which one candidate comes nearest."""
+    """A round without a finding, in which one candidate is closest to its threshold."""
     effects = [SimpleNamespace(name=effect, kind=kind), SimpleNamespace(name="leak", kind="physical")]
     tests = SimpleNamespace(
         fit=SimpleNamespace(model=SimpleNamespace(names=("gravity",)), trials=[None] * 6),

@@ -1,4 +1,4 @@
-"""A folder of rendered clips, as a person brings it."""
+"""A folder of rendered clips, as a user would have it."""
 
 from __future__ import annotations
 

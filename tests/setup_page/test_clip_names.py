@@ -1,4 +1,4 @@
-"""Recordings are listed, and their names read."""
+"""Listing of recordings, and columns from their names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server's answers, without a browser: frames, the axis, a track, a save; and nothing for strangers."""
+"""Responses of the server, without a browser: frames, axis, track, save; and refusal of foreign requests."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_file_that_changed_meanwhile_is_not_overwritten(server: SetupServer, c
 
 
 @pytest.mark.parametrize("headers", [{"Host": "elsewhere.example"}, {**OURS, "Origin": "http://elsewhere.example"}])
-def test_a_page_from_elsewhere_gets_nothing(server: SetupServer, clips: Path, headers: dict[str, str]) -> None:
+def test_requests_from_other_pages_are_refused(server: SetupServer, clips: Path, headers: dict[str, str]) -> None:
     assert ask(server, "/api/save", sent(clips), headers)[0] == 403
     assert not (clips / "trials.csv").exists()
 
@@ -122,7 +122,7 @@ def test_a_request_without_the_header_changes_nothing(server: SetupServer, clips
     assert ask(server, "/api/save", sent(clips), {"Content-Type": "text/plain"})[0] == 403
 
 
-def test_a_path_that_leads_out_is_refused_in_words(server: SetupServer) -> None:
+def test_a_path_out_of_the_folder_is_refused_with_a_reason(server: SetupServer) -> None:
     status, data, _ = ask(server, "/api/thumbnail?recording=../other.mp4")
     assert status == 422
     assert "leads out of the experiment folder" in json.loads(data)["words"]

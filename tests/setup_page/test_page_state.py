@@ -1,4 +1,4 @@
-"""What the page is told, and what it sends back."""
+"""State sent to the page, and drafts sent back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinetrack.setup_page.page_state import draft_from_json, draft_problems, pag
 
 
 def sent(folder: Path, **more: Any) -> dict[str, Any]:
-    """What the page sends where nobody has touched it."""
+    """The content that an unchanged page sends."""
     state = page_state(folder)
     return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
 

@@ -25,7 +25,7 @@ NAME = "a.getAttribute('aria-label') || a.labels?.[0]?.textContent || a.textCont
 
 
 class Person:
-    """What somebody does on the page."""
+    """User actions on the page."""
 
     def __init__(self, chrome: Chrome, address: str) -> None:
         self.chrome = chrome
@@ -67,7 +67,7 @@ def at_the_page(address: str, folder: Path) -> Iterator[Person]:
 
 @pytest.fixture
 def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
-    """At a page served by this process: it need not start once more for every test."""
+    """A page served by this process, so that the server is not restarted for every test."""
     server = start_server(clips, 0)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
@@ -99,7 +99,7 @@ def _fill_in(person: Person, length_mm: str) -> None:
     person.chrome.wait("document.querySelector('#headline').textContent.includes('complete')", "the complete sheet")
 
 
-def test_a_ruler_wrong_by_two_is_said_once_and_not_before_the_recordings_are_looked_at(person: Person) -> None:
+def test_a_ruler_wrong_by_a_factor_of_two_is_reported_once_after_checking_the_recordings(person: Person) -> None:
     _fill_in(person, "337.5")
     person.press("#check")
     person.chrome.wait("document.querySelector('#headline').textContent.includes('or correct')", "the check", 60)
@@ -183,7 +183,7 @@ def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_
     assert person.chrome.run("document.activeElement.dataset.handle") == "Start of the growth axis"
 
 
-def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) -> None:
+def test_a_frame_is_corrected_and_the_file_contains_the_correction(person: Person, clips: Path) -> None:
     """Frame 20 is dropped by its button, frame 21 moved in the picture by the keyboard, and 22 taken back."""
     person.press("#track")
     person.chrome.wait("document.querySelector('.strip svg') !== null", "the strip", 120)
@@ -193,7 +193,7 @@ def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) 
     for frame, button in ((20, "#drop"), (22, "#confirm"), (22, "#undo")):
         person.chrome.run(show % frame)
         person.press(button)
-    person.press("[aria-label='Frame before']")
+    person.press("[aria-label='Previous frame']")
     edge = "document.querySelector('[data-handle^=Leading]')"
     person.chrome.wait(f"{edge} !== null && document.querySelector('#frame').value === '21'", "the edge in the picture")
     person.chrome.run(f"{edge}.focus()")
@@ -209,7 +209,7 @@ def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) 
     person.chrome.run("document.querySelector('[data-handle^=End]').focus()")
     person.key("ArrowDown", 40)
     warning = "document.querySelector('#moved-points')?.textContent"
-    person.chrome.wait(f"{warning}?.includes('along the axis as it was')", "the warning of moved points")
+    person.chrome.wait(f"{warning}?.includes('to the former axis')", "the warning of moved points")
 
 
 def test_a_problem_stands_under_the_cell_it_concerns(person: Person) -> None:

@@ -237,8 +237,8 @@ class FilmPanel:
     def _update_caption(self, frame: int, reason: str = "") -> None:
         aligned = self._shown_trial()
         since_s = self._time_s(frame) - aligned.release_s
-        positions = zip(("tracked", "compared with", "model"), self._positions(frame), strict=True)
-        colours = {"tracked": MEASURED_EDGE, "compared with": REFERENCE_EDGE, "model": MODEL_EDGE}
+        positions = zip(("tracked", "comparison", "model"), self._positions(frame), strict=True)
+        colours = {"tracked": MEASURED_EDGE, "comparison": REFERENCE_EDGE, "model": MODEL_EDGE}
         positions_text = [
             f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (m - aligned.origin_m):.1f} mm</span>'
             for name, m in positions

@@ -96,7 +96,7 @@ class Plots:
         tips = [
             ("", "@label"),
             ("now", "@now{0.000} mm"),
-            ("compared with", "@before{0.000} mm"),
+            ("for comparison", "@before{0.000} mm"),
             ("replicates", "@floor{0.000} mm"),
         ]
         fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, fig.renderers[0]]))

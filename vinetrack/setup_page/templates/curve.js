@@ -1,6 +1,6 @@
-// A smooth curve through points, the one that is tracked along: a natural cubic spline whose parameter grows by the
+// The smooth curve through points that is used for tracking: a natural cubic spline whose parameter increases by the
 // square root of the distance between points (video/curved_axis.py).
-const STEP_PX = 4;  // about, between places of it: drawn straight, a bend of 100 px radius is off by less than 0.05 px
+const STEP_PX = 4;  // approximate spacing of its points: with straight segments the error at a radius of 100 px is below 0.05 px
 
 export function curveThrough(points) {
   const knots = knotsOf(points);
@@ -14,7 +14,7 @@ export function curveThrough(points) {
   return [...places, points.at(-1)];
 }
 
-// Where a bend is added: the middle of the longest part between two points, and its place among them.
+// Where a bend is added: the middle of the longest segment, and its index.
 export function middleOfLongest(points) {
   const lengths = points.slice(1).map((point, i) => distance(points[i], point));
   const i = lengths.indexOf(Math.max(...lengths)), knots = knotsOf(points);
@@ -23,7 +23,7 @@ export function middleOfLongest(points) {
   return {index: i + 1, point: [0, 1].map((k) => valueAt(knots, column(k), bendsOf(knots, column(k)), i, 0.5))};
 }
 
-// Parameter at each point; none where two points coincide, through which no curve goes.
+// Parameter at each point; null if two points coincide, because no curve passes through them.
 function knotsOf(points) {
   const knots = [0];
   for (let i = 1; i < points.length; i++) knots.push(knots[i - 1] + Math.sqrt(distance(points[i - 1], points[i])));
@@ -32,7 +32,7 @@ function knotsOf(points) {
 
 const distance = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
 
-// Second derivatives at the knots, none at both ends: a tridiagonal system, by elimination.
+// Second derivatives at the knots, zero at both ends: solution of a tridiagonal system.
 function bendsOf(knots, values) {
   const n = values.length, bends = Array(n).fill(0), upper = Array(n).fill(0);
   for (let i = 1; i < n - 1; i++) {

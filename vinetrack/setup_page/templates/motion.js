@@ -1,4 +1,4 @@
-// The motion: strip along the axis with the edge that is found, position against time, the measured pressure beside it.
+// The motion: strip along the axis with the tracked edge, position against time, and the measured pressure.
 import {$, ask, changed, content, decimals, el, round, state} from "./state.js";
 import {placesOf, row, showFrame, shownFrame} from "./picture.js";
 
@@ -6,7 +6,7 @@ let last = null;
 
 export function forget() {
   last = null;
-  $("tracked").replaceChildren(el("p", {class: "hint"}, "Shows the strip along the axis and the leading edge that is found, before anything is saved."));
+  $("tracked").replaceChildren(el("p", {class: "hint"}, "Shows the strip along the axis with the leading edge, before anything is saved."));
 }
 
 export async function track() {
@@ -34,7 +34,7 @@ function show(made) {
   if (!made.timed) notes.unshift("Times are in frames: fill in capture_fps.");
   if (!made.scaled) notes.unshift("Positions are in pixels: give a scale.");
   if (made.pressure?.words) notes.unshift(`pressure_trace ${made.pressure.words}`);
-  $("tracked").replaceChildren(el("p", {class: "fact"}, el("b", {}, made.name), `: ${facts.join("; ")}.`), strip(made), plot(made), el("p", {class: "readout", id: "readout"}, "Point at the strip or the curve: the frame is shown beside it."), proofs(),
+  $("tracked").replaceChildren(el("p", {class: "fact"}, el("b", {}, made.name), `: ${facts.join("; ")}.`), strip(made), plot(made), el("p", {class: "readout", id: "readout"}, "Point at the strip or the curve to see the frame."), proofs(),
     el("ul", {class: "problems"}, ...notes.map((text) => el("li", {class: "note"}, text))));
 }
 
@@ -77,7 +77,7 @@ function plot(made) {
   const per = made.timed ? 1000 : 1;
   const time = made.time_s.map((value) => value * per);
   const position = made.scaled ? made.position_mm : made.edge_px;
-  if (!position.some((value) => value !== null)) return el("p", {class: "hint"}, "No position is known.");
+  if (!position.some((value) => value !== null)) return el("p", {class: "hint"}, "There are no positions.");
   const [t0, t1] = range(time);
   const first = Math.min(...position.filter((value) => value !== null));
   const grown = position.map((value) => (value === null ? null : value - first));
@@ -126,7 +126,7 @@ function point(i) {
   pending = requestAnimationFrame(() => showFrame(i, edgeAt(i)));
 }
 
-// The edge of a frame in the picture, and what happens where it is moved.
+// The edge of a frame in the picture, and how it is moved.
 function edgeAt(i) {
   const made = last;
   if (!made) return null;
@@ -134,7 +134,7 @@ function edgeAt(i) {
   const step = made.length_px / (places.length - 1);
   const half = 0.75 * (made.axis.width_px || 0.1 * made.length_px);
   const shake = made.shake_px[i] ?? 0;
-  // A frame without an edge offers one where its neighbours have theirs.
+  // For a frame without an edge, propose the position of its neighbours.
   const edge = made.edge_px[i] ?? nearest(made.edge_px, i);
   if (edge === null) return null;
   const s = edge + shake;
@@ -146,7 +146,7 @@ function edgeAt(i) {
   };
 }
 
-// Place and direction `by` px along one part of an axis, which goes straight on beyond its ends.
+// Position and direction `by` px along one segment of an axis, extended straight beyond its ends.
 function along(places, part, step, by) {
   const [[x0, y0], [x1, y1]] = [places[part], places[part + 1]];
   const [ux, uy] = [(x1 - x0) / step, (y1 - y0) / step];
@@ -171,16 +171,16 @@ function nearest(values, i) {
   return null;
 }
 
-// ---- proofreading ------------------------------------------------------------------------------------------------
+// ---- corrections -------------------------------------------------------------------------------------------------
 
 const SETTLED = ["doubtful", "lost", "rejected", "after_end", "corrected"];
 
 function proofs() {
   const act = (action) => () => correct(shownFrame(), action);
-  return el("div", {class: "row", id: "proofs", role: "group", "aria-label": "Proofread the frame that is shown"},
+  return el("div", {class: "row", id: "proofs", role: "group", "aria-label": "Correct the frame that is shown"},
     el("span", {class: "muted"}, "This frame:"), el("button", {type: "button", id: "confirm", onclick: act("confirm")}, "Confirm"),
     el("button", {type: "button", id: "drop", onclick: act("drop")}, "Drop"), el("button", {type: "button", id: "undo", onclick: act("undo")}, "As tracked"),
-    el("button", {type: "button", "aria-label": "Frame before", onclick: () => point(shownFrame() - 1)}, "◀"), el("button", {type: "button", "aria-label": "Frame after", onclick: () => point(shownFrame() + 1)}, "▶"),
+    el("button", {type: "button", "aria-label": "Previous frame", onclick: () => point(shownFrame() - 1)}, "◀"), el("button", {type: "button", "aria-label": "Next frame", onclick: () => point(shownFrame() + 1)}, "▶"),
     el("span", {class: "muted"}, "or drag its edge in the picture"));
 }
 
@@ -202,7 +202,7 @@ function correct(i, action, edge = null) {
     made.edge_px[i] = action === "move" ? edge : action === "drop" ? null : made.tracked_px[i];
     made.flag[i] = [...bare, ...(action === "drop" ? ["rejected"] : []), "corrected"].join(";");
   }
-  // Until it is tracked again, along a straight scale.
+  // Approximate, with a constant scale, until it is tracked again.
   const known = made.first_edge.findIndex((value, j) => value !== null && made.first_mm[j] !== null);
   made.position_mm[i] = made.edge_px[i] === null || mm === null || known < 0 ? null : made.first_mm[known] + mm * (made.edge_px[i] - made.first_edge[known]);
   state.corrections[name] = others;

@@ -3,7 +3,7 @@ import {curveThrough, middleOfLongest} from "./curve.js";
 import {$, ask, changed, decimals, el, numberOf, round, state, url} from "./state.js";
 
 const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
-const LENS = 7; // Pixels of the screen for one of the picture.
+const LENS = 7; // Screen pixels per pixel of the picture.
 const MM = {mm: 1, cm: 10, in: 25.4};
 let lengthUnit = "mm";
 let askedFor = "";
@@ -111,12 +111,12 @@ function setAxis(axis, scope) {
 
 const pointsOf = (axis) => [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
 
-// Places along an axis, one after the other: those of a curve as the server laid it, else along the points.
+// Points along an axis in order: those of the curve from the server, or else its given points.
 export function placesOf(axis) {
   return axis.path_px ?? curveThrough(pointsOf(axis));
 }
 
-// The axis with other bends; it stays whose it was.
+// The axis with other bends and the same scope.
 function setBends(via_px) {
   const now = currentAxis();
   setAxis({...now, via_px}, now.given || scopeWanted());
@@ -151,7 +151,7 @@ function clearAxis() {
 export function drawOver() {
   const over = $("over");
   if (!over || !state.clip) return;
-  // What is drawn anew keeps the focus: a frame may arrive while its edge is moved by the keyboard.
+  // Keep the focus when redrawing: a frame may arrive while its edge is moved with the keyboard.
   const held = over.contains(document.activeElement) ? document.activeElement.dataset.handle : "";
   over.setAttribute("viewBox", `0 0 ${view.width} ${view.height}`);
   $("stage").classList.toggle("scale", view.tool === "scale");
@@ -170,7 +170,7 @@ export function drawOver() {
   if (held) over.querySelector(`[data-handle="${held}"]`)?.focus();
 }
 
-// The edge in this frame, to be moved along the axis.
+// The edge in this frame, which can be moved along the axis.
 function drawEdge(over, unit) {
   const {line, middle, put} = view.edge;
   over.append(el("line", {...line, class: "edge-line", "stroke-width": 2 * unit}));
@@ -203,7 +203,7 @@ function drawAxis(over, axis, unit, handles) {
   }
   (axis.via_px ?? []).forEach((point, i) => {
     const put = (place) => setBends(currentAxis().via_px.with(i, place));
-    const made = handle("circle", {cx: point[0], cy: point[1], r: 6 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, bendWords(i), () => currentAxis().via_px[i], put, "Delete takes it out");
+    const made = handle("circle", {cx: point[0], cy: point[1], r: 6 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, bendWords(i), () => currentAxis().via_px[i], put, "Delete removes it");
     made.addEventListener("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) { event.preventDefault(); removeBend(i); } });
     over.append(made);
   });
@@ -230,7 +230,7 @@ const inside = ([x, y]) => [Math.min(Math.max(x, 0), view.width - 1), Math.min(M
 
 function at(event) {
   const box = $("over").getBoundingClientRect();
-  // Pixel centres lie at whole numbers.
+  // Pixel centres are at integers.
   return inside([((event.clientX - box.left) / box.width) * view.width - 0.5, ((event.clientY - box.top) / box.height) * view.height - 0.5]);
 }
 
@@ -284,7 +284,7 @@ function place(event) {
   writeScale();
   drawOver();
   drawTools();
-  // The press itself takes the focus to what was pressed.
+  // Pressing moves the focus to the pressed element.
   if (marks.to_px) addEventListener("pointerup", () => setTimeout(() => $("length")?.focus()), {once: true});
 }
 
@@ -331,7 +331,7 @@ async function findBoard() {
   drawTools();
   try {
     const board = await ask(url("api/board", {picture}));
-    view.words = board ? "" : `No printed board is seen in ${picture}: show it whole, in focus and not mirrored.`;
+    view.words = board ? "" : `No printed board found in ${picture}: it must be fully visible, in focus and not mirrored.`;
     if (board) { marks.board = board; kind = board.kind; if (numberOf(marks.square)) marks.marker = suggested(); writeScale(); }
   } catch (error) {
     view.words = error.message;
@@ -358,7 +358,7 @@ export function drawTools() {
   drawScaleTool();
 }
 
-// Fields stay as they are: somebody may be typing in one.
+// Keep the fields: the user may be typing in one.
 export function drawProblems() {
   for (const [tool, name] of [["axis-tool", "axis"], ["scale-tool", "calibration"]]) $(tool).querySelector(".problems")?.replaceWith(said(name));
 }
@@ -366,7 +366,7 @@ export function drawProblems() {
 function drawAxisTool() {
   const axis = currentAxis();
   const words = {
-    "": axis ? "Found from the motion of this recording. Nothing is written: each recording finds its own. Drag an end where it is wrong." : `No axis is found: ${state.clip.no_axis}.`,
+    "": axis ? "Found from the motion of this recording. Nothing is written: the axis of each recording is found separately. Drag an end if it is wrong." : `No axis found: ${state.clip.no_axis}.`,
     all: "Given for all trials, in experiment.yaml.", trial: `Given for ${row().trial} alone, in its row.`,
   }[axis?.given ?? ""];
   const ends = axis ? ["from_px", "to_px"].map((end) => axis[end].map((v) => round(v)).join(", ")).join(" to ") : "";
@@ -374,12 +374,12 @@ function drawAxisTool() {
     el("option", {value: "all", selected: axis?.given !== "trial"}, "all trials"), el("option", {value: "trial", selected: axis?.given === "trial"}, "this trial alone"));
   const place = () => { const [w, h] = [state.clip.width, state.clip.height]; setAxis({from_px: [0.1 * w, h / 2], to_px: [0.9 * w, h / 2]}, "all"); drawOver(); drawTools(); };
   const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
-  const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A point that was moved counts" : `${moved} points that were moved count`} along the axis as it was: after a change of it, move them again.`) : null;
+  const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A moved point refers" : `${moved} moved points refer`} to the former axis: after a change of the axis, move them again.`) : null;
   $("axis-tool").replaceChildren(...[said("axis"), el("p", {class: "hint"}, words), warning].filter(Boolean), el("div", {class: "row"},
     axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
-    axis ? el("button", {type: "button", class: "plain", id: "add-bend", onclick: addBend, title: "A point in the middle of the longest part, to be dragged to where the vine bends; Delete takes one out"}, "Add a bend") : null,
+    axis ? el("button", {type: "button", class: "plain", id: "add-bend", onclick: addBend, title: "Adds a point in the middle of the longest segment; drag it to where the vine bends. Delete removes a point."}, "Add a bend") : null,
     axis?.via_px?.length ? el("button", {type: "button", class: "plain", id: "straighten", onclick: () => setBends([])}, "Make it straight") : null,
-    el("label", {}, "A dragged axis holds for ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Take what the motion shows") : null));
+    el("label", {}, "A dragged axis applies to ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Use the axis found from the motion") : null));
 }
 
 function facts() {
@@ -406,9 +406,9 @@ function drawScaleTool() {
     parts.push(el("p", {class: "hint"}, step), el("div", {class: "row"},
       field("length", "Length between them", marks.length, (value) => { marks.length = value; }),
       el("select", {id: "length-unit", "aria-label": "Unit of the length", onchange: (event) => { lengthUnit = event.target.value; writeScale(); facts(); }}, ...Object.keys(MM).map((unit) => el("option", {value: unit, selected: unit === lengthUnit}, unit))),
-      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); drawOver(); drawTools(); }}, "Click both anew") : null));
+      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); drawOver(); drawTools(); }}, "Click both again") : null));
   } else if (kind === "mm_per_px") {
-    parts.push(el("div", {class: "row"}, field("own-scale", "Millimetres a pixel", marks.own, (value) => { marks.own = value; })));
+    parts.push(el("div", {class: "row"}, field("own-scale", "Millimetres per pixel", marks.own, (value) => { marks.own = value; })));
   } else {
     const {board} = marks;
     parts.push(el("div", {class: "row"}, el("button", {type: "button", id: "find-board", onclick: findBoard}, "Look for a board here"),

@@ -1,4 +1,4 @@
-// The page begins, listens, checks and saves.
+// Entry point of the page: load, handle events, check and save.
 import {$, ask, content, el, listeners, settle, state} from "./state.js";
 import {drawOver, drawProblems, readCalibration, showRecording} from "./picture.js";
 import {drawTable, markProblems} from "./table.js";
@@ -12,7 +12,7 @@ function choose(i) {
   showRecording();
 }
 
-// Without `true` only the sheet was looked at: whether the recordings agree with it is not known yet.
+// Without `true` only the sheet was checked: whether the recordings agree with it is not known yet.
 function headline(n, errors) {
   if (errors) return `${n} trials, ${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct`;
   return state.compared ? `${n} trials, ready to run` : `${n} trials, complete; Check compares them with the recordings`;
@@ -68,10 +68,10 @@ async function save() {
     const made = await ask("api/save", content());
     state.stamp = made.stamp;
     state.dirty = false;
-    // What a comparison with the recordings found still holds: a save changes nothing that was compared.
+    // Results of the comparison with the recordings remain valid: saving changes nothing that was compared.
     if (state.compared) showState();
     else await check();
-    $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "Nothing had changed"} · ${$("status").textContent}`;
+    $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "No changes"} · ${$("status").textContent}`;
   } catch (error) {
     showWhole([{severity: "error", text: error.message}]);
   }

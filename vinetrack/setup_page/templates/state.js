@@ -1,4 +1,4 @@
-// What the page knows, how it asks the server, and how it makes elements.
+// State of the page, requests to the server, and creation of elements.
 export const state = {
   known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
   recordings: [], pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
@@ -29,7 +29,7 @@ export async function ask(path, body) {
     throw Object.assign(new Error("The program has ended: start vinetrack setup again; nothing here is saved."), {gone: true});
   }
   const content = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw Object.assign(new Error(content.words || `The server answers ${answer.status}.`), {content});
+  if (!answer.ok) throw Object.assign(new Error(content.words || `The server returned status ${answer.status}.`), {content});
   return content;
 }
 
@@ -47,7 +47,7 @@ export function baseOf(name) {
   return Object.keys(state.known).find((key) => state.known[key].quantity === quantity && state.known[key].units.length) ?? null;
 }
 
-// Columns shown: those of the sheet and those offered, each quantity once, in the unit it is written in.
+// Columns shown: those of the sheet and those offered, each quantity once, in its unit in the sheet.
 export function shownColumns() {
   const names = state.sheet.columns.filter((name) => !["trial", "video"].includes(name));
   const quantities = new Set(names.map(quantityOf));
@@ -60,7 +60,7 @@ export function shownColumns() {
   return names.map((name, i) => [order(name), i, name]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).map((entry) => entry[2]);
 }
 
-// A column as a person says it: without its unit where that can be chosen.
+// Display name of a column: without its unit if that can be chosen.
 export function labelOf(name) {
   const known = state.known[baseOf(name)];
   return (known && known.units.length > 1 ? known.quantity : name).replaceAll("_", " ");
@@ -71,7 +71,7 @@ export function sharedValue(name) {
   return key === undefined ? "" : state.shared[key];
 }
 
-// Columns that nobody filled in are not written, unless the sheet had them.
+// Empty columns are not written, unless the sheet had them.
 export function content(more = {}) {
   const {rows} = state.sheet;
   const columns = state.sheet.columns.filter((name) => state.kept.includes(name) || rows.some((row) => row[name]));
@@ -88,7 +88,7 @@ export function changed() {
   waiting = setTimeout(() => listeners.forEach((listener) => listener()), 350);
 }
 
-// What is about to be checked anyway need not be checked again.
+// Avoid a second check when one is already pending.
 export const settle = () => clearTimeout(waiting);
 
 export const decimals = (value, digits) => (value === null || value === undefined ? "–" : Number(value.toPrecision(digits)).toString());

@@ -1,4 +1,4 @@
-// The table: one row for all trials, one for each, problems under the cell they concern.
+// The table: one row for all trials, one for each trial, with problems under the cell concerned.
 import {$, baseOf, changed, el, labelOf, quantityOf, sharedValue, shownColumns, state, url} from "./state.js";
 
 export function drawTable(choose) {
@@ -15,7 +15,7 @@ export function drawTable(choose) {
 function head(columns) {
   const cells = columns.map((name) => {
     const known = state.known[baseOf(name)];
-    const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "No column of a trial sheet: kept, and ignored.";
+    const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "Not a column of a trial sheet: kept, but ignored.";
     const label = el("span", {title}, labelOf(name));
     const unit = known && known.units.length > 1
       ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
@@ -129,7 +129,7 @@ function drawAdder(columns) {
   };
 }
 
-// Marks the cells that problems concern; returns those that no cell shows.
+// Marks the cells with problems; returns the problems that no cell shows.
 export function markProblems() {
   const placeless = [], measured = new Set();
   for (const cell of $("trials").querySelectorAll("td")) {
@@ -142,7 +142,7 @@ export function markProblems() {
     const wanted = field === "row" ? "trial" : column;
     const all = [...$("trials").querySelectorAll("[data-column]")].filter((one) => quantityOf(one.dataset.column) === quantityOf(wanted));
     const inputs = all.filter((one) => one.dataset.row === String(row));
-    // A column that neither place has is missing for all; where no cell shows it, it stands with the trial.
+    // A column in neither file is missing for all trials; a problem without a cell is shown with its trial.
     const input = inputs[0] ?? all[0] ?? $("trials").querySelector(`[data-column="trial"][data-row="${row}"]`);
     if (!input) {
       placeless.push({severity, text});
