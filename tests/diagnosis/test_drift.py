@@ -15,7 +15,7 @@ from grown import Pairs, grown, pairs_of, sheet
 import vinetrack as vt
 from vinetrack.diagnosis import drift_along
 from vinetrack.diagnosis.drift import DRIFT_COLUMNS, GROUP_COLUMNS, Drift, drift
-from vinetrack.diagnosis.per_trial_estimates import lay, per_trial_estimates
+from vinetrack.diagnosis.per_trial_estimates import align_trials, per_trial_estimates
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_result import Fit
 
@@ -77,7 +77,7 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(depleting: 
 
 def test_a_trial_that_stands_still_in_one_half_of_its_way_says_nothing_of_b(monkeypatch: pytest.MonkeyPatch) -> None:
     found = fitted(pairs_of(grown(sheet((4,), replicates=2), 58)))
-    laid = lay(found)
+    laid = align_trials(found)
     values = per_trial_estimates(found, B, laid)
     halves = drift_along._halves(found, laid, values.trial_effects)
     spoilt = halves.deviation.copy()
@@ -113,7 +113,7 @@ def test_a_friction_on_the_payload_makes_b_know_the_payload() -> None:
 def test_every_trial_finds_the_b_it_was_grown_with() -> None:
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = per_trial_estimates(found, B, lay(found))
+    values = per_trial_estimates(found, B, align_trials(found))
     true = np.array([one.damping for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
     away = np.log(values.value / true)

@@ -18,7 +18,7 @@ import vinetrack as vt
 import vinetrack.diagnosis.missing_force as missing_force_module
 from vinetrack.diagnosis.force_sensitivities import force_sensitivities, motions_of
 from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, LAW_COLUMNS, MissingForce, missing_force
-from vinetrack.diagnosis.per_trial_estimates import lay
+from vinetrack.diagnosis.per_trial_estimates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference.fit_result import Fit
@@ -108,7 +108,7 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(tmp_path: Pa
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
     found = vt.fit(model, pairs_of(virtual), profile=False)
-    own = lay(found).trial_effects
+    own = align_trials(found).trial_effects
     motions = motions_of(found, own)
     shapes = {
         "bump": lambda m: np.exp(-0.5 * ((m.lead_position_m - 0.08) / 0.01) ** 2),

@@ -35,7 +35,7 @@ from vinetrack.diagnosis.constancy_tests import (
     normal_deviate,
 )
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
-from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, lay, per_trial_estimates
+from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, align_trials, per_trial_estimates
 from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
 from vinetrack.diagnosis.stretches import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
@@ -174,7 +174,7 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
 
 def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
     keys = [key for key in fit.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
-    laid, damping = lay(fit), None
+    laid, damping = align_trials(fit), None
     for key in keys:
         try:
             estimates = per_trial_estimates(fit, key, laid)

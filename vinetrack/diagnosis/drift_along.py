@@ -17,7 +17,7 @@ from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, normal_deviate
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, acceleration_sensitivities, motions_of
-from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, PerTrialEstimates
+from vinetrack.diagnosis.per_trial_estimates import AlignedTrials, PerTrialEstimates
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import rest_is_seen
@@ -48,7 +48,7 @@ class _Halves:
     deviation: Floats
 
 
-def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
+def along_growth(fit: Fit, laid: AlignedTrials, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
     """Rows of B against the growth, for every vine and for all; `values` are those of B.
 
     Parameters
@@ -79,7 +79,7 @@ def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Ite
             yield tested
 
 
-def _halves(fit: Fit, laid: AlignedTrial, trial_effects: Floats) -> _Halves:
+def _halves(fit: Fit, laid: AlignedTrials, trial_effects: Floats) -> _Halves:
     """About each trial's own B: about the common one, its scatter would count in the second order."""
     motions = motions_of(fit, trial_effects)
     data = laid.predictor.data

@@ -10,7 +10,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.cubic_splines import splines
 from vinetrack.diagnosis.force_inversion import ForceEstimate, LinearInversion
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
-from vinetrack.diagnosis.per_trial_estimates import lay
+from vinetrack.diagnosis.per_trial_estimates import align_trials
 from vinetrack.diagnosis.stretches import replicate_scatter, residual_courses
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
@@ -57,7 +57,7 @@ def linear_misfit(fit: Fit) -> LinearMisfit:
     """
     try:
         scatter = replicate_scatter(fit, residual_courses(fit)[0])
-        starts = [fit.solution.state.trial_effects, lay(fit).trial_effects]
+        starts = [fit.solution.state.trial_effects, align_trials(fit).trial_effects]
         linearised = [_linearised(fit, LinearInversion(fit, trial_effects, scatter)) for trial_effects in starts]
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error

@@ -20,7 +20,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.drift import Drift, drift
 from vinetrack.diagnosis.ladder import excess
-from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, stretch_covariance, unlikely
+from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, replicate_z, stretch_covariance
 from vinetrack.diagnosis.replicates import replicates_of
 from vinetrack.diagnosis.stretches import (
     MAX_STRETCHES,
@@ -69,7 +69,7 @@ class Failure:
     """Where a model fails; tables in SI, a residual is measurement minus model.
 
     `by_condition`, columns `CONDITION_COLUMNS`, has the largest root mean square first, which every page calls the
-    worst condition; `z` tells how unlikely replicates alone make the course of the mean residual. `along_time`,
+    worst condition; `z` tells how replicate_z replicates alone make the course of the mean residual. `along_time`,
     `along_position` and `along_speed` (since release; growth and speed of the leading edge in the model) hold the mean
     residual of a stretch with its error; rows with a blank `condition` take all trials of a vine together. `drift`
     tells which parameter knows a condition it should not.
@@ -154,7 +154,7 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
         "floor_m": errors["replicate_floor_m"],
         "ratio": errors["ratio"],
         "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
-        "z": unlikely(mean, covariance, count, scatter) if mean.size else 0.0,
+        "z": replicate_z(mean, covariance, count, scatter) if mean.size else 0.0,
         "worst_at_s": errors["worst_at_s"],
         "worst_at_m": errors["worst_at_m"],
         "worst_residual_m": math.nan if worst is None else float(mean[worst]),
@@ -210,7 +210,7 @@ def _mean_rows(
 
 
 def _fail(z: Floats) -> bool:
-    """Whether the largest of so many deviates, or all of them together by Fisher's way, are too unlikely."""
+    """Whether the largest of so many deviates, or all of them together by Fisher's way, are too replicate_z."""
     from scipy.stats import chi2, norm
 
     level = float(norm.sf(FAILED_SIGMAS))

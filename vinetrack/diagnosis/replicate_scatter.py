@@ -1,10 +1,10 @@
-"""How far replicates alone carry the mean of a condition off the model.
+"""Between-trial scatter from replicates alone, and the standard error of a condition's mean residual that follows.
 
-Positions of one trial err together from frame to frame: a trial with 3 % more B is late everywhere. So frames are not
-counted. Every trial is cut into a few stretches, and how the means of stretches vary between replicates is described
-by three numbers for all conditions: the scatter of pressure and of B, through the sensitivities of the trajectories,
-and a rest that stretches do not share. They are found from differences between replicates alone, so a model that fails
-does not make them larger.
+Residuals of one trial are correlated from frame to frame: a trial with 3 % more B is late everywhere. Frames are
+therefore not counted as independent. Every trial is cut into a few stretches, and the covariance of the stretch means
+between replicates has three parameters for all conditions: the scatter of pressure and of B, propagated by the
+sensitivities of the trajectories, and a residual scatter that is independent between stretches. They are estimated from
+differences between replicates alone, so that a model that fails does not inflate them.
 """
 
 from __future__ import annotations
@@ -15,44 +15,45 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, without
+from vinetrack.diagnosis.per_trial_estimates import AlignedTrials, orthogonal_part
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
 
 START_VALUES = (0.01, 0.03, 0.2)
-"""Start, least and largest values of the search: pressure, ln B, rest. Chosen."""
+"""Starting values of the search: pressure, ln B, residual scatter. Chosen."""
 
 LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
-"""Chosen: from exact to worse than any rig; the search never ends there where replicates tell anything."""
+"""Bounds of the search. Chosen: from exact to worse than any rig; it ends there only where replicates hold no
+information."""
 
 LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
-"""Of pressure and B, for whoever needs both: replicates tell their sum much better than either. Chosen: half of a
-usual scatter."""
+"""Lower limits of the standard deviations of pressure and B where both are needed: replicates determine their sum much
+better than either. Chosen: half of a usual scatter."""
 
 POSITION_FLOOR_M = 1e-6
-"""Stretches are no better known than this, m. Chosen: a hundredth of a good tracker's error."""
+"""Lower limit of the error of a stretch mean, m. Chosen: a hundredth of a good tracker's error."""
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """Parts of the motion of replicates, all filmed in each.
+    """Stretches of the motion that all replicates of a condition cover.
 
-    `means_m`, shape (n_trials, n), are the mean residuals; `answers`, shape (n, 2), what a unit of pressure and of B
-    does to them; `noise_m2`, shape (n, n), their covariance from the noise of the tracks alone.
+    `means_m`, shape (n_trials, n), are the mean residuals; `sensitivities`, shape (n, 2), their derivatives by pressure
+    and ln B; `noise_m2`, shape (n, n), their covariance from the noise of the tracks alone.
     """
 
     means_m: Floats
-    answers: Floats
+    sensitivities: Floats
     noise_m2: Floats
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Relative standard deviations of pressure and B, and the rest as part of what these two make of the stretches.
+    """Between-trial standard deviations of pressure (relative) and ln B, and of a residual, relative to their effect.
 
-    `dof` counts replicates beyond the first of each condition; 0 where there are none: then pressure and B scatter as
-    the fit says.
+    `dof` counts replicates beyond the first of each condition. Where it is 0, the standard deviations of pressure and B
+    are those of the fit.
     """
 
     pressure: float
@@ -62,46 +63,47 @@ class Scatter:
 
     @property
     def variances(self) -> Floats:
-        """Their squares, shape (3,)."""
+        """Squares of the three, shape (3,)."""
         return np.array([self.pressure, self.damping, self.residual]) ** 2
 
 
-def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
-    """What a unit of pressure and of B does to every trial beside its release, shape (n_points, 2).
+def scatter_sensitivities(aligned: AlignedTrials) -> list[Floats]:
+    """Sensitivities of positions to pressure and ln B, orthogonal to those to release and origin, of every trial.
 
-    Where growth has ended in the model nothing answers any more, but the vine may still grow: there the answers stay
-    what they were.
+    Where growth has ended in the model they would be zero, but the vine may still grow: the last values are kept.
 
     Parameters
     ----------
-    laid : the model aligned with its trials.
+    aligned : the model aligned with its trials.
 
     Returns
     -------
     list of arrays, shape (n_points, 2), m
     """
-    held = rest_is_seen(laid.predictor.data)
-    answers = []
-    for i, columns in enumerate(laid.columns):
+    origin_fixed = rest_is_seen(aligned.predictor.data)
+    sensitivities = []
+    for i, columns in enumerate(aligned.columns):
         moving = np.flatnonzero(columns[:, RELEASE] != 0)
-        kept = columns.copy()
+        extended = columns.copy()
         if moving.size:
-            kept[moving[-1] + 1 :, [RELEASE, PRESSURE, DAMPING_DEVIATION]] = columns[
+            extended[moving[-1] + 1 :, [RELEASE, PRESSURE, DAMPING_DEVIATION]] = columns[
                 moving[-1], [RELEASE, PRESSURE, DAMPING_DEVIATION]
             ]
-        others = kept[:, [RELEASE]] if held[i] else kept[:, [RELEASE, ORIGIN]]
-        answers.append(np.column_stack([without(kept[:, k], others) for k in (PRESSURE, DAMPING_DEVIATION)]))
-    return answers
+        others = extended[:, [RELEASE]] if origin_fixed[i] else extended[:, [RELEASE, ORIGIN]]
+        sensitivities.append(
+            np.column_stack([orthogonal_part(extended[:, k], others) for k in (PRESSURE, DAMPING_DEVIATION)])
+        )
+    return sensitivities
 
 
 def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
-    """The three numbers that make the differences between replicates most likely; a group is a condition.
+    """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates.
 
     Parameters
     ----------
-    fit : its between-trial standard deviations stand in where there are no replicates.
+    fit : its between-trial standard deviations are used where there are no replicates.
     groups : sequence of Stretches
-        One a condition.
+        One for each condition.
 
     Returns
     -------
@@ -116,10 +118,10 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
     parts = []
     for group in groups:
         if len(group.means_m) > 1:
-            away = group.means_m - group.means_m.mean(axis=0)
-            parts.append((len(away) - 1, away.T @ away, group))
+            deviations = group.means_m - group.means_m.mean(axis=0)
+            parts.append((len(deviations) - 1, deviations.T @ deviations, group))
 
-    def cost(logs: Floats) -> float:
+    def minus_two_log_likelihood(logs: Floats) -> float:
         variances = np.exp(2 * np.clip(logs, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS)))
         total = 0.0
         for count, square, group in parts:
@@ -128,7 +130,9 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
             total += float(np.trace(np.linalg.solve(covariance, square)))
         return total
 
-    best = minimize(cost, np.log(START_VALUES), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
+    best = minimize(
+        minus_two_log_likelihood, np.log(START_VALUES), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
+    )
     pressure, damping, residual = np.exp(np.clip(best.x, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS))).tolist()
     return Scatter(pressure, damping, residual, dof)
 
@@ -139,7 +143,7 @@ def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
     Parameters
     ----------
     scatter
-        What replicates differ by.
+        Between-trial scatter.
     group
         Stretches of one condition.
 
@@ -151,16 +155,17 @@ def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
 
 
 def _covariance(group: Stretches, variances: Floats) -> Floats:
-    shared = (group.answers * variances[:2]) @ group.answers.T
+    shared = (group.sensitivities * variances[:2]) @ group.sensitivities.T
     residual = variances[2] * float(np.trace(shared)) / len(shared)
     return np.asarray(shared + group.noise_m2 + (residual + POSITION_FLOOR_M**2) * np.eye(len(shared)))
 
 
-def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
-    """How unlikely replicates alone make means of stretches so large, as a normal deviate.
+def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
+    """Test whether between-trial scatter explains stretch means as large as observed; the p-value as a normal deviate.
 
-    The sum of squares of the means in their own errors, for what Satterthwaite's approximation leaves of degrees of
-    freedom: stretches err together. The scatter is itself known from `dof` replicates.
+    The test statistic is the mean square of the means in units of their standard errors, with the effective degrees of
+    freedom of Satterthwaite's approximation, because stretches are correlated. The scatter itself has `dof` degrees of
+    freedom.
 
     Parameters
     ----------
@@ -170,7 +175,7 @@ def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) ->
         Of one trial.
     trials : int
         Number of trials.
-    scatter : its degrees of freedom count.
+    scatter : between-trial scatter, for its degrees of freedom.
 
     Returns
     -------

@@ -1,9 +1,9 @@
-"""Replicates of one condition: laid over each other, what they differ by, and a model beside them.
+"""Alignment of the replicates of one condition, their scatter (the replicate floor), and the residuals of a model.
 
-Every trial of a condition has a release of its own, and an origin where its rest was not filmed, not even behind a
-door; those two are what a model may shift too. They are found by Gauss–Newton steps towards the mean of all until
-nothing moves. No model enters, so the same recordings differ by the same amount whatever model they are compared with:
-the floor that no model can go below.
+Every trial has its own release, and its own origin where no standstill was filmed, not even imprecisely; a model may
+shift the same two. They are found by Gauss–Newton steps towards the mean of all replicates until they have converged.
+No model enters, so that the same recordings have the same scatter whatever model they are compared with: the floor
+below which no model can fall.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from vinetrack.tracks.outliers import FEWEST_POINTS, local_fit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
 MIN_SINGULAR_VALUE = 0.05
-"""Of a shift in time and one in position, the least singular value by which both are found. Chosen: below it the motion
-is so straight that a shift in time and one in position are one; at half noise drives both, at twice curved motions are
-left misaligned."""
-
-MAX_ROUNDS = 200
-"""Rounds of shifting every replicate onto their mean. A round moves a trial by two frames at most, so that this covers
-400 frames; it ends when nothing moves. Chosen as a safeguard; most conditions settle within twenty."""
-
-SETTLED_FRAMES = 1e-3
-"""Part of a frame by which the largest shift of a round still counts: of a step of 3 mm it is 3 µm. Chosen: far below
-the noise of any tracker."""
-
-LARGEST_STEP_FRAMES = 2.0
-"""Of a round: farther away the motion's speed is another. Chosen: at half alignment takes twice as many rounds, at
-twice it may overshoot a steep start."""
-
-LEAST_OVERLAP = 0.8
-"""Part of the shorter motion in which it must lie beside the longer one, where no rest says when it began. Motions of
-different speed agree best where they hardly overlap: without this, replicates that differ by 14 % in speed were slid
-apart until the 10 mm in which they were equally fast gave a floor of 0.05 mm. Chosen: tracks that begin in motion begin
-within a fifth of their length of each other; at 0.6 the floor may be half too small, at 0.9 a clip begun late is
+"""Smallest scaled singular value with which a shift in time and one in position are both fitted. Chosen: below it the
+motion is so straight that the two cannot be separated; at half noise drives both, at twice curved motions are left
 misaligned."""
 
-COARSE_SHIFTS = 201
-"""Shifts in time that are tried for a track that begins in motion. Chosen: steps of a hundredth of the duration, which
+MAX_ROUNDS = 200
+"""Maximum number of rounds, each of which shifts every replicate towards the mean. A round moves a trial by two frames
+at most, so that this covers 400 frames. Chosen as a safeguard; most conditions converge within twenty."""
+
+SETTLED_FRAMES = 1e-3
+"""Largest shift of a round, in frames, at which the alignment has converged: for 3 mm a frame it is 3 µm. Chosen: far
+below the noise of any tracker."""
+
+LARGEST_STEP_FRAMES = 2.0
+"""Largest shift of a round, in frames: farther away the speed of the motion is different. Chosen: at half alignment
+takes twice as many rounds, at twice it may overshoot a steep start."""
+
+LEAST_OVERLAP = 0.8
+"""Fraction of the shorter motion that must overlap with the longer one where no standstill shows when it began. Motions
+of different speed agree best where they hardly overlap: without this limit, replicates that differ by 14 % in speed
+were shifted apart until the 10 mm in which they were equally fast gave a floor of 0.05 mm. Chosen: tracks that begin in
+motion begin within a fifth of their length of each other; at 0.6 the floor may be half too small, at 0.9 a clip that
+begins late is misaligned."""
+
+N_COARSE_SHIFTS = 201
+"""Number of shifts in time tried for a track that begins in motion. Chosen: steps of a hundredth of the duration, which
 the rounds then refine."""
 
 
@@ -54,8 +54,8 @@ class Alignment:
     """Replicates on a common clock.
 
     `time_s`, shape (n_times,), is since the mean release; `deviation_m`, shape (n_trials, n_times), that of each trial
-    from the mean of all that are there, NaN where it says nothing; `present`, shape (n_times,), counts them.
-    `release_s` and `origin_m`, shape (n_trials,), lay the trials there. `begin_s` is when the first one moves.
+    from the mean of all trials present, NaN where it is absent; `present`, shape (n_times,), counts the trials present.
+    `release_s` and `origin_m`, shape (n_trials,), align the trials. `begin_s` is when the first trial moves.
     """
 
     time_s: Floats
@@ -67,13 +67,13 @@ class Alignment:
 
     @property
     def variance_m2(self) -> Floats:
-        """Variance of single replicates, shape (n_times,), unbiased for their number; NaN with one alone."""
+        """Unbiased variance of single replicates, shape (n_times,); NaN for one trial alone."""
         square = np.where(np.isfinite(self.deviation_m), self.deviation_m, 0.0) ** 2
         return np.where(self.present > 1, square.sum(axis=0) / np.maximum(self.present - 1, 1), math.nan)
 
     @property
     def floor_m(self) -> float:
-        """Root mean square of what a replicate differs by from the mean of infinitely many; NaN with one alone."""
+        """Replicate floor: rms deviation of a replicate from the mean of infinitely many; NaN for one trial alone."""
         moving = (self.time_s >= self.begin_s) & (self.present > 1)
         if not moving.any():
             return math.nan
@@ -83,25 +83,25 @@ class Alignment:
     def degrees(self) -> int:
         """Degrees of freedom of the floor: one for each replicate beyond the first.
 
-        Replicates differ slowly along the whole motion, by pressure and B: a trial counts once, however many frames.
+        Deviations vary slowly along the whole motion, by pressure and B: a trial counts once, however many its frames.
         """
         return self.release_s.size - 1
 
     @property
     def floor_sigma_m(self) -> float:
-        """Standard error of the floor, m: σ/√(2ν) for a variance of ν degrees of freedom; NaN with one alone."""
+        """Standard error of the floor, m: σ/√(2ν) for a variance of ν degrees of freedom; NaN for one trial alone."""
         return self.floor_m / math.sqrt(2 * self.degrees) if self.degrees > 0 else math.nan
 
 
 @dataclass(frozen=True)
 class _Reference:
-    """The motion of one replicate, smoothed: the shape that all share, which cancels from their differences."""
+    """The smoothed motion of one replicate: the common shape, which cancels from the differences of replicates."""
 
     since_s: Floats
     growth_m: Floats
 
     def at(self, since_s: Floats) -> Floats:
-        """Growth at times since release; straight on beyond the ends."""
+        """Growth at times since release; extrapolated linearly beyond the ends."""
         inside = np.interp(since_s, self.since_s, self.growth_m)
         slopes = [self._slope(slice(0, 5)), self._slope(slice(-5, None))]
         before, after = np.minimum(since_s - self.since_s[0], 0.0), np.maximum(since_s - self.since_s[-1], 0.0)
@@ -113,7 +113,7 @@ class _Reference:
 
 
 def frames_at_rest(trial: TrialFit) -> int:
-    """Frames before the motion; 0 where the track begins in motion.
+    """Number of frames before the motion; 0 where the track begins in motion.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ def frames_at_rest(trial: TrialFit) -> int:
 
 
 def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
-    """Lay the measured motions of one condition over each other.
+    """Align the measured motions of one condition in time and position.
 
     Parameters
     ----------
     trials : sequence of TrialFit
-        Trials of one condition; only their times and measured positions are read.
+        Trials of one condition; only their times and measured positions are used.
 
     Returns
     -------
@@ -142,40 +142,41 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     """
     rests = [frames_at_rest(trial) for trial in trials]
     release_s, origin_m = (np.array(values) for values in zip(*map(_begin, trials, rests), strict=True))
-    seen = np.array([n > 0 or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)])
+    rest_seen = np.array([n > 0 or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)])
     longest = int(np.argmax([trial.time_s[-1] - at for trial, at in zip(trials, release_s, strict=True)]))
     reference = _reference(trials[longest], float(release_s[longest]), float(origin_m[longest]))
     for i, trial in enumerate(trials):
-        if i != longest and not (seen[i] and seen[longest]):
-            release_s[i], origin_m[i] = _coarse(trial, reference)
+        if i != longest and not (rest_seen[i] and rest_seen[longest]):
+            release_s[i], origin_m[i] = _coarse_alignment(trial, reference)
     frame_s = np.array([float(np.median(np.diff(trial.time_s))) for trial in trials])
     begin_s = min(trial.time_s[0] - at for trial, at in zip(trials, release_s, strict=True))
     end_s = float(reference.since_s[-1])
     time_s = begin_s + frame_s.min() * np.arange(math.floor((end_s - begin_s) / frame_s.min() + 1e-6) + 1)
     speed_m_s = np.gradient(reference.at(time_s), time_s)
-    at_rest = np.array(
+    origin_known = np.array(
         [n >= FEWEST_AT_REST or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)]
     )
-    earliest_s, latest_s = np.array([_within_reach(trial, reference) for trial in trials]).T
+    earliest_s, latest_s = np.array([_release_range(trial, reference) for trial in trials]).T
     for _ in range(MAX_ROUNDS):
         deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
-        later_s, higher_m = _shifts(deviation_m, speed_m_s, at_rest)
-        later_s = np.clip(later_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
-        # Only differences of releases matter: all together would run away from the clock of the reference.
-        later_s -= later_s.mean()
-        moved_s = np.where(seen, release_s + later_s, np.clip(release_s + later_s, earliest_s, latest_s))
-        later_s, release_s, origin_m = moved_s - release_s, moved_s, origin_m + higher_m
-        if np.all(np.abs(later_s) < SETTLED_FRAMES * frame_s):
+        time_shift_s, position_shift_m = _shifts(deviation_m, speed_m_s, origin_known)
+        time_shift_s = np.clip(time_shift_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
+        # Only differences of releases are determined: a common shift would drift away from the reference.
+        time_shift_s -= time_shift_s.mean()
+        shifted_s = release_s + time_shift_s
+        shifted_s = np.where(rest_seen, shifted_s, np.clip(shifted_s, earliest_s, latest_s))
+        time_shift_s, release_s, origin_m = shifted_s - release_s, shifted_s, origin_m + position_shift_m
+        if np.all(np.abs(time_shift_s) < SETTLED_FRAMES * frame_s):
             break
     deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
-    moves_s = min(_begin(trial, n)[0] - at for trial, n, at in zip(trials, rests, release_s, strict=True))
-    return Alignment(time_s, deviation_m, present.astype(float), release_s, origin_m, moves_s - 1e-9)
+    motion_begin_s = min(_begin(trial, n)[0] - at for trial, n, at in zip(trials, rests, release_s, strict=True))
+    return Alignment(time_s, deviation_m, present.astype(float), release_s, origin_m, motion_begin_s - 1e-9)
 
 
 def sampled(at_s: Floats, release_s: float, time_s: Floats, values: Floats) -> Floats:
-    """Values of the frames nearest to times since release, NaN where none is within one frame's spacing.
+    """Values of the frames nearest to times since release, NaN where none is within half a frame's spacing.
 
-    To interpolate positions would average their noise away.
+    Interpolation would average the noise of positions away.
 
     Parameters
     ----------
@@ -184,22 +185,22 @@ def sampled(at_s: Floats, release_s: float, time_s: Floats, values: Floats) -> F
     release_s : float, s
         Release on the clock of `time_s`.
     time_s : array, shape (n_points,), s
-        Rising.
+        Increasing.
     values : array, shape (n_points,)
 
     Returns
     -------
     array, shape (n,)
     """
-    wanted = at_s + release_s
-    k = np.clip(np.searchsorted(time_s, wanted), 1, time_s.size - 1)
-    k -= wanted - time_s[k - 1] < time_s[k] - wanted
+    target_s = at_s + release_s
+    k = np.clip(np.searchsorted(time_s, target_s), 1, time_s.size - 1)
+    k -= target_s - time_s[k - 1] < time_s[k] - target_s
     spacing = float(np.median(np.diff(time_s)))
-    return np.where(np.abs(time_s[k] - wanted) <= 0.51 * spacing, values[k], math.nan)
+    return np.where(np.abs(time_s[k] - target_s) <= 0.51 * spacing, values[k], math.nan)
 
 
 def _reference(trial: TrialFit, release_s: float, origin_m: float) -> _Reference:
-    """A trial's motion freed of most of its noise by the cubic through each point's neighbours."""
+    """A trial's motion, smoothed by a cubic fitted to the neighbours of each point."""
     y = trial.lead_position_m
     if y.size >= FEWEST_POINTS:
         y = y - local_fit(trial.time_s, y, rough_noise(y)).residual_m
@@ -207,36 +208,36 @@ def _reference(trial: TrialFit, release_s: float, origin_m: float) -> _Reference
 
 
 def _begin(trial: TrialFit, n_rest: int) -> tuple[float, float]:
-    """When a trial begins to move, s, and from where, m, by its rest; its first frame where no rest was seen."""
+    """Time, s, and position, m, at which a trial begins to move; its first frame where no standstill was seen."""
     if n_rest == 0 and trial.imprecise_rest is not None:
         return trial.imprecise_rest.release_s, trial.imprecise_rest.origin_m
     return float(trial.time_s[max(n_rest - 1, 0)]), float(np.mean(trial.lead_position_m[: max(n_rest, 1)]))
 
 
-def _within_reach(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
-    """Earliest and latest release, s, with which a trial lies beside enough of the reference."""
+def _release_range(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
+    """Earliest and latest release, s, with which a trial overlaps enough with the reference."""
     first_s, last_s = float(trial.time_s[0]), float(trial.time_s[-1])
     begin_s, end_s = float(reference.since_s[0]), float(reference.since_s[-1])
-    needed_s = LEAST_OVERLAP * min(last_s - first_s, end_s - begin_s)
-    return needed_s + first_s - end_s, last_s - begin_s - needed_s
+    overlap_s = LEAST_OVERLAP * min(last_s - first_s, end_s - begin_s)
+    return overlap_s + first_s - end_s, last_s - begin_s - overlap_s
 
 
-def _coarse(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
-    """Release and origin of a track that begins in motion, from where its shape lies nearest to the reference."""
-    tried_s = np.linspace(*_within_reach(trial, reference), COARSE_SHIFTS)
-    left = np.array([trial.lead_position_m - reference.at(trial.time_s - at) for at in tried_s])
-    best = int(np.argmin(left.std(axis=1)))
-    return float(tried_s[best]), float(left[best].mean())
+def _coarse_alignment(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
+    """Release and origin of a track that begins in motion, where it deviates least from the reference."""
+    tried_s = np.linspace(*_release_range(trial, reference), N_COARSE_SHIFTS)
+    differences_m = np.array([trial.lead_position_m - reference.at(trial.time_s - at) for at in tried_s])
+    best = int(np.argmin(differences_m.std(axis=1)))
+    return float(tried_s[best]), float(differences_m[best].mean())
 
 
 def _deviations(
     trials: Sequence[TrialFit], reference: _Reference, time_s: Floats, release_s: Floats, origin_m: Floats
 ) -> tuple[Floats, Floats]:
-    """Deviation of each trial from the mean at every instant, and how many trials are there.
+    """Deviation of each trial from the mean at every instant, and the number of trials present.
 
-    Only what is left beside the reference is compared: between frames the motion itself would count as a difference.
+    Differences from the reference are compared, because frames of different trials are not taken at the same instants.
     """
-    left_m = np.array(
+    difference_m = np.array(
         [
             sampled(
                 time_s,
@@ -247,19 +248,19 @@ def _deviations(
             for i, trial in enumerate(trials)
         ]
     )
-    present = np.isfinite(left_m).sum(axis=0)
-    return np.where(present > 1, left_m - mean_of(left_m, present), math.nan), present
+    present = np.isfinite(difference_m).sum(axis=0)
+    return np.where(present > 1, difference_m - mean_of(difference_m, present), math.nan), present
 
 
-def _shifts(deviation_m: Floats, speed_m_s: Floats, at_rest: Floats) -> tuple[Floats, Floats]:
-    """How much later each trial was released, s, and how much higher it lies, m; 0 where its rest tells that."""
+def _shifts(deviation_m: Floats, speed_m_s: Floats, origin_known: Floats) -> tuple[Floats, Floats]:
+    """Least-squares shifts of each trial in time, s, and position, m; the latter 0 where its origin is known."""
     shifts = np.zeros((2, len(deviation_m)))
-    for i, left_m in enumerate(deviation_m):
-        use = np.isfinite(left_m)
+    for i, trial_deviation_m in enumerate(deviation_m):
+        use = np.isfinite(trial_deviation_m)
         if np.count_nonzero(use) > 2:
-            free = 0.0 if at_rest[i] else 1.0
+            free = 0.0 if origin_known[i] else 1.0
             design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-            shifts[:, i] = scaled_least_squares(design, left_m[use], MIN_SINGULAR_VALUE)
+            shifts[:, i] = scaled_least_squares(design, trial_deviation_m[use], MIN_SINGULAR_VALUE)
     return shifts[0], shifts[1]
 
 
@@ -271,7 +272,7 @@ def mean_of(values: Floats, present: Floats) -> Floats:
     values : array, shape (n_trials, n_times)
         NaN where a trial is absent.
     present : array, shape (n_times,)
-        Trials that are there.
+        Number of trials present.
 
     Returns
     -------
@@ -283,12 +284,12 @@ def mean_of(values: Floats, present: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Replicates:
-    """The trials of one condition on a common clock; shapes (n_trials, n_times), NaN where a trial says nothing.
+    """Residuals of the trials of one condition on a common clock; shapes (n_trials, n_times), NaN where absent.
 
     `time_s`, shape (n_times,), is since release. `residual_m` is measurement minus model; `present`, shape (n_times,),
-    counts the trials. `model_m`, shape (n_times,), is the model's growth, the longest of the trials'. `begin_s` is when
-    the first of model and measurement moves: what counts begins there. `variance_m2`, shape (n_times,), is that of
-    single replicates, and `alignment` what they differ by, both from the measurements alone.
+    counts the trials. `model_m`, shape (n_times,), is the model's growth in the longest trial. `begin_s` is when the
+    first of model and measurement moves; errors are evaluated from there on. `variance_m2`, shape (n_times,), is that
+    of single replicates, and `alignment` their alignment, both from the measurements alone.
     """
 
     time_s: Floats
@@ -306,10 +307,9 @@ class Replicates:
 
 
 def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
-    """Lay the trials of one condition over each other.
+    """Residuals of a model for the trials of one condition on a common clock.
 
-    Every instant takes each trial's nearest frame, and only what is left beside the model is compared there: to
-    interpolate positions would average their noise away.
+    Each instant uses the nearest frame of each trial, because interpolation would average the noise of positions away.
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     model_m = _growth(longest, time_s)
     residuals_m = np.array([sampled(time_s, t.release_s, t.time_s, t.residual_m) for t in trials])
     alignment = align_replicates(trials)
-    # The two clocks differ by what the releases do on average, which the mean of the replicates cannot tell.
+    # The two clocks differ by the mean difference of the releases, which the replicates do not determine.
     shift_s = float(np.mean(alignment.release_s - [trial.release_s for trial in trials]))
     variance_m2 = sampled(time_s, 0.0, alignment.time_s + shift_s, alignment.variance_m2)
     begin_moving_s = min(float(trial.time_s[first_that_counts(trial)]) - trial.release_s for trial in trials)
@@ -337,7 +337,7 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
 
 
 def first_that_counts(trial: TrialFit) -> int:
-    """The frame where the first of model and measurement begins to move: rest would only dilute an error.
+    """Index of the frame where model or measurement begins to move: a standstill would only dilute an error.
 
     Parameters
     ----------
@@ -349,14 +349,14 @@ def first_that_counts(trial: TrialFit) -> int:
     int
     """
     released = int(np.searchsorted(trial.time_s, trial.release_s))
-    # A pressure that is only let in moves nothing yet.
+    # While the pressure is still rising, nothing moves yet.
     moved = np.flatnonzero(trial.predicted_position_m > trial.origin_m)
     released = max(released, int(moved[0]) if moved.size else trial.time_s.size)
     return min(released, max(frames_at_rest(trial) - 1, 0), trial.time_s.size - 1)
 
 
 def _growth(trial: TrialFit, since_release_s: Floats) -> Floats:
-    """The model's growth at times since release; what lies beyond the trial's frames holds its ends."""
+    """The model's growth at times since release; constant beyond the trial's frames."""
     from scipy.interpolate import PchipInterpolator
 
     t = trial.time_s - trial.release_s

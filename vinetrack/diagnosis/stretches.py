@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import in_sample
-from vinetrack.diagnosis.per_trial_estimates import lay
+from vinetrack.diagnosis.per_trial_estimates import align_trials
 from vinetrack.diagnosis.replicate_scatter import (
     Scatter,
     Stretches,
@@ -72,7 +72,7 @@ def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ..
         If the model cannot be simulated.
     """
     predicted = in_sample(fit).trials
-    response = scatter_sensitivities(lay(fit))
+    response = scatter_sensitivities(align_trials(fit))
     return [_course(*members) for members in zip(predicted, response, fit.predictor.data, strict=True)], predicted
 
 
