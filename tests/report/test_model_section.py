@@ -40,7 +40,7 @@ FIT = {
     ],
     "spreads": {"B": {"value": 0.03, "estimated": True}, "pressure": {"value": 0.01, "estimated": False}},
     "messages": ["P_y: the trajectories do not constrain it beyond the value in the sheet"],
-    "warnings": ["Trial a: the tail would have to push."],
+    "warnings": ["Trial a: the model predicts compression in the tail."],
     "left_out": {"b": "its leading edge never moves"},
 }
 
@@ -93,7 +93,7 @@ def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
     assert "v 0.370 0.490 6.44 6.10 5.1" in text
     assert "Not in this fit: b: its leading edge never moves." in text
     assert "1 rule for neglecting terms is violated" in text
-    assert "Trial a: the tail would have to push." in text
+    assert "Trial a: the model predicts compression in the tail." in text
 
 
 def test_figures_of_the_model_stand_in_its_section() -> None:

@@ -1,9 +1,9 @@
-"""What a model leaves out, weighed along the motion that was filmed: an audit of each trial.
+"""Audit of the terms that a model neglects, along the recorded motion of each trial.
 
-Every effect of the catalogue that is not in the model is asked, at its typical size, what force it would have put on
-the tail. That is set against the drive ½PA. Beside it stands the tail's tension, and in words which of the paper's
-rules for leaving things out a trial breaks: drag above 5 % of the drive, friction along 30 cm and more, bends of 30°
-and more, a reservoir whose pressure changes by more than 5 %, a tail that would have to push.
+For every effect of the catalogue that is not in the model, the audit computes the force on the tail at the effect's
+typical size, relative to the drive ½PA; and the tail's tension. Warnings state which of the paper's rules for
+neglecting effects a trial violates: drag above 5 % of the drive, friction along 30 cm and more, bends of 30° and more,
+a reservoir whose pressure changes by more than 5 %, compression in the tail.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import trial_inputs
 from vinetrack.effects import Effect, EffectError, catalogue
 
-BENT_RAD = math.radians(30)
-DRAG_SHARE, PRESSURE_SHARE, LONG_M = 0.05, 0.05, 0.30
-"""Published: the rules by which Alvarez et al. (2025) leave out drag, the fall of the reservoir's pressure, friction
-along the length and bends. They set which warnings are printed, and no fitted number; at half there are more, at
+NEGLIGIBLE_BEND_RAD = math.radians(30)
+DRAG_SHARE, PRESSURE_SHARE, NEGLIGIBLE_LENGTH_M = 0.05, 0.05, 0.30
+"""Published: the rules by which Alvarez et al. (2025) neglect drag, the fall of the reservoir's pressure, friction
+along the length and bends. They decide which warnings are printed, and no fitted number; at half there are more, at
 twice fewer."""
 
 TENSION = "tail_tension"
@@ -49,7 +49,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class AuditedMotion:
-    """How one trial moved since release, from measurement or simulation; arrays of shape (n,), SI.
+    """Motion of one trial since release, measured or simulated; arrays of shape (n,), SI.
 
     `pressure_Pa` is the gauge pressure measured along with it, where there is one.
     """
@@ -65,7 +65,7 @@ class AuditedMotion:
 
         Parameters
         ----------
-        most : number of points that is not exceeded.
+        most : largest number of points.
 
         Returns
         -------
@@ -81,11 +81,12 @@ class AuditedMotion:
 
 @dataclass(frozen=True)
 class Audit:
-    """`table`, columns `COLUMNS`: a row for each neglected term and one for the tension, of every trial.
+    """Result of an audit: a table of neglected terms and tensions by trial, and warnings.
 
-    `force_N` is the force on the tail where it is largest against the drive (negative: it would hold back), there also
-    time and place; `shift_m` what the camera would see elsewhere. The row `tail_tension` has the least tension, and
-    when it first was negative. `warnings` are sentences.
+    `table`, columns `COLUMNS`, has a row per trial for each neglected term and one for the tension. `force_N` is the
+    force on the tail where it is largest relative to the drive (negative: it opposes growth), with time and place;
+    `shift_m` is the displacement that the camera would see. The row `tail_tension` has the least tension, and the time
+    at which it first was negative. `warnings` are sentences.
     """
 
     table: pd.DataFrame
@@ -95,7 +96,7 @@ class Audit:
 def measured_motion(
     trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
 ) -> AuditedMotion:
-    """Motion of a trial as it was filmed, from its release on.
+    """Motion of a trial as recorded, from its release on.
 
     Parameters
     ----------
@@ -118,39 +119,39 @@ def measured_motion(
 
 
 def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effect] | None = None) -> Audit:
-    """Weigh what `model` leaves out along each motion.
+    """Compute what `model` neglects along each motion.
 
     Parameters
     ----------
-    model : the model whose omissions are weighed.
-    motions : one motion a trial, from `modelled_motion` or `measured_motion`.
-    effects : what might have been in the model, at default sizes; by default the physical effects of the catalogue.
+    model : the model whose omissions are audited.
+    motions : one motion per trial, from `measured_motion` or a simulation.
+    effects : the effects considered, at default sizes; by default the physical effects of the catalogue.
 
     Returns
     -------
-    a row for each trial and effect left out, one for the tension of its tail, and the warnings.
+    Audit
 
     Raises
     ------
     EffectError
-        If a trial lacks what an effect *of the model* needs; what a neglected one lacks is said in its row.
+        If a trial lacks a value that an effect *of the model* needs; for a neglected effect its row says so.
     """
     candidates = list(catalogue().values()) if effects is None else list(effects)
     rows: list[dict[str, Any]] = []
     warnings: list[str] = []
     for motion in (motion.thinned() for motion in motions):
-        terms = _along(model, motion)
-        neglected = [e for e in candidates if e.kind != "measurement" and not _held(e, model, motion)]
+        terms = _terms_along(model, motion)
+        neglected = [e for e in candidates if e.kind != "measurement" and not _in_model(e, model, motion)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
         rows += [*left_out, tension]
         warnings += [
-            f"Trial {motion.trial.name}: {words}." for words in _broken_rules(model, motion, left_out, tension)
+            f"Trial {motion.trial.name}: {words}." for words in _rule_warnings(model, motion, left_out, tension)
         ]
     return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(warnings))
 
 
-def _along(model: Model, motion: AuditedMotion) -> Terms:
+def _terms_along(model: Model, motion: AuditedMotion) -> Terms:
     return evaluate(
         model,
         motion.trial,
@@ -161,8 +162,8 @@ def _along(model: Model, motion: AuditedMotion) -> Terms:
     )
 
 
-def _held(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
-    """Whether the model, or a pressure measured during growth, already holds an effect."""
+def _in_model(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
+    """Whether the model, or a pressure measured during growth, includes an effect."""
     if effect.name in model or (effect.in_trace and motion.pressure_Pa is not None):
         return True
     return any(effect.name in other.replaces for other in model)
@@ -175,7 +176,7 @@ def _drive_N(motion: AuditedMotion) -> Floats:
     return np.broadcast_to(np.asarray(pressure * rig.area / rig.travel_ratio, dtype=float), motion.time_s.shape)
 
 
-def _place(motion: AuditedMotion, i: int) -> dict[str, float]:
+def _place_of(motion: AuditedMotion, i: int) -> dict[str, float]:
     y = float(motion.lead_position_m[i])
     length = motion.trial.length_m
     share = y / length if math.isfinite(length) and length > 0 else math.nan
@@ -188,33 +189,33 @@ def _row(motion: AuditedMotion, term: str) -> dict[str, Any]:
 
 
 def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without: Terms) -> dict[str, Any]:
-    """What one effect would have changed: the sum of forces on the tail, less the inertia of mass it adds."""
+    """The change by one effect: the sum of forces on the tail, minus the inertia of mass that it adds."""
     row = _row(motion, effect.name)
     row["size"] = ", ".join(
         f"{p.symbol} = {p.default:g}{'' if p.unit == '1' else ' ' + p.unit}" for p in effect.parameters
     )
     try:
-        terms = _along(model + effect, motion)
+        terms = _terms_along(model + effect, motion)
     except EffectError as error:
         return {**row, "note": str(error)}
     if not set(effect.functions) - {"observed_position", "row_delay", "averaged_over"}:
-        return {**row, **_shift(effect, motion, without)}
+        return {**row, **_largest_shift(effect, motion, without)}
     if not set(effect.functions) - {"rest_force"}:
         return {**row, "note": "acts on a vine at rest only"}
     force = _total_N(terms) - _total_N(without) - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
     drive = _drive_N(motion)
     share = np.divide(force, drive, out=np.zeros_like(force), where=drive > 0)
     i = int(np.argmax(np.abs(share if np.any(drive > 0) else force)))
-    return {**row, "force_N": float(force[i]), "share_of_drive": float(share[i]), **_place(motion, i)}
+    return {**row, "force_N": float(force[i]), "share_of_drive": float(share[i]), **_place_of(motion, i)}
 
 
 def _total_N(terms: Terms) -> Floats:
-    """All that acts on the tail, N."""
+    """Total force on the tail, N."""
     return terms.tension_N + sum(terms.tail_N.values(), np.zeros_like(terms.tension_N))
 
 
-def _shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, float]:
-    """How far off an effect that only shows to the camera puts the leading edge, from where it does at release."""
+def _largest_shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, float]:
+    """Largest displacement by an effect that only changes the reported position, relative to release."""
     rig = trial_inputs(motion.trial)
     state = terms.state._replace(tail_tension=np.maximum(terms.tension_N, 0.0))  # type: ignore[arg-type]
     sizes = [parameter.default for parameter in effect.parameters]
@@ -222,16 +223,16 @@ def _shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, flo
         late_s = effect.functions["row_delay"](state, rig, *sizes) * motion.lead_position_m
         shift = np.interp(motion.time_s + late_s, motion.time_s, motion.lead_position_m) - motion.lead_position_m
     elif "averaged_over" in effect.functions:
-        shift = _averaged(motion, math.sqrt(effect.functions["averaged_over"](state, rig, *sizes)))
+        shift = _time_average(motion, math.sqrt(effect.functions["averaged_over"](state, rig, *sizes)))
         shift -= motion.lead_position_m
     else:
         shift = np.asarray(effect.functions["observed_position"](state, rig, *sizes), float) - motion.lead_position_m
     i = int(np.argmax(np.abs(shift)))
-    return {"shift_m": float(shift[i]), **_place(motion, i)}
+    return {"shift_m": float(shift[i]), **_place_of(motion, i)}
 
 
-def _averaged(motion: AuditedMotion, over_s: float) -> Floats:
-    """Positions as means over a time, m; the edge rests before the first and stands behind the last."""
+def _time_average(motion: AuditedMotion, over_s: float) -> Floats:
+    """Positions averaged over a time, m; the edge is at rest before the first and after the last."""
     area = cumulative_trapezoid(motion.lead_position_m, motion.time_s, initial=0.0)
     time_s = np.concatenate([[motion.time_s[0] - over_s], motion.time_s, [motion.time_s[-1] + over_s]])
     ends = over_s * motion.lead_position_m[[0, -1]]
@@ -249,12 +250,12 @@ def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:
         **_row(motion, TENSION),
         "force_N": float(tension[i]),
         "share_of_drive": float(tension[i]) / drive if drive > 0 else math.nan,
-        **_place(motion, i),
+        **_place_of(motion, i),
         "slack_from_s": float(motion.time_s[negative[0]]) if negative.size else math.nan,
     }
 
 
-def _broken_rules(
+def _rule_warnings(
     model: Model, motion: AuditedMotion, rows: Sequence[dict[str, Any]], tension: dict[str, Any]
 ) -> Iterator[str]:
     trial = motion.trial
@@ -265,27 +266,27 @@ def _broken_rules(
             f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
             f"({drag['size']}), above {DRAG_SHARE:.0%}; add air_drag to the model"
         )
-    if "tail_friction" in neglected and trial.length_m >= LONG_M:
+    if "tail_friction" in neglected and trial.length_m >= NEGLIGIBLE_LENGTH_M:
         yield (
-            f"friction along the length is left out of a vine of {100 * trial.length_m:.0f} cm, which is safe below "
-            f"{100 * LONG_M:.0f} cm; add tail_friction to the model"
+            f"friction along the length is neglected in a vine of {100 * trial.length_m:.0f} cm, which is safe below "
+            f"{100 * NEGLIGIBLE_LENGTH_M:.0f} cm; add tail_friction to the model"
         )
     bent = sum(bend.arc_m / bend.radius_m for bend in trial.bends)
-    if "capstan_friction" in neglected and bent >= BENT_RAD:
+    if "capstan_friction" in neglected and bent >= NEGLIGIBLE_BEND_RAD:
         yield (
-            f"the path bends by {math.degrees(bent):.0f}° in all, which is safe to leave out below "
-            f"{math.degrees(BENT_RAD):.0f}°; add capstan_friction to the model"
+            f"the path bends by {math.degrees(bent):.0f}° in all, which is safe to neglect below "
+            f"{math.degrees(NEGLIGIBLE_BEND_RAD):.0f}°; add capstan_friction to the model"
         )
-    yield from _fallen_pressure(model, motion, neglected)
+    yield from _reservoir_warning(model, motion, neglected)
     if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
         yield (
-            f"the tail would have to push from {1e3 * tension['slack_from_s']:.0f} ms on (tension down to "
-            f"{tension['force_N']:.2f} N); `tail_slack: free` lets it go slack"
+            f"the model predicts compression in the tail from {1e3 * tension['slack_from_s']:.0f} ms on (tension down "
+            f"to {tension['force_N']:.2f} N); `tail_slack: free` lets it go slack"
         )
 
 
-def _fallen_pressure(model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """The reservoir's rule, by the gas law in absolute pressure, between slow and fast."""
+def _reservoir_warning(model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """The reservoir's rule, by the gas law in absolute pressure, for slow and for fast expansion."""
     row = neglected.get("reservoir_depletion")
     pressure = motion.trial.pressure_Pa
     if row is None or row["note"] or not pressure > 0:
@@ -293,8 +294,8 @@ def _fallen_pressure(model: Model, motion: AuditedMotion, neglected: dict[str, d
     effect = catalogue()["reservoir_depletion"]
     shares = []
     for gamma in (1.0, 1.4):
-        left = _along((model + effect).with_values({"reservoir_depletion.gamma": gamma}), motion).pressure_Pa
-        shares.append(1 - float(np.min(left)) / pressure)
+        lowest_Pa = _terms_along((model + effect).with_values({"reservoir_depletion.gamma": gamma}), motion).pressure_Pa
+        shares.append(1 - float(np.min(lowest_Pa)) / pressure)
     if shares[1] > PRESSURE_SHARE:
         yield (
             f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "

@@ -1,4 +1,4 @@
-"""Trials laid out end to end for the compiled kernel, and run there."""
+"""Trials concatenated for the compiled kernel, and its calls."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import Model, asked, effects_on, hosted
+from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted
 from vinetrack.effects import State, TrialInputs
 
 RELATIVE_TOLERANCE = 1e-4
-"""Local tolerance on the speed. Hairer's estimate is of order 3, the method of order 5: positions come out good to 10⁻⁶
-of the distance travelled on every trial of the paper's protocol (measured by `benchmarks/integrator.py`)."""
+"""Local tolerance on the speed. Hairer's error estimate is of order 3, the method of order 5: positions are accurate to
+10⁻⁶ of the travel on every trial of the paper's protocol (measured by `benchmarks/integrator.py`)."""
 
 _NOTHING = State(*(math.nan,) * len(State._fields))
 
 CORES = os.cpu_count() or 1
-"""Of this machine; asking for them takes a tenth of the time of a small batch."""
+"""Cores of this machine, determined once: the call takes a tenth of the time of a small batch."""
 
 SMALLEST_SHARE = 64
 """Trials below which another thread costs more than it saves. Chosen: a millisecond of work; no result changes."""
 
 Trace = tuple[Floats, Floats]
-"""Times since release, s, and gauge pressures, Pa, measured there."""
+"""Times since release, s, and gauge pressures, Pa, measured at them."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Many trials laid out for the compiled kernel: prepared once, run as often as one likes.
+    """Trials laid out for the compiled kernel: prepared once, run as often as needed.
 
-    Trial i has rows `starts[i]:starts[i + 1]` of the answer; `stamps`, shape (n_times,), are its instants since release
-    as the camera has them, `times` when they really were. `thetas`, shape (n_trials, n_parameters), may be replaced
-    between runs as long as no effect changes between none and some.
+    Trial i has rows `starts[i]:starts[i + 1]` of the result; `stamps`, shape (n_times,), are its times since release on
+    the camera's clock, `times` the true ones. `thetas`, shape (n_trials, n_parameters), may be replaced between runs as
+    long as no effect is switched on or off.
     """
 
     integrate_many: Callable[..., None]
@@ -61,11 +61,10 @@ class Batch:
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
         """Integrate every trial.
 
-        Parameters
-        ----------
-        relative_tolerance : of the integrator, relative to the speed that a motion reaches.
-        threads : to share the trials among, by default one for every 64 trials and no more than there are cores: the
-            kernel runs outside the interpreter's lock.
+        Parameters ---------- relative_tolerance : of the integrator, relative to the speed that a motion reaches.
+        threads : number of threads, by default one for every 64 trials and at most the number of cores: the kernel
+        releases
+            the interpreter's lock.
 
         Returns
         -------
@@ -88,7 +87,7 @@ class Batch:
         return out, ends
 
     def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
-        """Trials a to b, each into its own rows of `out` and `ends`."""
+        """Integrate trials a to b, each into its own rows of `out` and `ends`."""
         self.integrate_many(
             self.starts[a : b + 1],
             self.times,
@@ -112,7 +111,7 @@ class Batch:
 
 @lru_cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Threads that wait for work; a process that was forked off has its own."""
+    """Thread pool of a process; a forked process gets its own."""
     return ThreadPoolExecutor(threads)
 
 
@@ -127,20 +126,19 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """As `prepare`, for trials that are rows of numbers already.
+    """As `simulate.prepare`, for trials whose inputs are numbers already.
 
     Parameters
     ----------
     model, traces, parameters, host : as those of `simulate_many`
     inputs : shape (n_trials, n_fields of `TrialInputs`), SI
     bends : by trial, as `bends_of` returns them
-    stamps : shape (n_times,), instants of all trials end to end, s
-    starts : shape (n_trials + 1,), where each trial's instants begin, as `starts_of` has it
+    stamps : shape (n_times,), times of all trials, concatenated, s
+    starts : shape (n_trials + 1,), start of each trial's times, from `starts_of`
 
     Returns
     -------
     Batch
-        Ready to be run.
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
@@ -174,7 +172,7 @@ def lay_out(
 
 
 def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
-    """Where each part begins when all are laid end to end, and where the last ends.
+    """Start of each part in their concatenation, and the end of the last.
 
     Parameters
     ----------
@@ -196,14 +194,14 @@ def _limits(
     on: NDArray[np.bool_],
     bends: Sequence[Sequence[tuple[float, float, float]]],
 ) -> tuple[Floats, Floats]:
-    """Tail travel at the breakpoints of the forces, rising, and at which growth ends, m; infinite where there is none.
+    """Tail travel at the breakpoints of the forces, increasing, and at the end of growth, m; infinite if there is none.
 
     Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
-    bends begin and end, and what effects say of theirs.
+    bends begin and end, and where effects declare them.
     """
     rig = TrialInputs(*inputs.T)
     film = np.ones(len(inputs))
-    for effect, function, place in asked(model, "film_gain"):
+    for effect, function, place in hook_functions(model, "film_gain"):
         for k in np.flatnonzero(on[:, effect]).tolist():
             film[k] *= function(_NOTHING, TrialInputs(*inputs[k]), *thetas[k, place])
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
@@ -219,7 +217,7 @@ def _limits(
         assert of_effect is not None
         known: dict[tuple[bytes, bytes], list[float]] = {}
         for k in np.flatnonzero(on[:, i]).tolist():
-            # A difference moves one number of a trial at a time, and most of them no breakpoint.
+            # Finite differences change one parameter of a trial at a time, and most affect no breakpoint.
             key = inputs[k].tobytes(), thetas[k, model.places[i]].tobytes()
             if key not in known:
                 known[key] = list(of_effect(TrialInputs(*inputs[k]), *thetas[k, model.places[i]]))
@@ -234,9 +232,9 @@ def _limits(
 def _true_times(
     model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats, starts: NDArray[np.int64]
 ) -> Floats:
-    """When what the camera stamps really happened, of all trials end to end, shape (n_times,)."""
+    """True times of the camera's stamps, for all trials concatenated, shape (n_times,)."""
     true_times = stamps
-    for effect, function, place in asked(model, "true_time"):
+    for effect, function, place in hook_functions(model, "true_time"):
         true_times = true_times.copy()
         for i in np.flatnonzero(on[:, effect]):
             of_trial = slice(starts[i], starts[i + 1])
@@ -248,9 +246,9 @@ def _true_times(
 def _true_traces(
     model: Model, inputs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
 ) -> list[Trace | None]:
-    """Measured pressures at the times at which they were really measured, by trial."""
+    """Measured pressures of each trial at the true times of their samples."""
     in_time = list(traces)
-    for effect, function, place in asked(model, "trace_time"):
+    for effect, function, place in hook_functions(model, "trace_time"):
         for i in np.flatnonzero(on[:, effect]).tolist():
             if (trace := in_time[i]) is None:
                 continue

@@ -1,8 +1,8 @@
-"""The motion between the instants that were asked for.
+"""Interpolation of the motion between the requested times.
 
-It is the Hermite polynomial of degree 5 through position, speed and acceleration at either side; up to the end of
-growth, where the acceleration jumps, that of degree 4 without the one at the jump. Where the vine sets off it jumps as
-well, and is not told apart: over a frame that is an error of micrometres.
+It is the Hermite polynomial of degree 5 through position, speed and acceleration on either side; next to the end of
+growth, where the acceleration jumps, that of degree 4 without the acceleration at the jump. The jump at the start of
+motion is not treated separately: over a frame that is an error of micrometres.
 """
 
 from vinetrack.dynamics.equations import Point, compiled, inlined
@@ -16,16 +16,16 @@ def _point(times, out, k):
 
 @compiled
 def motion_at(times, out, ratio, end, k, read):
-    """Position, m, and speed, m/s, of the tail at an instant, and what the camera adds to the lead position, m.
+    """Position, m, and speed, m/s, of the tail at a time, and the camera's offset of the lead position, m.
 
     Parameters
     ----------
     times : array (n_times,), s since release, increasing.
     out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m.
     ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite where it does not.
-    k : an instant to look from; the nearer, the faster.
-    read : the instant, s since release.
+    end : the `Point` at which growth ends; its time is infinite if it does not.
+    k : index of a nearby time, from which to search.
+    read : the time, s since release.
     """
     last = times.size - 1
     while k < last and times[k + 1] <= read:
@@ -53,7 +53,7 @@ def motion_at(times, out, ratio, end, k, read):
 
 @inlined
 def _without_far_acceleration(near, far, read):
-    """Position, m, and speed, m/s, of the tail between an instant and another, later or earlier, at which it jerks."""
+    """Position, m, and speed, m/s, of the tail between a time and another at which the acceleration jumps."""
     h = far.time - near.time
     part = (read - near.time) / h
     d = far.x - near.x - h * near.v - 0.5 * h * h * near.acceleration

@@ -1,4 +1,4 @@
-"""What one effect does to the motion of a reference vine: the table behind its picture."""
+"""Motion of a reference vine with and without one effect: the data of the effect's figure."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ REFERENCE = Trial(
 REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
 
 BENDS = (Bend(0.1, 0.1, 0.1),)
-"""One radian after 10 cm, for what happens in bends."""
+"""One radian after 10 cm, for effects of bends."""
 
 SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3]))
 """A pressure that rises and falls through the threshold, for effects that act on a vine at rest."""
 
 
 OPENED: Trace = (np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3]))
-"""A pressure that is recorded while a valve opens, for what concerns the record of it."""
+"""A pressure that is recorded while a valve opens, for effects on the record of the pressure."""
 
 
 def effect_motion(effect: Effect) -> pd.DataFrame:
     """Motion of the reference vine with an effect at its default size and without it.
 
-    An effect of the base model is taken out of it, another is put in.
+    An effect of the base model is removed from it, any other is added.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _acts_at_rest(effect: Effect) -> bool:
 def _models(effect: Effect) -> tuple[Model, Model]:
     """The base model with an effect and without.
 
-    Out of the whole catalogue, all else at no size: that is one compiled model for all pictures.
+    Both are the whole catalogue with all other effects at size zero, so that one compiled model serves all figures.
     """
     if effect.kind == "base" and not effect.parameters:
         base = base_model().with_values(REFERENCE_VALUES)
@@ -147,5 +147,5 @@ def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) ->
 
 
 def _seen_velocity(motion: Trajectory) -> Floats:
-    """Speed of the edge as it is reported."""
+    """Speed of the reported position of the edge."""
     return np.gradient(motion.observed_position_m, motion.time_s)

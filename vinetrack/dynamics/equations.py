@@ -1,8 +1,8 @@
-"""What the integrator needs to know of one model and one trial: compiled functions, and the arrays that go with them.
+"""The interface of the integrator to one model and one trial: compiled functions and the arrays that they use.
 
-`vinetrack.dynamics.kernel` writes the functions of one model and puts them into an `Equations`; the integrator
-(`radau`, `slack_tail`, `integrator`) takes that as its first argument. To numba the `Equations` of every model are a
-type of their own (`EquationsType`), so that it compiles the integrator for each model and sees through the calls.
+`vinetrack.dynamics.kernel` writes the functions of one model and collects them in an `Equations`; the integrator
+(`radau`, `slack_tail`, `integrator`) takes it as first argument. For numba the `Equations` of every model are a type of
+their own (`EquationsType`), so that the integrator is compiled for each model and the calls can be inlined.
 
 The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
 """
@@ -24,19 +24,21 @@ _FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, 
 
 compiled: Any = njit(**_FLAGS, forceinline=False)
 inlined: Any = njit(**_FLAGS, forceinline=True)
-"""How every function of the integrator is compiled: outside the interpreter's lock, dividing by zero as NumPy does, and
-without counting references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two together make it three
-times as fast; in return no function may make an array. Python cannot call them, for none has a way in from there but
-`integrate_many` of `vinetrack.dynamics.kernel`: a quarter of the time to compile a model went into those of the others.
+"""Options with which every function of the integrator is compiled: it releases the interpreter's lock, divides by zero
+as NumPy does, and does not count references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two
+together make it three times as fast; in return no function may allocate an array. Python cannot call these functions,
+since only `integrate_many` of `vinetrack.dynamics.kernel` has a wrapper for it: wrappers took a quarter of the time to
+compile a model.
 
-`inlined` is for the model and the steps of the integrator, so that it costs nothing to have them in functions of their
-own: on 36 trials a trajectory of the base model takes 1.8 times as long without, of a catalogue of 36 effects 1.8 too.
-Either is said of every function: numba takes what is not said from whichever caller it compiles first, so that the same
-model was up to twice as slow in a process that had asked for its rates alone."""
+`inlined` is for the model and the steps of the integrator, so that splitting them into functions costs no time: without
+it, a trajectory takes 1.8 times as long on 36 trials, for the base model as for a catalogue of 36 effects. Either
+option is stated for every function: otherwise numba takes it from whichever caller it compiles first, and the same
+model was up to twice as slow in a process that had called its rates alone.
+"""
 
 
 class TrialArrays(NamedTuple):
-    """One trial as the equations see it: everything that stays the same while it grows."""
+    """The inputs of one trial, constant during its growth."""
 
     on: Any  #: which effects act, shape (n_effects,)
     inputs: Floats  #: the fields of `vinetrack.effects.TrialInputs`, SI
@@ -48,11 +50,11 @@ class TrialArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The compiled functions of one model. All are asked at `(time, x, v, chamber, trial)` unless stated.
+    """The compiled functions of one model, called with `(time, x, v, chamber, trial)` unless stated.
 
     x, v are position and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa.
 
-    The last five are for tails that may go slack; for all others they are the functions at the end of this file.
+    The last five are for tails that may go slack; otherwise they are the placeholders at the end of this file.
     """
 
     name: str  #: of the model, unique in a process: it tells numba's types apart
@@ -71,10 +73,10 @@ class Equations:
 
 
 class EquationsType(types.Opaque):
-    """Numba's type for the `Equations` of one model: nothing at run time, its attributes are compiled functions.
+    """Numba's type for the `Equations` of one model: no data at run time; its attributes are compiled functions.
 
-    A tuple of functions would do as well, but numba passes the functions in it by their addresses in memory, and then
-    cannot keep the compiled form for the next process.
+    A tuple of functions would work too, but numba passes its functions by their memory addresses, and then cannot cache
+    the compiled form for the next process.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -109,7 +111,7 @@ def _lower_function(context: Any, _builder: Any, _type: Any, _value: Any, _attri
 
 
 class Point(NamedTuple):
-    """The vine at one instant: time, s; position, speed and acceleration of the tail; pressure of the chamber, Pa."""
+    """State of the vine: time, s; position, speed and acceleration of the tail; pressure of the chamber, Pa."""
 
     time: float
     x: float
@@ -120,7 +122,7 @@ class Point(NamedTuple):
 
 RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4
 """Status of a trajectory (the first four index `vinetrack.dynamics.simulate.STATUS`); a convention of this package.
-TAUT: a slack tail has pulled tight and the integrator goes on."""
+TAUT: a slack tail has become taut and the integrator continues."""
 
 
 @inlined
@@ -149,7 +151,7 @@ def trace_at(time, trial):
 
 @inlined
 def next_slope_change(k, time, trial):
-    """Index of the first sample of the measured pressure after `time`, from index k on, where its slope changes.
+    """Index of the first sample of the measured pressure after `time`, from index k on, at which its slope changes.
 
     No step of the integrator is accurate across such a sample.
 
@@ -181,7 +183,7 @@ def next_slope_change(k, time, trial):
 
 @inlined
 def angle_passed(y, trial):
-    """Angle of the bends that the tip has passed.
+    """Total angle of the bends that the tip has passed.
 
     Parameters
     ----------
@@ -200,20 +202,20 @@ def angle_passed(y, trial):
 
 
 @inlined
-def yes():
-    """True, as a function that the compiler sees through."""
+def with_chamber():
+    """Value of `has_chamber` for a model with an equation of the chamber: true, as an inlined function."""
     return True
 
 
 @inlined
-def no():
-    """False, as a function that the compiler sees through."""
+def without_chamber():
+    """Value of `has_chamber` for a model without an equation of the chamber: false, as an inlined function."""
     return False
 
 
 @inlined
 def not_averaged(trial):  # noqa: ARG001
-    """Stands for `averaged_over` where a position is that of one instant.
+    """Placeholder for `averaged_over` if positions are not averaged in time.
 
     Parameters
     ----------
@@ -228,7 +230,7 @@ def not_averaged(trial):  # noqa: ARG001
 
 @inlined
 def no_row_delay(trial):  # noqa: ARG001
-    """Stands for `row_delay` where all rows of a picture are read at once.
+    """Placeholder for `row_delay` if all rows of a picture are read at once.
 
     Parameters
     ----------
@@ -243,7 +245,7 @@ def no_row_delay(trial):  # noqa: ARG001
 
 @inlined
 def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
-    """Stands for `tip_tension` where no tail may go slack.
+    """Placeholder for `tip_tension` if no tail may go slack.
 
     Parameters
     ----------
@@ -252,14 +254,14 @@ def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
     Returns
     -------
     (tension, chamber_rate)
-        0 N and 0 Pa/s: nothing calls it but where a tail may go slack.
+        0 N and 0 Pa/s; never used.
     """
     return 0.0, 0.0
 
 
 @inlined
 def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
-    """Stands for `free_fall` where no tail may go slack.
+    """Placeholder for `free_fall` if no tail may go slack.
 
     Parameters
     ----------
@@ -274,7 +276,7 @@ def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
 
 @inlined
 def never_slack(equations, trial, h, start, end):  # noqa: ARG001
-    """Stands for `slack_fraction` where no tail may go slack: beyond the end of every step.
+    """Placeholder for `slack_fraction` if no tail may go slack: beyond the end of every step.
 
     Parameters
     ----------
@@ -289,7 +291,7 @@ def never_slack(equations, trial, h, start, end):  # noqa: ARG001
 
 @inlined
 def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
-    """Stands for `slack_at_rest` where no tail may go slack.
+    """Placeholder for `slack_at_rest` if no tail may go slack.
 
     Parameters
     ----------
@@ -304,16 +306,15 @@ def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
 
 @inlined
 def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
-    """Stands for `follow_slack` where no tail may go slack.
+    """Placeholder for `follow_slack` if no tail may go slack.
 
     Parameters
     ----------
-    equations, trial, times, row, start, stop, rtol, out, work : as of `follow_slack`; `row` and `start` are handed
-        back.
+    equations, trial, times, row, start, stop, rtol, out, work : as of `follow_slack`; `row` and `start` are returned.
 
     Returns
     -------
     (status, row, point, tip_speed)
-        TAUT, `row` and `start` as they came, and a tip speed r·ẏ of 0 m/s, as `follow_slack` returns them.
+        TAUT, `row` and `start` unchanged, and a tip speed r·ẏ of 0 m/s, as `follow_slack` returns them.
     """
     return TAUT, row, start, 0.0

@@ -1,7 +1,7 @@
-"""The terms of a model along a motion that is known: what drove it and what held it back, effect by effect.
+"""Forces, pressure and masses of a model along a known motion, effect by effect.
 
-The same order of physics as the compiled kernel (`vinetrack.dynamics.kernel`), in plain Python on arrays; a test holds
-the two together.
+The same order of physics as in the compiled kernel (`vinetrack.dynamics.kernel`), in plain Python on arrays; a test
+compares the two.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from vinetrack.effects import Effect, State, TrialInputs
 
 @dataclass(frozen=True)
 class Terms:
-    """Everything the model says along a motion; arrays of the motion's shape, SI.
+    """Everything that the model computes along a motion; arrays of the motion's shape, SI.
 
-    `tip_N` and `tail_N` hold the forces by effect: those at the tip count 1/r on the tail, those on the tail whole.
-    `tension_N` is what the tip leaves for the tail, T₁; where it is negative the tail would have to push, which it
-    cannot. `mass_kg` moves and has weight; `inertia_kg` holds also what effects add to it. `state` is what the effects
-    saw.
+    `tip_N` and `tail_N` are the forces by effect: those at the tip act on the tail by 1/r, those on the tail in full.
+    `tension_N` is the tension that the tip leaves for the tail, T₁; where it is negative the model predicts compression
+    in the tail, which is impossible. `mass_kg` moves and has weight; `inertia_kg` includes mass that effects add.
+    `state` is the argument of the effects.
     """
 
     pressure_Pa: Floats
@@ -48,7 +48,7 @@ def evaluate(
     *,
     measured_Pa: Floats | None = None,
 ) -> Terms:
-    """Ask every effect of the model along a motion since release.
+    """Evaluate every effect of the model along a motion since release.
 
     Parameters
     ----------
@@ -69,20 +69,20 @@ def evaluate(
     """
     check_needs(model, trial)
     rig = trial_inputs(trial)
-    ask = _Asker(model, trial)
+    hooks = _HookCaller(model, trial)
     motion = [np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s)]
-    state = _resting_state(trial, rig, *motion)
-    ask.measured = measured_Pa is not None
-    film = np.prod([np.ones_like(motion[0]), *ask.each("film_gain", state, rig).values()], axis=0)
+    state = _initial_state(trial, rig, *motion)
+    hooks.measured = measured_Pa is not None
+    film = np.prod([np.ones_like(motion[0]), *hooks.each("film_gain", state, rig).values()], axis=0)
     film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
-    weighed = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
-    state = state._replace(moving_mass=weighed, linear_density=rig.linear_density * film)
-    state = _with_pressure(ask, state, rig, measured_Pa)
-    state = state._replace(damping_gain=ask("damping_gain", state, rig, state.damping_gain, "damping_gain"))
-    tip, tail = ask.each("tip_force", state, rig), ask.each("tail_force", state, rig)
+    moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
+    state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
+    state = _with_pressure(hooks, state, rig, measured_Pa)
+    state = state._replace(damping_gain=hooks("damping_gain", state, rig, state.damping_gain, "damping_gain"))
+    tip, tail = hooks.each("tip_force", state, rig), hooks.each("tail_force", state, rig)
     tip_sum = sum(tip.values(), np.zeros_like(motion[0]))
-    added = sum(ask.each("added_mass", state, rig).values(), np.zeros_like(motion[0]))
-    moved = inertia_kg(film_mass, added, rig)
+    added = sum(hooks.each("added_mass", state, rig).values(), np.zeros_like(motion[0]))
+    inertia = inertia_kg(film_mass, added, rig)
     tail_sum = sum(tail.values(), np.zeros_like(motion[0]))
     tension = tip_sum / rig.travel_ratio
     return Terms(
@@ -92,24 +92,24 @@ def evaluate(
         tip_N=tip,
         tail_N=tail,
         tension_N=tension,
-        acceleration_m_s2=(tension + tail_sum) / moved,
-        inertia_kg=np.asarray(moved),
+        acceleration_m_s2=(tension + tail_sum) / inertia,
+        inertia_kg=np.asarray(inertia),
         state=state,
     )
 
 
 def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Floats:
-    """All that moves with the tail.
+    """Everything that moves with the tail.
 
-    The floor that the film's mass comes to is fold and gas: what effects add to the tail counts in it. What they take
-    away is no film, which goes to nothing on the way, but of the payload; fold and gas are left.
+    The floor of the film's mass is that of fold and gas: mass that effects add to the tail counts towards it. Mass that
+    they remove is that of the payload, not film, which goes to zero during growth; fold and gas remain.
 
     Parameters
     ----------
     film_mass : array, shape (n,), kg
         Of the film that has not everted.
     added_mass : array, shape (n,), kg
-        What effects add to it; less than nothing where they take away.
+        Added by effects; negative if they remove mass.
     rig : TrialInputs
 
     Returns
@@ -120,7 +120,7 @@ def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Float
     return np.asarray(np.maximum(tail + np.minimum(added_mass, 0.0) + rig.payload_mass, rig.least_mass))
 
 
-class _Asker:
+class _HookCaller:
     """Calls the hooks of a model's effects with the parameters of one trial's vine."""
 
     def __init__(self, model: Model, trial: Trial) -> None:
@@ -132,7 +132,7 @@ class _Asker:
         self.effects = sorted(effects, key=lambda effect: effect.order)
         self.measured = False
 
-    def _asked(self, hook: str) -> list[tuple[Effect, Callable[..., Any]]]:
+    def _functions_of(self, hook: str) -> list[tuple[Effect, Callable[..., Any]]]:
         return [
             (effect, effect.functions[hook])
             for effect in self.effects
@@ -140,11 +140,11 @@ class _Asker:
         ]
 
     def has(self, hook: str) -> bool:
-        return bool(self._asked(hook))
+        return bool(self._functions_of(hook))
 
     def __call__(self, hook: str, state: State, rig: TrialInputs, value: Floats | float, name: str) -> Any:
-        """The value that the effects leave one after the other; each sees the last in the field `name` of the state."""
-        for effect, function in self._asked(hook):
+        """The value after all effects in turn; each gets the previous value in the field `name` of the state."""
+        for effect, function in self._functions_of(hook):
             value = function(state, rig, *self.arguments[effect.name])
             if name:
                 changed: dict[str, Any] = {name: value}
@@ -152,16 +152,16 @@ class _Asker:
         return value
 
     def each(self, hook: str, state: State, rig: TrialInputs) -> dict[str, Floats]:
-        """What each effect says by itself."""
+        """The value of each effect by itself."""
         return {
             effect.name: np.broadcast_to(
                 np.asarray(function(state, rig, *self.arguments[effect.name]), dtype=float), np.shape(state.time)
             )
-            for effect, function in self._asked(hook)
+            for effect, function in self._functions_of(hook)
         }
 
 
-def _resting_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
+def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
     ones = np.ones_like(time)
     angle = sum(
         (np.clip(position - bend.start_m, 0.0, bend.arc_m) / bend.radius_m for bend in trial.bends), np.zeros_like(time)
@@ -186,47 +186,47 @@ def _resting_state(trial: Trial, rig: TrialInputs, time: Floats, position: Float
     return State(**fields)
 
 
-def _with_pressure(ask: _Asker, state: State, rig: TrialInputs, measured_Pa: Floats | None) -> State:
+def _with_pressure(hooks: _HookCaller, state: State, rig: TrialInputs, measured_Pa: Floats | None) -> State:
     """Gauge, chamber, area and losses, in the order of the physics."""
-    set_pressure = ask("gauge", state, rig, state.pressure, "pressure")
+    set_pressure = hooks("gauge", state, rig, state.pressure, "pressure")
     state = state._replace(set_pressure=set_pressure, pressure=set_pressure)
-    state = state._replace(yield_pressure=ask("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
+    state = state._replace(yield_pressure=hooks("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
     if measured_Pa is not None:
         measured: Any = np.asarray(measured_Pa, dtype=float)
         state = state._replace(pressure=measured)
-        state = state._replace(pressure=ask("gauge", state, rig, state.pressure, "pressure"))
-    elif ask.has("chamber_rate"):
-        state = state._replace(pressure=_chamber(ask, state, rig))
-    return _settled(ask, state, rig)
+        state = state._replace(pressure=hooks("gauge", state, rig, state.pressure, "pressure"))
+    elif hooks.has("chamber_rate"):
+        state = state._replace(pressure=_chamber_pressure(hooks, state, rig))
+    return _with_consistent_area(hooks, state, rig)
 
 
-def _settled(ask: _Asker, state: State, rig: TrialInputs) -> State:
-    """Area and pressure at the tip that agree with each other, from the pressure in the chamber."""
+def _with_consistent_area(hooks: _HookCaller, state: State, rig: TrialInputs) -> State:
+    """Area and pressure at the tip that are consistent with each other, from the pressure in the chamber."""
     start, plain = state.pressure, state.area
     area = plain
     for turn in range(30):
-        before, area = area, ask("area", state._replace(area=plain), rig, plain, "area")
+        before, area = area, hooks("area", state._replace(area=plain), rig, plain, "area")
         if turn > 0 and np.all(np.abs(area - before) <= 1e-10 * area):
             break
         state = state._replace(area=area, pressure=start)
-        state = state._replace(pressure=ask("pressure", state, rig, start, "pressure"))
+        state = state._replace(pressure=hooks("pressure", state, rig, start, "pressure"))
     return state._replace(area=area)
 
 
-def _chamber(ask: _Asker, state: State, rig: TrialInputs) -> Any:
-    """Pressure of a chamber that follows its own equation.
+def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any:
+    """Pressure of a chamber with an equation of its own.
 
-    From point to point with the motion frozen half-way, exact in the pressure to first order: a supply quicker than
-    the steps between the points does no harm.
+    Exponential integration from point to point with the motion frozen half-way, exact to first order in the pressure:
+    it is stable for a supply that is faster than the steps.
     """
     shape = np.shape(state.time)
     fields = [np.broadcast_to(np.asarray(value, dtype=float), shape) for value in state]
     half_way = [0.5 * (values[1:] + values[:-1]) for values in fields]
 
     def rate(i: int, pressure: float) -> float:
-        here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
-        here = _settled(ask, here, rig)._replace(pressure=pressure)
-        return sum(float(value) for value in ask.each("chamber_rate", here, rig).values())
+        state_here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
+        state_here = _with_consistent_area(hooks, state_here, rig)._replace(pressure=pressure)
+        return sum(float(value) for value in hooks.each("chamber_rate", state_here, rig).values())
 
     pressure = np.empty(shape)
     pressure[0] = float(fields[State._fields.index("set_pressure")][0])
@@ -242,7 +242,7 @@ def _chamber(ask: _Asker, state: State, rig: TrialInputs) -> Any:
 def pressure_along(
     model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats
 ) -> Floats:
-    """Gauge pressure that, by a model, drove a measured motion.
+    """Gauge pressure that drove a measured motion according to a model.
 
     Parameters
     ----------
@@ -250,7 +250,6 @@ def pressure_along(
 
     Returns
     -------
-    array, shape (n,)
-        Pa.
+    array, shape (n,), Pa
     """
     return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa

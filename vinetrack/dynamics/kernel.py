@@ -1,8 +1,8 @@
-"""The sum of effects as one compiled function.
+"""The sum of the effects of a model as one compiled function, generated as Python source.
 
-The effects of a model are plain Python functions in separate files. Here a small module is written that calls them in
-the order of the physics and hands the result, an `Equations`, to the integrator. It is compiled once; the compiled form
-is kept in the user's cache under a name made of everything it depends on, so that the next process finds it again.
+The effects are plain Python functions in separate files. This module writes a small module that calls them in the order
+of the physics and passes the result, an `Equations`, to the integrator. It is compiled once and cached under a hash of
+everything it depends on, so that other processes find the compiled form.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ PARTS = (
     *("equations.py", "radau.py", "slack_tail.py", "between_frames.py", "row_readout.py", "time_average.py"),
     "integrator.py",
 )
-"""Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
+"""Files of the integrator, which are part of the compiled form of a model: a change in one of them requires
+recompilation."""
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
 from numba import njit
 
 from vinetrack.dynamics.equations import (
-    Equations, angle_passed, inlined, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
-    not_averaged, not_slack_at_rest, trace_at, yes,
+    Equations, angle_passed, inlined, never_slack, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
+    not_averaged, not_slack_at_rest, trace_at, with_chamber, without_chamber,
 )
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
@@ -83,7 +84,7 @@ _AT_RELEASE = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
 
 
 class _Writer:
-    """Writes the calls of hooks, in the order of the effects, and remembers which functions must be loaded."""
+    """Writes the calls of hooks, in the order of the effects, and collects the functions to be loaded."""
 
     def __init__(self, effects: Sequence[Effect]) -> None:
         self.effects = effects
@@ -101,13 +102,13 @@ class _Writer:
             arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
             self.loads[name] = f"{name} = inlined(EFFECTS[{i}].functions[{hook!r}])"
-            # A measured trace already holds what happens in the chamber.
+            # A measured pressure includes everything that happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
             lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
         return lines
 
     def pressure(self) -> list[str]:
-        """Gauge → what the chamber does → area and losses; where the area yields to pressure, until both agree."""
+        """Gauge, then chamber, then area and losses; where the area depends on the pressure, iterate to consistency."""
         gauge = self.calls("gauge", "pressure = {call}")
         lines = [*gauge, "set_pressure = pressure"]
         lines += ["if measured:", "    pressure = trace_at(time, trial)"]
@@ -115,15 +116,16 @@ class _Writer:
         if self.has("chamber_rate"):
             lines += ["else:", "    pressure = chamber"]
         lines += self.calls("yield_gauge", "yield_pressure = {call}")
-        once = self.calls("pressure", "pressure = {call}")
-        stretch = self.calls("area", "area = {call}")
-        if not stretch:
-            return lines + once
-        # An area that no effect changes agrees at once; each turn gains a digit or two on the strongest stretch.
+        pressures = self.calls("pressure", "pressure = {call}")
+        areas = self.calls("area", "area = {call}")
+        if not areas:
+            return lines + pressures
+        # Fixed-point iteration: without strain it converges at once, with the largest strain by one or two digits a
+        # turn.
         lines += ["start = pressure", "for turn in range(30):", "    area_before, area = area, rig.area"]
-        lines += [f"    {line}" for line in stretch]
+        lines += [f"    {line}" for line in areas]
         lines += ["    if turn > 0 and abs(area - area_before) <= 1e-10 * area:", "        break"]
-        return lines + [f"    {line}" for line in ["pressure = start", *once]]
+        return lines + [f"    {line}" for line in ["pressure = start", *pressures]]
 
     def mass(self) -> list[str]:
         lines = [*self.calls("film_gain", "film *= {call}"), "density = rig.linear_density * film"]
@@ -133,7 +135,7 @@ class _Writer:
         return lines
 
     def inertia(self) -> list[str]:
-        """All that moves with the tail; see `force_terms.inertia_kg`."""
+        """Everything that moves with the tail; see `force_terms.inertia_kg`."""
         added = self.calls("added_mass", "added += {call}")
         tail = "mass = max(film_mass + max(added, 0.0), rig.least_mass)"
         total = "mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"
@@ -144,8 +146,8 @@ class _Writer:
         lines += self.calls("tip_force", "tip += {call}")
         return lines + self.calls("tail_force", "tail += {call}")
 
-    def unseen(self) -> list[str]:
-        """Where no effect changes what the camera reports, nothing has to be worked out for it."""
+    def camera_shortcut(self) -> list[str]:
+        """Return the position at once where no effect changes the position that the camera reports."""
         acting = [f"on[{i}]" for i, effect in enumerate(self.effects) if "observed_position" in effect.functions]
         return [f"if not ({' or '.join(acting)}):", "    return seen"]
 
@@ -163,14 +165,14 @@ class _Writer:
 
 
 def _modules(effect: Effect) -> list[str]:
-    """Names of the modules from which the functions of an effect come."""
+    """Names of the modules that define the functions of an effect."""
     return sorted({function.__module__ for function in effect.functions.values()})
 
 
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
-    """Python text of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
+    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
 
-    Mass that effects add moves like the tail but has no weight of its own: it is counted after the forces.
+    Mass that effects add moves with the tail but has no weight of its own, so it is added after the forces.
 
     Parameters
     ----------
@@ -180,56 +182,64 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     Returns
     -------
     str
-        The text; `kernel` writes it to a file and imports it, with the effects as `EFFECTS`. It names no place.
+        The source; `kernel` writes it to a file and imports it, with the effects as `EFFECTS`. It contains no paths.
     """
-    write = _Writer(effects)
-    both = [*write.mass(), *write.pressure(), *write.forces()]
-    added = write.inertia()
-    seen = write.calls("observed_position", "seen = {call}")
-    holding = write.calls("rest_force", "tip += {call}")
-    # The chamber knows its own pressure, not what is left of it at the tip.
-    filling = write.calls("chamber_rate", "chamber_rate += {call}", _STATE.replace(" pressure,", " chamber,"))
+    writer = _Writer(effects)
+    common_terms = [*writer.mass(), *writer.pressure(), *writer.forces()]
+    added = writer.inertia()
+    seen = writer.calls("observed_position", "seen = {call}")
+    rest_forces = writer.calls("rest_force", "tip += {call}")
+    # The rate of the chamber depends on its own pressure, not on that at the tip.
+    chamber_rates = writer.calls("chamber_rate", "chamber_rate += {call}", _STATE.replace(" pressure,", " chamber,"))
     per_mass = "return (tip / rig.travel_ratio + tail) / mass"
     tension = "max(tip, 0.0) / rig.travel_ratio"
-    pushed = ["if rig.tail_free > 0:", "    tip = max(tip, 0.0)"] if tail_free else []
-    looked = [*write.unseen(), *both, f"tension = {tension}", *seen]
+    no_compression = ["if rig.tail_free > 0:", "    tip = max(tip, 0.0)"] if tail_free else []
+    camera_position = [*writer.camera_shortcut(), *common_terms, f"tension = {tension}", *seen]
     functions = [
-        write.function("rates", _MOTION, _MOVING, [*both, *filling, *added, f"{per_mass}, chamber_rate"]),
-        write.function(
-            "rest_acceleration", _MOTION.replace("v, ", ""), _AT_REST, [*both, *holding, *pushed, *added, per_mass]
+        writer.function(
+            "rates", _MOTION, _MOVING, [*common_terms, *chamber_rates, *added, f"{per_mass}, chamber_rate"]
         ),
-        write.function("observed", _MOTION, _MOVING, [*(looked if seen else []), "return seen"]),
-        write.function(
+        writer.function(
+            "rest_acceleration",
+            _MOTION.replace("v, ", ""),
+            _AT_REST,
+            [*common_terms, *rest_forces, *no_compression, *added, per_mass],
+        ),
+        writer.function("observed", _MOTION, _MOVING, [*(camera_position if seen else []), "return seen"]),
+        writer.function(
             "first_chamber",
             "trial",
             _AT_RELEASE,
-            [*write.calls("gauge", "pressure = {call}"), "return pressure"],
+            [*writer.calls("gauge", "pressure = {call}"), "return pressure"],
         ),
     ]
-    if write.has("row_delay"):
-        delays = ["delay = 0.0", *write.calls("row_delay", "delay += {call}"), "return delay"]
-        functions += [write.function("row_delay", "trial", _AT_RELEASE, delays)]
-    if write.has("averaged_over"):
-        squares = ["square = 0.0", *write.calls("averaged_over", "square += {call}"), "return square"]
-        functions += [write.function("averaged_over", "trial", _AT_RELEASE, squares)]
+    if writer.has("row_delay"):
+        delays = ["delay = 0.0", *writer.calls("row_delay", "delay += {call}"), "return delay"]
+        functions += [writer.function("row_delay", "trial", _AT_RELEASE, delays)]
+    if writer.has("averaged_over"):
+        squares = ["square = 0.0", *writer.calls("averaged_over", "square += {call}"), "return square"]
+        functions += [writer.function("averaged_over", "trial", _AT_RELEASE, squares)]
     if tail_free:
-        resting = ["if resting:", *[f"    {line}" for line in holding or ["pass"]]]
+        resting = ["if resting:", *[f"    {line}" for line in rest_forces or ["pass"]]]
         functions += [
-            write.function(
+            writer.function(
                 "tip_tension",
                 _MOTION.replace("chamber,", "chamber, resting,"),
                 _MOVING,
-                [*both, *resting, *filling, "return tip / rig.travel_ratio, chamber_rate"],
+                [*common_terms, *resting, *chamber_rates, "return tip / rig.travel_ratio, chamber_rate"],
             ),
-            write.function("free_fall", _MOTION.replace("x, v,", "y, ydot, x, v,"), "", [*both, "return tail / mass"]),
+            writer.function(
+                "free_fall", _MOTION.replace("x, v,", "y, ydot, x, v,"), "", [*common_terms, "return tail / mass"]
+            ),
         ]
     names = ", ".join(effect.name for effect in effects)
-    fields = ["rates", "rest_acceleration", "observed", "first_chamber", "yes" if write.has("chamber_rate") else "no"]
-    fields += ["row_delay" if write.has("row_delay") else "no_row_delay"]
-    fields += ["averaged_over" if write.has("averaged_over") else "not_averaged"]
+    fields = ["rates", "rest_acceleration", "observed", "first_chamber"]
+    fields += ["with_chamber" if writer.has("chamber_rate") else "without_chamber"]
+    fields += ["row_delay" if writer.has("row_delay") else "no_row_delay"]
+    fields += ["averaged_over" if writer.has("averaged_over") else "not_averaged"]
     fields += _TAIL_FREE if tail_free else _TAIL_TAUT
     foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
-    return "\n".join((_HEAD.format(names=names), *write.loads.values(), *functions, foot))
+    return "\n".join((_HEAD.format(names=names), *writer.loads.values(), *functions, foot))
 
 
 def _cache_folder() -> Path:
@@ -248,11 +258,11 @@ def _cache_folder() -> Path:
                 return folder
         except OSError:
             continue
-    raise OSError("No folder can be written to keep the compiled model; set VINETRACK_CACHE to one.")
+    raise OSError("No writable folder was found for the compiled model; set VINETRACK_CACHE to one.")
 
 
 _LOADED: dict[str, ModuleType] = {}
-"""Kernels of this process by what they depend on: effects of the same text at two places share theirs."""
+"""Kernels of this process by their hash: effects with the same source at two places share one."""
 
 
 @lru_cache(maxsize=64)
@@ -267,13 +277,13 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     Returns
     -------
     module
-        With `integrate_many`, whose arguments are those of `vinetrack.dynamics.integrator.integrate_trials` behind the
+        With `integrate_many`, whose arguments are those of `vinetrack.dynamics.integrator.integrate_trials` after the
         equations, and the functions of the model.
 
     Raises
     ------
     OSError
-        If no folder can be written to.
+        If no folder is writable.
     """
     import numba
 
@@ -281,7 +291,7 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     parts = [source, *(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in PARTS)]
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], constants)]
     parts += [numba.__version__, sys.version]
-    # What is compiled names the modules of its effects, and is of use only where they have the same names.
+    # The compiled form refers to the modules of the effects by name, so the names are part of the hash.
     parts += [text for effect in effects for text in (effect.path.read_text(), *_modules(effect))]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     if digest in _LOADED:

@@ -91,7 +91,7 @@ class Model:
 
     @cached_property
     def places(self) -> list[slice]:
-        """Where in the parameters each effect finds its values."""
+        """Slice of the parameters of each effect."""
         ends = list(itertools.accumulate((len(effect.parameters) for effect in self.effects), initial=0))
         return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
@@ -100,16 +100,16 @@ class Model:
         """Every parameter at its `zero`, in the order of `parameter_names`."""
         return np.array([number for effect in self.effects for number in effect.zero], dtype=float)
 
-    # A fit asks several thousand times which effects act; what of that depends on the model alone is worked out once.
+    # A fit determines several thousand times which effects act; the part that depends on the model alone is cached.
     @cached_property
     def sized_effects(self) -> tuple[list[int], list[int]]:
-        """Places of the effects that have parameters, and where the parameters of each begin."""
+        """Indices of the effects that have parameters, and where the parameters of each begin."""
         sized = [i for i, effect in enumerate(self.effects) if effect.parameters]
         return sized, [self.places[i].start for i in sized]
 
     @cached_property
     def replaced_effects(self) -> list[tuple[int, int]]:
-        """Pairs of places: an effect, and one that it replaces."""
+        """Pairs of indices: an effect, and one that it replaces."""
         return [
             (i, j)
             for i, effect in enumerate(self.effects)
@@ -119,7 +119,7 @@ class Model:
 
     @cached_property
     def hooks(self) -> dict[str, list[tuple[int, Callable[..., Any], slice]]]:
-        """By hook what `asked` returns."""
+        """By hook the result of `hook_functions`."""
         functions: dict[str, list[tuple[int, int, Callable[..., Any], slice]]] = {}
         for i, (effect, place) in enumerate(zip(self.effects, self.places, strict=True)):
             for hook, function in effect.functions.items():
@@ -179,8 +179,8 @@ class Model:
         Parameters
         ----------
         vine : name of the vine, for values that are given per vine.
-        day : name of the day's trials, as `Trial.group` has it, for values that are given per day; what only the
-            recordings of other days are known to have is nothing on this one.
+        day : name of the day, from `Trial.group`, for values that are given per day; without a value for this day the
+            parameter is at its `zero`.
 
         Returns
         -------
@@ -248,8 +248,8 @@ class Model:
 def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
     """Which effects act.
 
-    An effect of no size (every parameter at its `zero`) does not act, nor one that an acting effect replaces: so one
-    compiled model serves all the smaller ones in it.
+    An effect of size zero (every parameter at its `zero`) does not act, nor does one that an acting effect replaces: so
+    one compiled model serves all smaller models that it contains.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
-    """Parameters of a model as those of a larger one that holds it.
+    """Parameters of a model, as parameters of a larger one that contains it.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
     Returns
     -------
     array, shape (n_trials, n_parameters of the host)
-        What the model lacks stands at its `zero`.
+        Parameters that the model lacks are at their `zero`.
 
     Raises
     ------
@@ -298,7 +298,7 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
     return wider
 
 
-def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
+def hook_functions(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
     """The functions of a hook, in the order in which they are called.
 
     Parameters

@@ -1,7 +1,8 @@
 """One step of Radau IIA, order 5, for the speed and position of a tail and the pressure of its chamber.
 
-Position follows from the speeds by the same quadrature, so that Newton's system is of the three stage speeds alone; the
-chamber's pressure has one of its own. Why it is this method is stated in `vinetrack.dynamics.integrator`.
+Position follows from the speeds by the same quadrature, so that the Newton system is that of the three stage speeds
+alone; the chamber pressure has a Newton system of its own. `vinetrack.dynamics.integrator` states why this method is
+used.
 
 Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections IV.5 (the method,
 table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error estimate).
@@ -12,7 +13,7 @@ from typing import NamedTuple
 from vinetrack.dynamics.equations import Point, inlined
 
 SQRT6 = 6.0**0.5
-"""Derived: √6, which the nodes are made of."""
+"""Derived: √6, which appears in the nodes."""
 
 C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
 A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
@@ -21,6 +22,8 @@ A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9
 """Nodes c and matrix A of the method; the third node is 1. Source: Hairer & Wanner, table IV.5.6."""
 
 S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))
+"""Derivative at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of
+its Lagrange polynomials at 1. It avoids the cancellation that f(v) suffers from in stiff problems."""
 S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
 S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)
 """Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of its
@@ -30,22 +33,22 @@ MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)  # source: below
 E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
 """The real eigenvalue of A⁻¹ and the weights of the estimate of the local error. Source: Hairer & Wanner, IV.8."""
 
-MOST_NEWTON = 9
+MOST_NEWTON_ITERATIONS = 9
 """Newton iterations before a step is given up; chosen near the 7 of RADAU5. At half, more steps are cut to a quarter
-and repeated; at twice, hopeless steps cost twice as much. The result depends on neither: a step counts only once it has
-converged."""
+and repeated; at twice, steps that fail cost twice as much. The result depends on neither: a step counts only once it
+has converged."""
 
 NEWTON_TOLERANCE = 1e-2
-"""Change of the speeds at which the iterations stop, over the tolerance of a step; chosen as RADAU5 does (κ between
-10⁻¹ and 10⁻²), so that what the iterations leave is small beside the error of the method."""
+"""Change of the speeds at which the iterations stop, relative to the tolerance of a step; chosen as in RADAU5 (κ
+between 10⁻¹ and 10⁻²), so that the remaining iteration error is small compared with the error of the method."""
 
 FAST_CONTRACTION = 0.1
 """Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen; RADAU5 keeps it from
-step to step below 10⁻³. At half it is evaluated more often, at twice the iterations are slower."""
+step to step below 10⁻³. At half it is evaluated more often, at twice the iterations converge more slowly."""
 
 
 class Stages(NamedTuple):
-    """Speeds gained at the three stages of a step of size h, s and m/s; h is 0 where there is no earlier step."""
+    """Increments of speed at the three stages of a step of size h, m/s and s; h is 0 if there is no previous step."""
 
     h: float
     z1: float
@@ -54,12 +57,12 @@ class Stages(NamedTuple):
 
 
 NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)
-"""For a step that no other precedes: after a start and after a step was refused."""
+"""For a step without a previous one: after a start and after a rejected step."""
 
 
 @inlined
 def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
-    """Solution of three linear equations by Cramer's rule: the Newton step of the three stages."""
+    """Solve three linear equations by Cramer's rule: the Newton step of the three stages."""
     k1 = m22 * m33 - m23 * m32
     k2 = m23 * m31 - m21 * m33
     k3 = m21 * m32 - m22 * m31
@@ -71,42 +74,47 @@ def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
 
 
 @inlined
-def _slope_in_speed(equations, trial, time, x, v, chamber, acceleration, scale):
-    """∂a/∂v, 1/s, by a one-sided difference, upwards: below rest the law is another."""
+def _speed_derivative(equations, trial, time, x, v, chamber, acceleration, scale):
+    """∂a/∂v, 1/s, by a one-sided difference towards higher speed, since a different law holds at rest."""
     delta = 1e-6 * max(abs(v), 1e-4 * scale)
     higher, _rate = equations.rates(time, x, v + delta, chamber, trial)
     return (higher - acceleration) / delta
 
 
 @inlined
-def first_stages(point, h, before):
-    """Starting values of the Newton iterations: the last step's cubic, continued beyond its end.
+def starting_values(point, h, previous):
+    """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated.
 
-    Without an earlier step, the acceleration at the start. No stage is let below a tenth of the speed at the start.
+    Without a previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the
+    speed at the start.
 
     Parameters
     ----------
     point : the `Point` from which the step starts.
     h : size of the step, s.
-    before : the `Stages` of the last accepted step, or `NO_STAGES`.
+    previous : the `Stages` of the last accepted step, or `NO_STAGES`.
 
     Returns
     -------
     Stages
-        Size of the step and speeds gained at its three stages, m/s.
+        Size of the step and increments of speed at its three stages, m/s.
     """
     lowest = -0.9 * point.v
-    if before.h > 0:
-        r = h / before.h
-        p1, p2, p3 = _continued(1 + C1 * r, before), _continued(1 + C2 * r, before), _continued(1 + r, before)
-        w1, w2, w3 = p1 - before.z3, p2 - before.z3, p3 - before.z3
+    if previous.h > 0:
+        r = h / previous.h
+        p1, p2, p3 = (
+            _collocation_polynomial(1 + C1 * r, previous),
+            _collocation_polynomial(1 + C2 * r, previous),
+            _collocation_polynomial(1 + r, previous),
+        )
+        w1, w2, w3 = p1 - previous.z3, p2 - previous.z3, p3 - previous.z3
     else:
         w1, w2, w3 = C1 * h * point.acceleration, C2 * h * point.acceleration, h * point.acceleration
     return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
 
 
 @inlined
-def _continued(s, stages):
+def _collocation_polynomial(s, stages):
     """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
     l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
     l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
@@ -116,7 +124,7 @@ def _continued(s, stages):
 
 @inlined
 def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
-    """Newton's change of the stage speeds: (I − h A J) d = h A f − z, J the slopes of the acceleration in speed."""
+    """Newton step of the stage speeds: (I − h A J) d = h A f − z, J the derivatives ∂a/∂v."""
     return _solve3(
         1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
         -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
@@ -129,7 +137,7 @@ def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
 
 @inlined
 def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
-    """Newton's change of the chamber's pressures at the stages; jc is h times the slope of its rate in pressure."""
+    """Newton step of the chamber pressures at the stages; jc is h times the derivative of the rate."""
     return _solve3(
         1 - A11 * jc, -A12 * jc, -A13 * jc,
         -A21 * jc, 1 - A22 * jc, -A23 * jc,
@@ -142,33 +150,33 @@ def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
 
 @inlined
 def radau_step(equations, trial, point, stages, scale, rtol):
-    """One step from `point`, of the size and with the starting values that `first_stages` gave.
+    """One step from `point`, with the size and the starting values in `stages`.
 
     Parameters
     ----------
     equations, trial : the model, and the `TrialArrays` of the trial.
     point : where the step begins.
-    stages : size of the step, s, and the three starting values of the speeds gained, m/s.
+    stages : size of the step, s, and starting values of the three increments of speed, m/s.
     scale : speed that the motion reaches, m/s; with `rtol` it sets the tolerance.
     rtol : tolerance relative to that speed.
 
     Returns
     -------
     (converged, error, end, stages)
-        `error` in units of the tolerance, `end` the `Point` at the end of the step, `stages` the speeds gained.
+        `error` in units of the tolerance, `end` the `Point` at the end of the step, `stages` the increments of speed.
     """
     time, x, v, _acceleration, chamber = point
     h, z1, z2, z3 = stages
     j1 = j2 = j3 = 0.0
     g1 = g2 = g3 = 0.0
-    small = NEWTON_TOLERANCE * rtol * max(scale, abs(v))
-    before = 1e300
+    tolerance = NEWTON_TOLERANCE * rtol * max(scale, abs(v))
+    previous_size = 1e300
     q1 = q2 = q3 = chamber
     jc = 0.0
-    filling = False
-    fresh = False
+    chamber_active = False
+    jacobian_current = False
     converged = False
-    for iteration in range(MOST_NEWTON):
+    for iteration in range(MOST_NEWTON_ITERATIONS):
         v1, v2, v3 = v + z1, v + z2, v + z3
         x1 = x + h * (C1 * v + A11 * z1 + A12 * z2 + A13 * z3)
         x2 = x + h * (C2 * v + A21 * z1 + A22 * z2 + A23 * z3)
@@ -177,19 +185,19 @@ def radau_step(equations, trial, point, stages, scale, rtol):
         f1, g1 = equations.rates(t1, x1, v1, q1, trial)
         f2, g2 = equations.rates(t2, x2, v2, q2, trial)
         f3, g3 = equations.rates(t3, x3, v3, q3, trial)
-        if not fresh:
-            j1 = _slope_in_speed(equations, trial, t1, x1, v1, q1, f1, scale)
-            j2 = _slope_in_speed(equations, trial, t2, x2, v2, q2, f2, scale)
-            j3 = _slope_in_speed(equations, trial, t3, x3, v3, q3, f3, scale)
-            fresh = True
-            # A chamber with an equation of its own is as stiff as its supply is quick.
-            filling = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
-            if filling:
+        if not jacobian_current:
+            j1 = _speed_derivative(equations, trial, t1, x1, v1, q1, f1, scale)
+            j2 = _speed_derivative(equations, trial, t2, x2, v2, q2, f2, scale)
+            j3 = _speed_derivative(equations, trial, t3, x3, v3, q3, f3, scale)
+            jacobian_current = True
+            # The equation of a chamber is stiff if its supply is fast.
+            chamber_active = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
+            if chamber_active:
                 dq = 1e-6 * (abs(q3) + 1e3)
                 _f, higher = equations.rates(t3, x3, v3, q3 + dq, trial)
                 jc = h * (higher - g3) / dq
         change = 0.0
-        if filling:
+        if chamber_active:
             c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)
             q1, q2, q3 = q1 + c1, q2 + c2, q3 + c3
             change = max(abs(c1), abs(c2), abs(c3)) / (abs(q3) + 1e3)
@@ -198,31 +206,31 @@ def radau_step(equations, trial, point, stages, scale, rtol):
         size = max(abs(d1), abs(d2), abs(d3), change * scale)
         if not size < 1e300:
             break
-        ratio = size / before
-        # The next iteration would change about ratio · size more.
-        if size <= small or (iteration > 0 and ratio < FAST_CONTRACTION and ratio * size <= 0.1 * small):
+        ratio = size / previous_size
+        # The next iteration would change the speeds by about ratio · size.
+        if size <= tolerance or (iteration > 0 and ratio < FAST_CONTRACTION and ratio * size <= 0.1 * tolerance):
             converged = True
             break
         if ratio > FAST_CONTRACTION:
-            fresh = False
-        if iteration > 3 and size > before:
+            jacobian_current = False
+        if iteration > 3 and size > previous_size:
             break
-        before = size
-    gained = Stages(h, z1, z2, z3)
+        previous_size = size
+    new_stages = Stages(h, z1, z2, z3)
     if not converged:
-        return False, 1e300, point, gained
-    return True, _local_error(point, gained, scale, rtol), _end_of_step(point, gained, q3), gained
+        return False, 1e300, point, new_stages
+    return True, _local_error(point, new_stages, scale, rtol), _end_of_step(point, new_stages, q3), new_stages
 
 
 @inlined
 def _local_error(point, stages, scale, rtol):
-    """Hairer's estimate of the error of the speed, in units of the tolerance.
+    """Hairer's estimate of the local error of the speed, in units of the tolerance.
 
-    Hairer filters it with (μ/h − J)⁻¹. Not here: that hides what a long stiff step does wrong at its far end.
+    Hairer filters it with (μ/h − J)⁻¹. This is omitted: the filter hides the error of a long stiff step at its far end.
     """
     h, z1, z2, z3 = stages
     raw = (h * point.acceleration + E1 * z1 + E2 * z2 + E3 * z3) / MU
-    # A tenth of the final speed: what goes wrong at the start is carried through the whole growth.
+    # At least a tenth of the final speed: an error at the start affects the whole growth.
     weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
     return abs(raw) / weight
 
@@ -238,7 +246,7 @@ def _end_of_step(point, stages, chamber):
 
 @inlined
 def quintic(s, h, start, end):
-    """Motion within a step from that at its ends: the Hermite polynomial of degree 5.
+    """Motion within a step: the Hermite polynomial of degree 5 through position, speed and acceleration.
 
     Parameters
     ----------

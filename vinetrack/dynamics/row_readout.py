@@ -1,37 +1,37 @@
-"""A picture whose rows are read one after the other: the edge is seen where it is when its row is read.
+"""Rolling shutter: the rows of a picture are read one after the other, and show the edge at different times.
 
-What is stamped t shows the edge at t + s·y, with y the position at which it is seen then and s the delay by the metre.
-Where the vine sets off rows are read at their stamps, since s·y is next to nothing.
+A frame stamped t shows the edge at t + s·y, with y its position at that time and s the delay per metre. At the start of
+growth s·y is negligible, and rows are read at their stamps.
 """
 
 from vinetrack.dynamics.between_frames import motion_at
 from vinetrack.dynamics.equations import compiled
 
 STEEPEST = 0.1
-"""Least 1 − s·ẏ that Newton's method divides by. Chosen: an edge that keeps up with the readout within 10 % is seen
-smeared over the picture, and no track comes of that; between 0.05 and 0.2 only the number of turns changes."""
+"""Least 1 − s·ẏ by which Newton's method divides. Chosen: an edge that keeps up with the readout within 10 % is smeared
+over the picture and gives no track; between 0.05 and 0.2 only the number of iterations changes."""
 
 TURNS = 8
-"""Steps of Newton's method. Derived: the error is squared at each; from 10 % four come to rounding, and a first guess
-on the far side of the release costs two or three more."""
+"""Maximum number of Newton iterations. Derived: the error is squared by each; from 10 % four reach rounding, and a
+first guess before the release costs two or three more."""
 
 SETTLED_S = 1e-10
-"""A step that ends the search, s. Derived: at 100 m/s it is 10 nm."""
+"""Step that ends the iterations, s. Derived: at 100 m/s it is 10 nm."""
 
 
 @compiled
 def read_by_rows(times, out, ratio, end, delay):
-    """Replace what a camera would see at once by what it sees row by row.
+    """Replace the positions recorded by an instantaneous shutter by those recorded row by row.
 
     Parameters
     ----------
     times : array (n_times,), s since release, increasing.
     out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m, which is replaced.
     ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite where it does not.
+    end : the `Point` at which growth ends; its time is infinite if it does not.
     delay : s, s/m, not 0.
     """
-    # What is still to be asked for must be as it was: later rows where the delay is positive, else earlier ones.
+    # Positions that are still needed must not be replaced yet: later ones at a positive delay, else earlier ones.
     count = times.size
     for step in range(count):
         i = step if delay > 0 else count - 1 - step

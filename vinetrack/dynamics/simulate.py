@@ -1,4 +1,4 @@
-"""The trajectory that a model gives for a trial."""
+"""Simulation of trials by a model."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ENDED, TOO_HARD = STATUS.index("ended"), STATUS.index("too hard")
 class Trajectory:
     """Motion of one trial since release; arrays have shape (n_times,), SI.
 
-    `observed_position_m` is the lead position as the camera reports it: another where the model has measurement
-    effects. `status`: `ended` (all film everted before the last time asked for), `stalled` for good before, `running`.
-    `end_time_s` is when growth ended (or last stalled), NaN if it did not; `slack_from_s` when the tail of a trial that
-    lets it (`tail_slack: free`) first went slack.
+    `observed_position_m` is the lead position as the camera reports it, which differs if the model has measurement
+    effects. `status`: `ended` (all film everted before the last requested time), `stalled` permanently before,
+    `running`. `end_time_s` is the time at which growth ended (or last stalled), NaN if it did not; `slack_from_s` the
+    time at which the tail of a trial with `tail_slack: free` first went slack.
     """
 
     time_s: Floats
@@ -49,7 +49,7 @@ class Trajectory:
 
 
 class SimulationError(UserError, RuntimeError):
-    """A trajectory could not be followed; the message names the trial."""
+    """A trajectory could not be integrated; the message names the trial."""
 
 
 def simulate(
@@ -60,14 +60,14 @@ def simulate(
     trace: Trace | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> Trajectory:
-    """Follow one trial from rest at release.
+    """Simulate one trial from rest at release.
 
     Parameters
     ----------
     model : the sum of effects with its values
     trial : the vine and its settings
     times_s : array, shape (n_times,), s since release, increasing; before 0 the vine is at rest
-    trace : measured gauge pressure, which then takes the place of the set pressure and of what happens in the chamber
+    trace : measured gauge pressure, which replaces the set pressure and the effects in the chamber
     relative_tolerance : local tolerance on the speed
 
     Returns
@@ -78,9 +78,9 @@ def simulate(
     Raises
     ------
     EffectError
-        If the trial lacks what an effect needs.
+        If the trial lacks a value that an effect needs.
     SimulationError
-        If the integration does not get through.
+        If the integration fails.
 
     >>> import vinetrack as vt
     >>> trial, _ = vt.tracks_from_frame(vt.example_tracks())[0]
@@ -100,7 +100,7 @@ def simulate_many(
     host: Model | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> list[Trajectory]:
-    """`simulate` for many trials in one call of the compiled kernel.
+    """Simulate many trials in one call of the compiled kernel, see `simulate`.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def simulate_many(
 
 
 def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float]) -> list[Trajectory]:
-    """Read what a batch has answered.
+    """The trajectories of a batch that was run.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
     Returns
     -------
     list of Trajectory
-        One for each trial.
+        One per trial.
     """
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
@@ -143,7 +143,7 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
 
 
 def check_completed(ends: Floats, names: Sequence[str]) -> None:
-    """Refuse motions that the integrator did not get through.
+    """Raise an error for a trial that the integrator could not complete.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def prepare(
     Raises
     ------
     EffectError
-        If a trial lacks what an effect needs, or the host does not hold the model.
+        If a trial lacks a value that an effect needs, or the host does not contain the model.
     """
     check_needs(model, *trials)
     inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
@@ -217,7 +217,7 @@ def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
 
 
 def _trajectory(r: float, times_s: Floats, motion: Floats, observed_m: Floats, end: Sequence[float]) -> Trajectory:
-    """One trial of a batch; `motion` has position, velocity and acceleration of the leading edge in its rows."""
+    """One trial of a batch; the rows of `motion` are position, velocity and acceleration of the leading edge."""
     return Trajectory(
         time_s=times_s,
         lead_position_m=motion[0],

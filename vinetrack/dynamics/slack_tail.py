@@ -1,9 +1,9 @@
-"""A tail that cannot push: what happens while it is slack, for trials whose `tail_slack` is `free`.
+"""Motion with a slack tail, which cannot push, for trials with `tail_slack: free`.
 
-The payload then falls free, by the forces on the tail alone; the tip, which has no mass to speak of, grows as fast as
-its own forces balance, Σ tip forces = 0 at the tail speed r·ẏ of the film that passes it. The tail is taut again when
-the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests there: its push on the
-tip is left out, so that growth is too slow from then on.
+The payload then falls freely, under the forces on the tail alone; the tip, whose mass is negligible, grows at the speed
+at which its own forces balance, Σ tip forces = 0 at the tail speed r·ẏ of the film that passes it. The tail is taut
+again when the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests there: its
+push on the tip is neglected, so that growth is too slow from then on.
 
 The method is that of Dormand & Prince with its continuous extension: E. Hairer, S. P. Nørsett and G. Wanner, Solving
 Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation (6.12).
@@ -16,11 +16,11 @@ from vinetrack.dynamics.radau import quintic
 from vinetrack.effects import TrialInputs
 
 MOST_STEPS = 20_000
-"""Steps before a slack phase is given up, chosen as in `vinetrack.dynamics.integrator`; at half and at twice only what
-a hopeless one costs changes."""
+"""Maximum number of steps of a slack phase, chosen as in `vinetrack.dynamics.integrator`; half and twice only change
+the time that a failing one takes."""
 
 FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")
-"""Places in the inputs of a trial: derived from the order of the fields."""
+"""Indices in the inputs of a trial: derived from the order of the fields."""
 
 # Source: Dormand & Prince, as below.
 NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
@@ -42,7 +42,7 @@ DENSE_WEIGHTS = (
 
 
 class SlackState(NamedTuple):
-    """A vine with a slack tail: position and speed of the tail, position of the tip, pressure of the chamber, SI."""
+    """State with a slack tail: position and speed of the tail, position of the tip, chamber pressure, SI."""
 
     x: float
     v: float
@@ -52,7 +52,7 @@ class SlackState(NamedTuple):
 
 @compiled
 def slack_at_rest(equations, trial, time, x, chamber):
-    """Whether the tail of a vine at rest would have to push.
+    """Whether the tail of a vine at rest would be under compression.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def slack_fraction(equations, trial, h, start, end):
 
 @compiled
 def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
-    """Tail speed of the film at a tip with nothing to pull: where its forces balance, by the Illinois rule; x = r·y."""
+    """Tail speed r·ẏ at a tip without tension, at which its forces balance, by the Illinois method; x = r·y."""
     f_low, _r = equations.tip_tension(time, x, 0.0, chamber, not moving, trial)
     if f_low <= 0:
         return 0.0
@@ -143,7 +143,7 @@ def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
 
 @compiled
 def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
-    """Rates of a `SlackState` into `rates`, shape (4,); returns the tail speed of the film at the tip, m/s."""
+    """Write the rates of a `SlackState` into `rates`, shape (4,); return the tail speed of the film at the tip, m/s."""
     r = trial.inputs[RATIO]
     u = _free_tip_speed(equations, trial, time, r * s.y, s.chamber, tip_speed, moving)
     _tension, chamber_rate = equations.tip_tension(time, r * s.y, u, s.chamber, False, trial)
@@ -169,7 +169,7 @@ def _stage_state(s, h, weights, k, n):
 
 @compiled
 def _dormand_prince(equations, trial, time, s, h, tip_speed, k):
-    """One step: k (7, 4), its first row given, gets the others. Returns the end, its error and the tip's speed."""
+    """One step: k (7, 4), with its first row given, is completed. Returns the end, its error and the tip's speed."""
     moving = tip_speed > 0
     end = s
     u = tip_speed
@@ -238,7 +238,7 @@ def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, 
 
 @compiled
 def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
-    """From the moment the tail goes slack until it is taut again, growth ends or the last time is filled in.
+    """Integrate a slack phase until the tail is taut again, growth ends or the last time is reached.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
     Returns
     -------
     (status, row, point, tip_speed)
-        `status` TAUT, RUNNING (all filled in), ENDED or TOO_HARD; `tip_speed` is r·ẏ there, m/s.
+        `status` TAUT, RUNNING (all times filled), ENDED or TOO_HARD; `tip_speed` is r·ẏ there, m/s.
     """
     time, until = start.time, times[times.size - 1]
     r = trial.inputs[RATIO]
@@ -286,7 +286,7 @@ def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
 
 @compiled
 def _resting_on_tip(s, tip, tip_velocity):
-    """The state, with a payload that has come to the tip resting there."""
+    """The state with a payload that has reached the tip resting there."""
     if s.x > tip:
         return SlackState(tip, min(s.v, tip_velocity), s.y, s.chamber)
     return s

@@ -1,4 +1,4 @@
-"""Positions that are means over a stretch of time: what is reported at t is averaged from t − T/2 to t + T/2."""
+"""Positions averaged over time: the position reported at t is the mean from t − T/2 to t + T/2."""
 
 import math
 
@@ -6,13 +6,13 @@ from vinetrack.dynamics.between_frames import motion_at
 from vinetrack.dynamics.equations import compiled
 
 NODE, WEIGHT, MIDDLE_WEIGHT = math.sqrt(0.6), 5 / 18, 4 / 9
-"""Gauss and Legendre's three places in an interval, and their weights. Derived: exact for polynomials of degree 5, as
-the motion between two frames is."""
+"""Gauss–Legendre quadrature with three nodes, and its weights. Derived: exact for polynomials of degree 5, which the
+motion between two frames is."""
 
 
 @compiled
 def average_over(times, out, means, ratio, end, square):
-    """Replace what is seen at an instant by its mean over the time about it.
+    """Replace instantaneous positions by their means over the time around each.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def average_over(times, out, means, ratio, end, square):
     out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m, which is replaced.
     means : array (n_times,), overwritten.
     ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite where it does not.
+    end : the `Point` at which growth ends; its time is infinite if it does not.
     square : T², s², above 0.
     """
     half = 0.5 * math.sqrt(square)
@@ -31,7 +31,7 @@ def average_over(times, out, means, ratio, end, square):
             k -= 1
         area, at = 0.0, first
         while at < last:
-            # What lies before the first instant, and beyond the last, is one piece each.
+            # The intervals before the first time and after the last are one piece each.
             until = last
             if at < times[0]:
                 until = min(last, times[0])
@@ -50,7 +50,7 @@ def average_over(times, out, means, ratio, end, square):
 
 @compiled
 def _integral(times, out, ratio, end, k, low, high):
-    """Of the reported position, m s, over a piece of time in which the motion is one polynomial."""
+    """Integral of the reported position, m s, over an interval in which the motion is one polynomial."""
     middle, reach = 0.5 * (low + high), 0.5 * NODE * (high - low)
     total = 0.0
     for place in range(3):

@@ -1,4 +1,4 @@
-"""A trial as the effects see it: SI numbers that stay the same while it grows."""
+"""The inputs of effects that are constant for a trial, as SI numbers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vinetrack.experiment.schema import COLUMNS
 
 
 def trial_inputs(trial: Trial) -> TrialInputs:
-    """What the effects see of a trial.
+    """The inputs of effects for a trial.
 
     Parameters
     ----------
-    trial : the vine and its settings; of a body that moves as a whole what is blank counts as zero.
+    trial : the vine and its settings; for a body that moves as a whole, blanks count as zero.
 
     Returns
     -------
@@ -59,12 +59,12 @@ def trial_inputs(trial: Trial) -> TrialInputs:
 
 
 def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
-    """The same trials at other pressures; the gas in them weighs as much more.
+    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly.
 
     Parameters
     ----------
     inputs : rows of `TrialInputs`, shape (n_trials, n_fields), SI.
-    set_pressure_Pa, yield_pressure_Pa : shape (n_trials,); a yield pressure that is NaN leaves that of the row.
+    set_pressure_Pa, yield_pressure_Pa : shape (n_trials,); NaN keeps the yield pressure of the row.
 
     Returns
     -------
@@ -83,12 +83,12 @@ def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: F
 
 
 def _of_trial(column: str, trial: Trial) -> object:
-    """What a trial has in a column of the sheet, SI; NaN for a column that no sheet has."""
+    """Value of a trial in a column of the sheet, SI; NaN for a column that no sheet has."""
     return getattr(trial, COLUMNS[column].field, math.nan) if column in COLUMNS else math.nan
 
 
 def stated(column: str, trial: Trial) -> bool:
-    """Whether the sheet gives a trial a number other than zero in this column.
+    """Whether the sheet gives a trial a value other than zero in this column.
 
     Parameters
     ----------
@@ -98,14 +98,14 @@ def stated(column: str, trial: Trial) -> bool:
     Returns
     -------
     bool
-        True also where the column holds something other than a number.
+        True also if the column holds something other than a number.
     """
     value = _of_trial(column, trial)
     return not isinstance(value, float) or (math.isfinite(value) and value != 0)
 
 
 def check_needs(model: Model, *trials: Trial) -> None:
-    """Refuse trials that lack what an effect of the model needs.
+    """Raise an error for a trial without a value that an effect of the model needs.
 
     Parameters
     ----------

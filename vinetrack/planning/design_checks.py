@@ -147,7 +147,7 @@ def _rules(prediction: VinePrediction) -> Iterator[str]:
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     for sentence in audit(inputs.model, [motion]).warnings:
         words = sentence.partition(": ")[2].rstrip(".")
-        if not words.startswith("the tail would have to push"):
+        if not words.startswith("the model predicts compression in the tail"):
             yield words
 
 
