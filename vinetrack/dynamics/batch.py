@@ -61,10 +61,11 @@ class Batch:
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
         """Integrate every trial.
 
-        Parameters ---------- relative_tolerance : of the integrator, relative to the speed that a motion reaches.
-        threads : number of threads, by default one for every 64 trials and at most the number of cores: the kernel
-        releases
-            the interpreter's lock.
+        Parameters
+        ----------
+        relative_tolerance : of the integrator, relative to the speed that a motion reaches.
+        threads : number of threads, by default one for every 64 trials and at most the number of cores, as the kernel
+            releases the interpreter's lock.
 
         Returns
         -------

@@ -69,8 +69,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     times : array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it
         stays at `stop`, with zero speed and acceleration.
     breakpoints : array, increasing, padded with infinity: values of x at which the slope of a force changes abruptly,
-    such as
-        where the film's mass reaches its floor, m. A step ends at each, since no step is accurate across it.
+        such as where the film's mass reaches its floor, m. A step ends at each, since no step is accurate across it.
     stop : tail travel at the end of growth, m; infinite for a body that moves as a whole.
     rtol : local tolerance on the speed, relative.
     out : array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
