@@ -1,6 +1,6 @@
-"""Detection power of a campaign: the probability of finding each effect against its size, as a map.
+"""Detection power of a campaign: the probability of detecting each effect against its size, as a map.
 
-One row per effect; columns are sizes relative to the largest plausible one. The sizes found with 50 and 90 % are listed
+One row per effect; columns are sizes relative to the largest plausible one. The sizes of 50 and 90 % power are listed
 at the end of each row in the unit of the effect.
 """
 
@@ -33,7 +33,7 @@ _ROW_IN, _WIDTH_IN = 0.31, 9.6
 
 
 def draw_power(power: Power) -> Figure:
-    """Draw the probability with which each effect is found, against its size.
+    """Draw the power to detect each effect against its size.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def draw_power(power: Power) -> Figure:
 
     entries = sorted(power.effects, key=_order)
     if not entries or power.wary:
-        return blank(f"What these trials could have seen was not computed: {power.wary or 'no candidate acts here'}.")
+        return blank(f"Detectable sizes were not computed: {power.wary or 'no candidate acts here'}.")
     parts = np.geomspace(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS)
     probabilities = np.array(
         [
@@ -65,7 +65,7 @@ def draw_power(power: Power) -> Figure:
         _mark_rows(ax, entries)
         _list_sizes(sizes, entries)
         bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
-        bar.set_label("probability of finding it (%)")
+        bar.set_label("power: probability of detection (%)")
         bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
         bar.outline.set_visible(False)
         trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
@@ -74,7 +74,7 @@ def draw_power(power: Power) -> Figure:
 
 
 def _order(entry: EffectPower) -> float:
-    """Sort key: effects found at the smallest fraction of their plausible size first."""
+    """Sort key: effects detected at the smallest fraction of their plausible size first."""
     return abs((entry.size_at(0.9) - entry.zero) / (entry.largest - entry.zero))
 
 
@@ -110,5 +110,5 @@ def _list_sizes(ax: Axes, entries: list[EffectPower]) -> None:
         for column, value in zip(_TEXT_COLUMN_X, (entry.size_at(0.5), entry.size_at(0.9), entry.largest), strict=True):
             beyond = column == _TEXT_COLUMN_X[-1] or abs(value - entry.zero) > abs(entry.largest - entry.zero)
             ax.text(column, row, size_text(entry, value), va="center", fontsize=9, color=MUTED if beyond else INK)
-    for column, words in zip(_TEXT_COLUMN_X, ("found\n50 %", "found\n90 %", "largest\nplausible"), strict=True):
+    for column, words in zip(_TEXT_COLUMN_X, ("50 %\npower", "90 %\npower", "largest\nplausible"), strict=True):
         ax.text(column, -0.65, words, va="bottom", fontsize=9, color=INK)

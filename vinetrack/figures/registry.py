@@ -89,7 +89,7 @@ _ALL = (
     RegisteredFigure("learned_force", "where", "The learned force", "The missing force, learned inside the fit"),
     RegisteredFigure("candidates", "candidates", "Candidates", "Candidates"),
     RegisteredFigure("cosines", "tied", "Tied candidates", "Candidates that these trials cannot tell apart"),
-    RegisteredFigure("power", "power", "What could be seen", "What these trials could have seen"),
+    RegisteredFigure("power", "power", "Detectable effects", "Detectable effects"),
     RegisteredFigure("drift", "drift", "Drift of parameters", "Parameters that change with a condition"),
     RegisteredFigure(
         "paper_fig4", "paper", "Fig. 4, position", "Fig. 4: the leading edge with the payload", "paper_motions.csv"

@@ -30,8 +30,8 @@ ABOUT_SIGMA = (
 
 
 ABOUT_POWER = (
-    "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Found there: at the "
-    "largest plausible size. Taken for: the other candidates with the highest score, at the size found in 90 %."
+    "By linear theory, with the noise and scatter of the fit, given all effects of the last model. Power there: at the "
+    "largest plausible size. Mistaken for: the other candidates with the highest score, at the size of 90 % power."
 )
 
 
