@@ -1,7 +1,7 @@
-"""What follows from the paper's own numbers, without any experiment.
+"""Rows of the table that follow from the paper's own numbers by arithmetic.
 
-Pressures and volumes by the gas law in absolute pressure, p-values from R² and N, B against R, the speeds that the
-printed B imply, what the weight does beside the gas, the injector, the fast vine's hoop stress, rounding.
+They cover pressures and volumes by the gas law in absolute pressure, p-values from R² and N, B against R, the speeds
+that the printed B imply, the work of the weight, the injector, the hoop stress of the fast vine, and rounding.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def area_m2(diameter_mm: float) -> float:
 
 
 def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> float:
-    """Volume of a whole vine over that of its chamber.
+    """Return the volume of a whole vine over that of its chamber.
 
     Parameters
     ----------
@@ -54,9 +54,9 @@ def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> fl
 
 
 def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
-    """Part of the gauge pressure left when the volume has grown by the fraction `change` and nothing refills it.
+    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`.
 
-    P_abs V^γ is kept, in absolute pressure.
+    P_abs V^γ is constant, with absolute pressure.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
 
 
 def p_value(R2: float, n: int) -> float:
-    """Two-sided p of a straight line's slope from its R² and the number of points.
+    """Return the two-sided p-value of the slope of a straight line from its R² and the number of points.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def p_value(R2: float, n: int) -> float:
 
 
 def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> float:
-    """Steady tail speed by Eq. (3) with the printed B and n.
+    """Return the steady tail speed by Eq. (3) with the printed B and n.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> fl
 
 
 def weight_over_gas(diameter_mm: float) -> float:
-    """Work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y.
+    """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def weight_over_gas(diameter_mm: float) -> float:
 
 
 def computed_rows() -> Iterator[PaperRow]:
-    """Every line of the table that needs no experiment and no simulation."""
+    """Yield every row of the table that needs no experiment and no simulation."""
     yield from _scale_rows()
     yield from _reservoir_rows()
     yield from _statistics_rows()
@@ -314,11 +314,11 @@ def _guess_rows() -> Iterator[PaperRow]:
 
 
 def _rounding_row() -> PaperRow:
-    # They look like rounded pounds per square inch: 14 kPa is 13.79, 2 psi.
+    # The printed pressures look like rounded pounds per square inch: 14 kPa is 2 psi, 13.79 kPa.
     pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
     exact = [round(kPa / psi_kPa) * psi_kPa for kPa in pressures_kPa]
-    off = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
-    worst = int(np.argmax(off))
+    errors = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
+    worst = int(np.argmax(errors))
     return PaperRow(
         row="pressure_rounding",
         where="throughout",
@@ -326,7 +326,7 @@ def _rounding_row() -> PaperRow:
         setting=f"{pressures_kPa[worst]} kPa for {exact[worst]:.2f}",
         unit="%",
         as_printed="whole kPa",
-        ours=100 * off[worst],
+        ours=100 * errors[worst],
         mark=COMPUTED,
         how="7, 14, 28, 34, 41, 48 and 62 kPa are 1, 2, 4, 5, 6, 7 and 9 psi to the kPa",
     )

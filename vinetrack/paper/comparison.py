@@ -1,4 +1,4 @@
-"""Trials of the paper's Figs. 4 and 5 held against Eq. (2) with the printed numbers, in the paper's own way."""
+"""Comparison of the trials of the paper's Figs. 4 and 5 with Eq. (2) and the printed numbers, by the paper's method."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigm
 
 
 class Rest(NamedTuple):
-    """When a trial was let go, on its track's clock, and where its edge was until then."""
+    """Release time of a trial, on the clock of its track, and resting position of its edge."""
 
     release_s: float
     origin_m: float
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
-    """Trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload.
+    """Find the trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
 
 
 def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
-    """Trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload.
+    """Find the trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload.
 
     Parameters
     ----------
@@ -89,10 +89,10 @@ def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float
 def mean_motions(
     conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """The mean of the trials of each pressure since release, columns `MEAN_COLUMNS`.
+    """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %.
 
-    Until the first of them has grown to 95 %. The release is that of the trial itself, from a fit in which its pressure
-    and B are its own: laid where one B for all fits best, a trial's release would take up what its speed is off.
+    The release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a
+    trial would absorb its deviation of speed.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def mean_motions(
 
     Returns
     -------
-    the table; empty where no trial can be laid over the others.
+    the table; empty where no trial can be aligned.
     """
     parts = []
     for pressure_kPa, trials in conditions.items():
@@ -140,7 +140,7 @@ def position_errors(
 ) -> pd.DataFrame:
     """How far trials lie from Eq. (2) with the printed B and n, their mean and each alone, columns `POSITION_COLUMNS`.
 
-    Since release, until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
+    From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def position_errors(
 
     Returns
     -------
-    a row a pressure.
+    one row for each pressure.
     """
     rows = []
     for pressure_kPa, trials in conditions.items():
@@ -167,7 +167,7 @@ def position_errors(
 def final_speeds(
     conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """Speed of the leading edge at the paper's 12 cm, means of trials, beside Eq. (2), columns `SPEED_COLUMNS`.
+    """Average the speed of the leading edge at the paper's 12 cm, and compute it by Eq. (2), columns `SPEED_COLUMNS`.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def final_speeds(
 
     Returns
     -------
-    a row a condition.
+    one row for each condition.
     """
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
@@ -200,7 +200,7 @@ def final_speeds(
 
 
 def eq2_speed_m_s(trial: Trial) -> float:
-    """Speed of the leading edge at 12 cm by Eq. (2), B in proportion to the wall; 0 where it does not get there.
+    """Return the speed of the leading edge at 12 cm by Eq. (2), B proportional to the wall; 0 where not reached.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def eq2_speed_m_s(trial: Trial) -> float:
 
 
 def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> pd.DataFrame:
-    """Eq. (2) along payloads, from the least of each pressure to the largest, in the columns of `final_speeds`.
+    """Compute Eq. (2) over the range of payloads of each pressure, in the columns of `final_speeds`.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> p
 
     Returns
     -------
-    a row a payload and pressure.
+    one row for each payload and pressure.
     """
     rows = []
     by_pressure: dict[float, list[Trial]] = {}

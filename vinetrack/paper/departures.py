@@ -1,9 +1,9 @@
-"""What the paper's assumptions leave out, simulated for its own trials: how far a motion would then lie from Eq. (2).
+"""Departures from the paper's assumptions, simulated for its own trials: differences of the motions from Eq. (2).
 
-A chamber that nothing refills, between slow (isothermal) and fast (adiabatic); a tail that cannot push; both. These are
-bounds for what such a departure would cause, with the printed B, n and P_y, and no explanation of what was measured:
-how fast the regulator refills is not printed, nor are the lengths of the vines, and a payload that has fallen as far as
-the tip rests there without pushing it.
+The departures are a chamber that is not refilled, from slow (isothermal) to fast (adiabatic), a tail that cannot carry
+compression, and both. They bound the effect of such a departure, with the printed B, n and P_y, and do not explain what
+was measured: neither the rate at which the regulator refills nor the lengths of the vines are printed, and a payload
+that has fallen to the tip rests there without pushing it.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.kinematics.conditions import lead_velocity_at
 
 WITHIN = 0.95
-"""Of the length, up to which positions are compared: a motion that stalls would else be averaged for ever. Chosen: the
-last 5 % is where a motion that runs out of pressure creeps. At 0.9 differences are a little smaller, at 1 they may not
-end."""
+"""Fraction of the length up to which positions are compared, since a motion that stalls would be averaged without end.
+Chosen: a motion that runs out of pressure creeps in the last 5 %. At 0.9 differences are a little smaller, at 1 they
+may not end."""
 
 LASTS_S = 60.0
-"""For as long motions are followed; the slowest, at 7 kPa, would take 7 s by Eq. (2). Chosen: eight times that; twice
-changes nothing, half nothing either."""
+"""Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2). Chosen: eight times that; half and
+twice change nothing."""
 
 
 @dataclass(frozen=True)
 class Departure:
-    """One thing left out of Eq. (2): `gamma` of a chamber that nothing refills (None: kept full), and a slack tail."""
+    """A departure from Eq. (2): `gamma` of a chamber that is not refilled (None: refilled), and a slack tail."""
 
     name: str
     words: str
@@ -42,7 +42,7 @@ class Departure:
     slack: bool = False
 
     def model(self, B: float) -> Model:
-        """Make Eq. (2) with the printed n, and this departure beside it.
+        """Return Eq. (2) with the printed n and this departure.
 
         Parameters
         ----------
@@ -58,7 +58,7 @@ class Departure:
         return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
 
     def trial(self, trial: Trial) -> Trial:
-        """Return the trial, with a tail that may go slack where the departure lets it.
+        """Return the trial, whose tail may go slack if the departure says so.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
 def paper_trial(
     diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
 ) -> Trial:
-    """A trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa.
+    """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa.
 
     Parameters
     ----------
@@ -120,21 +120,21 @@ def paper_trial(
 
 
 def position_trials() -> list[Trial]:
-    """The paper's Fig. 4: the 24 mm × 200 µm vine with its payload; the length is that of its longest vine."""
+    """Return the trials of the paper's Fig. 4: the 24 mm × 200 µm vine, as long as the longest, with its payload."""
     size = (published.DIAMETER_MM[4], published.THICKNESS_UM[4], published.LONGEST_VINE_MM)
     return [paper_trial(*size, pressure_kPa, published.PAYLOAD_G) for pressure_kPa in published.POSITION_RMS_CM]
 
 
 def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
-    """How far each departure lies from Eq. (2), columns `DEPARTURE_COLUMNS`.
+    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`.
 
     Parameters
     ----------
-    payloads_g : payloads of Fig. 5, over which speeds are put together.
+    payloads_g : payloads of Fig. 5, over which the root mean square of speeds is taken.
 
     Returns
     -------
-    a row a figure, pressure and departure.
+    one row for each figure, pressure and departure.
     """
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
@@ -152,7 +152,7 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 
 
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
-    """The motion at the camera's frames, until it ends or for `LASTS_S`.
+    """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
 
 
 def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
-    """Root mean square of the two positions' difference until Eq. (2) has grown to 95 %; both start at release.
+    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
 
 
 def _speed_trial(pressure_kPa: float, payload_g: float) -> tuple[Trial, float]:
-    """A trial of the paper's Fig. 5 and its B, in proportion to the wall: it is not printed."""
+    """A trial of the paper's Fig. 5 and its B, which is not printed and taken as proportional to the wall."""
     wall_um = published.FINAL_SPEED_THICKNESS_UM
     B = published.DAMPING_B[4] * wall_um / published.THICKNESS_UM[4]
     return paper_trial(published.DIAMETER_MM[4], wall_um, published.LONGEST_VINE_MM, pressure_kPa, payload_g), B
@@ -203,7 +203,7 @@ def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departur
 
 
 def motion_table(instants: int = 200) -> pd.DataFrame:
-    """Motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`, thinned to so many instants.
+    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def motion_table(instants: int = 200) -> pd.DataFrame:
 
 
 def pressure_table(instants: int = 60) -> pd.DataFrame:
-    """Gauge pressure left along the growth of Fig. 4's vine: `pressure_kPa, departure, lead_position_m, gauge_left`.
+    """Compute the remaining gauge pressure along the growth of Fig. 4's vine.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def pressure_table(instants: int = 60) -> pd.DataFrame:
 
     Returns
     -------
-    the table; `gauge_left` is a fraction.
+    columns `pressure_kPa, departure, lead_position_m, gauge_left`; the last is a fraction.
     """
     from vinetrack.paper.arithmetic import area_m2, gauge_left
 

@@ -1,4 +1,4 @@
-"""Lines of the table about what was set: the vines of Table I and how they were made, and how trials were run."""
+"""Rows of the table about the protocol: the vines of Table I, their fabrication, and how trials were run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vinetrack.paper.rows import NOT_CHECKABLE, SIMULATED, PaperRow
 
 
 def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> Iterator[PaperRow]:
-    """What was set in an experiment beside what the paper set.
+    """Compare the protocol of an experiment with that of the paper.
 
     Parameters
     ----------
@@ -118,13 +118,13 @@ def _capture_row(trials: Sequence[Trial], mark: str, source: str) -> PaperRow:
 
 
 def _window_rows(names: set[str], steady: pd.DataFrame, mark: str) -> Iterator[PaperRow]:
-    """What the published rule for a steady window accepts, beside the gated one, in trials without payload."""
-    of_scale = steady[steady["trial"].isin(names)]
-    literal, gated = of_scale[of_scale["rule"] == "paper"], of_scale[of_scale["rule"] == "gated"]
+    """What the published rule for a steady window accepts in trials without payload, and the gated rule."""
+    windows = steady[steady["trial"].isin(names)]
+    literal, gated = windows[windows["rule"] == "paper"], windows[windows["rule"] == "gated"]
     accepted = literal[literal["accepted"]]
     drift = accepted["drift"].abs()
-    line = partial(PaperRow, where="Section III-E", setting="trials of R = 1…4 without payload", mark=mark)
-    yield line(
+    row_of = partial(PaperRow, where="Section III-E", setting="trials of R = 1…4 without payload", mark=mark)
+    yield row_of(
         row="window_fewest_points",
         quantity="fewest points in a steady window",
         as_printed=f"at least {published.STEADY_FEWEST_POINTS}",
@@ -132,7 +132,7 @@ def _window_rows(names: set[str], steady: pd.DataFrame, mark: str) -> Iterator[P
         how=f"the published rule to the letter, N = {len(accepted)} windows",
         beside="noise alone makes three velocities in a row agree to 3 % somewhere",
     )
-    yield line(
+    yield row_of(
         row="window_largest_cv",
         quantity="largest coefficient of variation of velocity in a steady window",
         unit="%",
@@ -144,7 +144,7 @@ def _window_rows(names: set[str], steady: pd.DataFrame, mark: str) -> Iterator[P
         if len(drift)
         else "",
     )
-    yield line(
+    yield row_of(
         row="window_share_accepted",
         quantity="trials in which the published rule finds a steady window",
         unit="%",

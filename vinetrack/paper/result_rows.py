@@ -1,7 +1,4 @@
-"""Lines of the table that come from an experiment's results: the law, model against measurement, the fast vine.
-
-Lines about size set B, steady speed and efficiency against scale, wall and diameter.
-"""
+"""Rows of the table that come from the results of an experiment: damping law, positions, speeds, dependence on size."""
 
 from __future__ import annotations
 
@@ -24,11 +21,11 @@ nan = math.nan
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentResults:
-    """What an experiment found: tables and files of its results folder, by the names they have there.
+    """Results of an experiment: tables and files of its results folder, by their names there.
 
-    `mark` is `SIMULATED` or `MEASURED`. `positions` has a row a pressure of the paper's Fig. 4 (`pressure_kPa,
-    n_trials, rms_mean_m, rms_single_m`), `speeds` one a condition of Fig. 5 (`pressure_kPa, payload_g,
-    final_lead_velocity_m_s, eq2_lead_velocity_m_s`); `departures` is `departures.departure_table`.
+    `mark` is `SIMULATED` or `MEASURED`. `positions` has a row for each pressure of the paper's Fig. 4 (`pressure_kPa,
+    n_trials, rms_mean_m, rms_single_m`), `speeds` one for each condition of Fig. 5 (`pressure_kPa, payload_g,
+    final_lead_velocity_m_s, eq2_lead_velocity_m_s`); `departures` is that of `departures.departure_table`.
     """
 
     mark: str
@@ -42,7 +39,7 @@ class ExperimentResults:
 
 
 def result_rows(results: ExperimentResults) -> Iterator[PaperRow]:
-    """Every line that an experiment answers; where it has nothing to say, ours is blank.
+    """Yield every row that an experiment can answer; where it does not, ours is blank.
 
     Parameters
     ----------
@@ -204,11 +201,8 @@ def _fast_row(results: ExperimentResults) -> PaperRow:
     )
 
 
-nan = math.nan
-
-
 def size_rows(mark: str, damping: Mapping[str, Any], scaling: Mapping[str, Any]) -> Iterator[PaperRow]:
-    """Lines from `damping.json` and `scaling.json`; where they have nothing to say, ours is blank.
+    """Yield the rows from `damping.json` and `scaling.json`; where these do not answer, ours is blank.
 
     Parameters
     ----------

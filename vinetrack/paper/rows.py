@@ -1,4 +1,4 @@
-"""One line of the table that sets published numbers beside ours, and what its marks mean."""
+"""One row of the table that compares published numbers with ours, and the meaning of its marks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PAPER_COLUMNS = (
 )
 
 PREFERRED = "both_axes"
-"""The fit of the damping law whose numbers stand for ours."""
+"""The fit of the damping law that supplies our numbers."""
 
 nan = math.nan
 
@@ -53,9 +53,9 @@ nan = math.nan
 class PaperRow:
     """A published number or statement and ours, in `unit`.
 
-    `row` names it for programs, `where` tells where it is printed, `as_printed` how; `published` is NaN where that is
-    no number. `low` and `high` bound ours with 95 %. `how` says where ours comes from; `beside`, what a departure from
-    the paper's own assumptions would do to it.
+    `row` identifies it in programs; `where` and `as_printed` say where and how it is printed; `published` is NaN where
+    that is not a number. `low` and `high` are the 95 % interval of ours. `how` gives the origin of ours; `beside`, the
+    effect of a departure from the paper's assumptions.
     """
 
     row: str
@@ -74,20 +74,20 @@ class PaperRow:
 
 
 def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
-    """Rows as `paper.csv` holds them, columns `PAPER_COLUMNS`.
+    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`.
 
     Parameters
     ----------
-    rows : of the table, each name once.
+    rows : of the table, with unique names.
 
     Returns
     -------
-    a row each.
+    DataFrame, one row each.
 
     Raises
     ------
     ValueError
-        If a row's name stands twice, or its mark is none.
+        If a name is repeated or a mark is unknown.
     """
     entries = []
     for row in map(_as_answered, rows):
@@ -105,14 +105,14 @@ def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
 
 
 def _as_answered(row: PaperRow) -> PaperRow:
-    """A row that trials should answer and do not says that, in place of how they would have."""
+    """The row; where trials should have given a number and did not, `how` says so."""
     if row.mark not in (SIMULATED, MEASURED) or math.isfinite(row.ours):
         return row
     return replace(row, how=UNANSWERED)
 
 
 def number(value: Any) -> float:
-    """Return a number as JSON gives it back: NaN where it is null.
+    """Return a number read from JSON, NaN for null.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def number(value: Any) -> float:
 
 
 def bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
-    """Return an interval as JSON gives it back: NaN where it is null.
+    """Return an interval read from JSON, NaN for null.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Lines of the table that Eq. (2) gives with the paper's own numbers, by simulation and without any experiment.
+"""Rows of the table that follow from Eq. (2) with the paper's own numbers, by simulation and without an experiment.
 
-Behind them: what Eq. (2) gives for the fast vine and for air drag, and what the published rule finds in its motions.
+They cover the fast vine, air drag, and the published rule applied to simulated motions.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, PaperRow
 from vinetrack.planning.scaling_priors import damping_prior
 
 FAST_AT = (0.90, 0.95, 0.98, 0.99)
-"""Fractions of the length at which the fast vine's speed is stated. Chosen near the end, where it is fastest."""
+"""Fractions of the length at which the speed of the fast vine is evaluated. Chosen near the end, where it is
+fastest."""
 
 DRAG_AT = (0.50, 0.95, 0.99)
-"""Fractions of the length at which drag is stated. Chosen: half-way and near the end, where it is largest."""
+"""Fractions of the length at which drag is evaluated. Chosen: half-way, and near the end, where it is largest."""
 
 
 def theory_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
-    """The fast vine, air drag, and the published rule on noise-free motions.
+    """Compute the rows on the fast vine, on air drag, and on the published rule for noise-free motions.
 
     Parameters
     ----------
-    trials : of the experiment; their pressures and lengths, at the printed scales and without payload, are those at
-        which the rule is tried.
+    trials : of the experiment; the rule is applied at the pressures and lengths of those at the printed scales without
+        payload.
 
     Yields
     ------
@@ -87,7 +88,7 @@ def _drag_rows() -> Iterator[PaperRow]:
 
 
 def _rule_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
-    """What the published rule makes of motions without noise: its own bias, and that of a chamber that sags."""
+    """Bias of the published rule in noise-free motions, with a full and with a depleting chamber."""
     chosen: dict[str, Trial] = {}
     for trial in trials:
         scale = published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m)
@@ -117,7 +118,7 @@ def _rule_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
 
 
 def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -> str:
-    """What departures from Eq. (2) would cause, in a sentence: positions in cm, speeds in m/s.
+    """Describe the effect of departures from Eq. (2) in a sentence: positions in cm, speeds in m/s.
 
     Parameters
     ----------
@@ -144,11 +145,11 @@ def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -
 
 
 SLOWEST_S = 10.0
-"""For as long the steady motions are followed; the slowest takes 2.3 s. Chosen: four times that."""
+"""Duration of the simulated motions, s. Chosen: four times that of the slowest, 2.3 s."""
 
 
 def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
-    """Speed of the fast vine's leading edge at fractions of its length by Eq. (2) with a guessed B, m/s.
+    """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior.
 
     Parameters
     ----------
@@ -166,10 +167,10 @@ def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
 
 
 def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, float]]:
-    """The paper's example of air drag: fraction of the length, drag over drive by mechanics, and as it is printed.
+    """Compute the ratio of drag to drive in the paper's example of air drag, by mechanics and as printed.
 
-    By mechanics the air meets the head at ẏ and the pulley halves it: ¼ρ A C_D ẏ² over ½PA; printed is ½ρ A C_D ẋ².
-    Speeds by Eq. (2) with a guessed B, without drag.
+    By mechanics the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is
+    ½ρ A C_D ẋ². Speeds are those of Eq. (2) without drag, with B from the scaling prior.
 
     Parameters
     ----------
@@ -190,12 +191,12 @@ def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, floa
 
 
 def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[float, dict[int, float]]:
-    """What the published rule finds in noise-free motions of these trials, made with the printed B and n.
+    """Apply the published rule to noise-free motions of these trials, simulated with the printed B and n.
 
     Parameters
     ----------
-    gamma : of a chamber that nothing refills; None for one that is kept full.
-    trials : one a vine and pressure, without payload; those of other sizes than the printed scales are passed over.
+    gamma : of a chamber that is not refilled; None for constant pressure.
+    trials : one for each vine and pressure, without payload; sizes other than the printed scales are ignored.
 
     Returns
     -------
@@ -218,7 +219,7 @@ def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[fl
 
 
 def _point(scale: int, trial: Trial, moved: Trajectory) -> dict[str, object]:
-    """A row of the damping fit that only the published rule has a say in."""
+    """A row of the damping fit that only the published rule uses."""
     unknown = dict.fromkeys(("x_ss_m_s", "x_ss_sigma_m_s", "force_N", "force_sigma_N"), math.nan)
     return {
         "trial": trial.name,
