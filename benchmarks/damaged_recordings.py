@@ -27,7 +27,7 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
-from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording
 
@@ -45,7 +45,7 @@ def filmed(folder: Path) -> tuple[Trial, Any]:
     (folder / "trials.csv").write_text(SHEET)
     (folder / "experiment.yaml").write_text(SETTINGS)
     values = {"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}}
-    nature = Nature(values=values, damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411)
+    nature = GroundTruth(values=values, damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411)
     grown = grow(read_experiment(folder, strict=True).trials, nature)[0]
     return grown.stated, film(grown, Filming(camera=Camera(m_per_px=2.4e-4)), grown.stated.video, seed=41)
 

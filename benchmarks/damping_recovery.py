@@ -31,7 +31,7 @@ from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import fit_laws, mark_half_steady
 from vinetrack.kinematics.summary import summarise_trial
-from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
 from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_values, paper_damping
 
 NATURES = {
@@ -49,7 +49,7 @@ def measure(seed: int, nature: str) -> list[dict[str, object]]:
     values = damping_values(trials)
     if nature == "reservoir":
         values |= {"reservoir_depletion.gamma": 1.4}
-    grown = grow(trials, Nature(values=values, seed=seed, **NATURES[nature]))
+    grown = grow(trials, GroundTruth(values=values, seed=seed, **NATURES[nature]))
     rows = []
     if nature == "reservoir":
         blind = [replace(trial, track=replace(trial.track, pressure_Pa=None)) for trial in grown]

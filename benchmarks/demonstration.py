@@ -30,7 +30,7 @@ from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
 from vinetrack.laboratory.render import Truth
-from vinetrack.laboratory.tracks import VirtualTrial, grow, read_nature
+from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth
 from vinetrack.video.measure import Measurement, measure_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "demo"
@@ -57,7 +57,7 @@ def film_demonstration(folder: Path, processes: int) -> tuple[Experiment, dict[s
     for name in ("trials.csv", "experiment.yaml"):
         write_text(folder / name, (SHIPPED / name).read_text(encoding="utf-8"))
     experiment = read_experiment(folder, strict=True)
-    nature = read_nature(DEMO)
+    nature = read_ground_truth(DEMO)
     filming = make_filming(yaml.safe_load(DEMO.read_text(encoding="utf-8"))["filming"])
     picture_target(filming, folder / experiment.settings.calibration.image, nature.seed)
     grown = grow(experiment.trials, nature)

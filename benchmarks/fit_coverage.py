@@ -33,7 +33,7 @@ from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 NOISE_M = 1e-4
@@ -49,11 +49,11 @@ def sheet() -> list[Trial]:
     return [replace(trial, chamber_m3=CHAMBER_L / 1e3) for trial in with_names(trials)]
 
 
-def draw_nature(seed: int) -> tuple[Nature, float, bool]:
+def draw_nature(seed: int) -> tuple[GroundTruth, float, bool]:
     """What is true in one campaign, the correlation of its noise, and whether that has heavy tails."""
     draw = np.random.default_rng([seed, 77])
     gamma = float(draw.uniform(1.05, 1.35))
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, EFFECT),
         values={**damping_values(sheet()), f"{EFFECT}.gamma": gamma},
         damping_scatter=float(draw.uniform(0, 0.04)),
@@ -92,7 +92,7 @@ def measure_few(seed: int) -> dict[str, object]:
     """Two to seven trials of one vine: numbers of the fit held against their truth."""
     draw, count = np.random.default_rng([seed, 79]), 2 + seed % 6
     trials = list(with_names([isometric_vine(4).trial(f"{P:g}kPa", P) for P in FEW_PRESSURES_KPA[:count]]))
-    nature = Nature(
+    nature = GroundTruth(
         effects=BASE,
         values=damping_values(trials),
         damping_scatter=float(draw.uniform(0, 0.04)),

@@ -18,7 +18,7 @@ import numpy as np
 import vinetrack as vt
 from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Track, Trial
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values, paper_damping
 
 SIZES = (12, 24, 48, 100, 200)
@@ -29,7 +29,7 @@ def measured(count: int, seed: int) -> list[tuple[Trial, Track]]:
     """`count` trials of the protocol, spread over vines and pressures."""
     trials = [replace(trial, chamber_m3=CHAMBER_L / 1e3) for trial in paper_damping(replicates=5)]
     take = np.linspace(0, len(trials) - 1, count).astype(int)
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, EFFECT),
         values={**damping_values(trials), f"{EFFECT}.gamma": 1.2},
         yield_error_kPa=0.2,

@@ -27,7 +27,7 @@ import numpy as np
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
-from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.tracks import GroundTruth, grow
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESSURES_KPA = (30, 36, 42)
@@ -44,7 +44,7 @@ def filmed(folder: Path) -> None:
     (folder / "trials.csv").write_text(SHEET + "".join(rows))
     (folder / "experiment.yaml").write_text(SETTINGS)
     values = {"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}}
-    nature = Nature(values=values, release_frames=(14, 20), seed=420)
+    nature = GroundTruth(values=values, release_frames=(14, 20), seed=420)
     for i, grown in enumerate(grow(read_experiment(folder, strict=True).trials, nature)):
         film(grown, Filming(camera=Camera(m_per_px=2.4e-4)), grown.stated.video, seed=50 + i)
 

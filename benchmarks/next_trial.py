@@ -34,7 +34,7 @@ from vinetrack.core.terminal import table
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import Vine, campaign
 from vinetrack.planning.scaling_priors import damping_prior
 
@@ -82,7 +82,7 @@ def grown(trials: Sequence[Trial], tie: Tie, seed: int) -> list[tuple[Trial, Tra
         else GUESSED_WRONG * damping_prior(t.diameter_m, t.thickness_m)
         for t in trials
     }
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, tie.effect),
         values={"eversion_damping.B": damping, "eversion_damping.n": EXPONENT, **tie.size},
         noise_correlation=0.3,

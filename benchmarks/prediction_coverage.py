@@ -27,7 +27,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 from vinetrack.planning.fit_inputs import numbers_of
 from vinetrack.planning.input_sources import predictive_inputs
@@ -51,7 +51,7 @@ def unseen() -> dict[str, Trial]:
     return dict(zip(found, with_names(list(found.values())), strict=True))
 
 
-def made(trial: Trial, nature: Nature, yield_Pa: float, draw: np.random.Generator) -> float:
+def made(trial: Trial, nature: GroundTruth, yield_Pa: float, draw: np.random.Generator) -> float:
     """Final speed of such a trial when it is made: the edge's at 0.95, a payload's as it leaves."""
     model = nature.model()
     values = dict(zip(model.parameter_names, model.parameters_for(sheet()[0].vine).tolist(), strict=True))
@@ -66,7 +66,7 @@ def made(trial: Trial, nature: Nature, yield_Pa: float, draw: np.random.Generato
 
 def measure(seed: int) -> list[dict[str, object]]:
     """One campaign fitted, and what was predicted beside what was made."""
-    nature = Nature(
+    nature = GroundTruth(
         values=damping_values(sheet()),
         damping_scatter=DAMPING_SCATTER,
         pressure_scatter=PRESSURE_SCATTER,

@@ -25,7 +25,7 @@ from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film, picture_target
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.targets import Target
-from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.tracks import GroundTruth, grow
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"
 SHARED = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
@@ -35,7 +35,7 @@ BOARD = (
     "calibration: {kind: charuco, image: calibration/board.png, squares: [14, 5], square_mm: 15, marker_mm: 11, "
     "dictionary: DICT_4X4_100}\n"
 )
-NATURE = Nature(
+NATURE = GroundTruth(
     values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
     damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
 )  # fmt: skip

@@ -14,7 +14,7 @@ from hidden.folder import write_folder
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.camera import Camera
-from vinetrack.laboratory.filming import FINE_STEPS, Filming, before_the_camera, picture_target, scene_of
+from vinetrack.laboratory.filming import FINE_STEPS, Filming, picture_target, recording_experiment, scene_of
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.targets import Target
 
@@ -40,7 +40,7 @@ def film_campaign(campaign: Hidden, folder: Path, processes: int) -> Experiment:
     filming = filming_of(campaign)
     write_folder(campaign, folder / "as_tracks")
     names = [trial.name for trial, _ in campaign.pairs]
-    experiment = before_the_camera(read_experiment(folder / "as_tracks"), names, filming, folder / "filmed")
+    experiment = recording_experiment(read_experiment(folder / "as_tracks"), names, filming, folder / "filmed")
     assert experiment.settings.calibration is not None
     picture_target(filming, experiment.folder / experiment.settings.calibration.image, campaign.seed)
     (experiment.folder / "videos").mkdir(exist_ok=True)

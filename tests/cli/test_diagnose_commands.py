@@ -13,7 +13,7 @@ from hidden_truth import sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.laboratory.tracks import BASE, Nature, grow, write_experiment
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow, write_experiment
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 LADDER = (
@@ -30,7 +30,7 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hidden") / "campaign"
     trials = sheet()[6:]  # one vine at three pressures, twice each
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, "reservoir_depletion"),
         values={**damping_values(trials), "reservoir_depletion.gamma": 1.2},
         damping_scatter=0.02,

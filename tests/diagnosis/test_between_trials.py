@@ -22,7 +22,7 @@ from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
 from vinetrack.inference.position_errors import smooth_errors
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 B = "eversion_damping.B"
@@ -39,7 +39,7 @@ def made(trials: Sequence[Trial], order: Sequence[int], factor: Change, seed: in
         uses[trial.vine] = seen + 1
         change = factor(trial, seen)
         held = {**values, B: {vine: change * size for vine, size in values[B].items()}}
-        nature = Nature(
+        nature = GroundTruth(
             effects=BASE, values=held, seed=1000 * seed + place,
             **{"damping_scatter": 0.005, "pressure_scatter": 0.003, "yield_error_kPa": 0.0, **more},
         )  # fmt: skip
@@ -211,7 +211,7 @@ def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
     n = "eversion_damping.n"
     pairs: Pairs = []
     for vine, exponent in zip(dict.fromkeys(trial.vine for trial in trials), (0.40, 0.46), strict=True):
-        nature = Nature(effects=BASE, values={**values, n: exponent}, seed=4, damping_scatter=0.01)
+        nature = GroundTruth(effects=BASE, values={**values, n: exponent}, seed=4, damping_scatter=0.01)
         pairs += pairs_of(grow([trial for trial in trials if trial.vine == vine], nature))
     result = diagnosed(pairs, PHYSICS)
     assert (result.verdict, result.answer_set) == (ARTEFACT, ("n_by_vine",))
@@ -221,7 +221,7 @@ def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
 
 
 def test_depletion_keeps_its_name_in_random_order(trials: list[Trial]) -> None:
-    nature = Nature(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=5)
+    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=5)
     pairs = pairs_of(grow(trials, nature))
     order = shuffled(len(trials), 5)
     ordered = [(replace(trial, order=1.0 + order[i]), track) for i, (trial, track) in enumerate(pairs)]

@@ -6,13 +6,13 @@ import numpy as np
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 
 def campaign(seed: int) -> Pairs:
     trials = sheet()
-    nature = Nature(effects=BASE, values=damping_values(trials), damping_scatter=0.02, noise_m=5e-5, seed=seed)
+    nature = GroundTruth(effects=BASE, values=damping_values(trials), damping_scatter=0.02, noise_m=5e-5, seed=seed)
     return [(grown.stated, grown.track) for grown in grow(trials, nature)]
 
 

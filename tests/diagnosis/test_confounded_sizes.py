@@ -21,7 +21,7 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_LATER_ROUNDS, Mis
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 from vinetrack.narrative.verdict_text import confounders_in_words
 
@@ -33,7 +33,7 @@ TRUE_DRAG, TRUE_INLET = 1.2, 1.0
 def both_act() -> Pairs:
     """Trials of two tubes through connectors a third as wide: air slows down there as drag would slow the vine."""
     trials = [replace(trial, inlet_m=0.33 * trial.diameter_m) for trial in sheet()]
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, "inlet_loss", "air_drag"),
         values={**damping_values(trials), INLET: TRUE_INLET, DRAG: TRUE_DRAG},
         damping_scatter=5e-3,

@@ -14,7 +14,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.contradictions import contradictions, displacement_m, is_within_position_errors
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 
@@ -29,7 +29,9 @@ def exponents_apart(by: float) -> list[tuple[Trial, Track]]:
     for prefix, change in (("a", -by / 2), ("b", by / 2)):
         trials = [trial for trial in sheet() if trial.name.startswith(prefix)]
         values = {**damping_values(trials), "eversion_damping.n": 0.37 + change}
-        nature = Nature(effects=BASE, values=values, damping_scatter=5e-3, pressure_scatter=1e-3, noise_m=3e-5, seed=9)
+        nature = GroundTruth(
+            effects=BASE, values=values, damping_scatter=5e-3, pressure_scatter=1e-3, noise_m=3e-5, seed=9
+        )
         pairs += [(one.stated, one.track) for one in grow(trials, nature)]
     return pairs
 

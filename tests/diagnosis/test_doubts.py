@@ -21,7 +21,7 @@ from vinetrack.diagnosis.shape_products import fit_columns, products_of
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.systematics import Systematics, systematics_of
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 
@@ -29,7 +29,7 @@ def careful(payload_g: float, seed: int) -> Pairs:
     """Twenty-four trials of two vines that scatter by a tenth of a per cent, half of them with a payload."""
     loads = [(f"{trial.name}_{load:g}g", load, trial) for load in (0.0, payload_g) for trial in sheet()]
     trials = [replace(trial, name=name, payload_kg=1e-3 * load) for name, load, trial in loads]
-    nature = Nature(
+    nature = GroundTruth(
         effects=BASE,
         values=damping_values(trials),
         damping_scatter=1e-3,

@@ -31,7 +31,7 @@ from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_prepared, predict_trials
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
@@ -46,7 +46,7 @@ def grown(seed: int, *effects: str, scales: Sequence[int] = (2, 4), replicates: 
         for trial in campaign(isometric_vine(scale), (24, 30, 38, 48), replicates, prefix=f"R{scale}_")
     ]
     trials = list(with_names(trials))
-    nature = Nature(effects=(*BASE, *effects), values={**damping_values(trials), **more}, seed=seed)
+    nature = GroundTruth(effects=(*BASE, *effects), values={**damping_values(trials), **more}, seed=seed)
     return [(one.stated, one.track) for one in grow(trials, nature)]
 
 

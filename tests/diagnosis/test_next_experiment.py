@@ -19,7 +19,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import Vine, campaign
 from vinetrack.planning.scaling_priors import damping_prior
 
@@ -41,7 +41,7 @@ def grown(trials: Sequence[Trial], seed: int, effects: Mapping[str, float], nois
         else off * damping_prior(trial.diameter_m, trial.thickness_m)
         for trial in trials
     }
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, *{key.split(".")[0] for key in effects}),
         values={"eversion_damping.B": damping, "eversion_damping.n": N, **effects},
         noise_m=noise_m,

@@ -16,7 +16,7 @@ from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, Misf
 from vinetrack.diagnosis.selection import SelectionStep, select_effects
 from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK, pushes, slack_fit
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 
@@ -24,7 +24,7 @@ def grown(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:
     """Trials of two vines, grown with a tail that may go slack or not, stated as taut."""
     sheets = [replace(one, growth_angle_rad=angle_rad, tail_slack=tail_slack) for one in sheet()]
     trials = [replace(one, payload_kg=1e-3 * payload_g) for one in sheets]
-    nature = Nature(effects=BASE, values=damping_values(trials), noise_m=5e-5, seed=4)
+    nature = GroundTruth(effects=BASE, values=damping_values(trials), noise_m=5e-5, seed=4)
     return [(replace(one.stated, tail_slack="taut"), one.track) for one in grow(trials, nature)]
 
 
@@ -73,7 +73,7 @@ def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_bette
 ) -> None:
     truth = {"tail_friction.mu_w": 0.04}
     trials = [replace(one, growth_angle_rad=np.pi / 2) for one in sheet()]
-    nature = Nature(effects=[*BASE, "tail_friction"], values=damping_values(trials) | truth, noise_m=5e-5, seed=6)
+    nature = GroundTruth(effects=[*BASE, "tail_friction"], values=damping_values(trials) | truth, noise_m=5e-5, seed=6)
     found = fit(vt.base_model(), [(one.stated, one.track) for one in grow(trials, nature)], profile=False)
     effects, _ = hypotheses.testable(candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
     questions = misfit_tests(found, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)

@@ -23,7 +23,7 @@ from vinetrack.diagnosis.trial_effect_tests import (
 )
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 WANDER_M = 2e-4
@@ -42,7 +42,7 @@ def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials: 
         by_vine = values["eversion_damping.B"]
         assert isinstance(by_vine, dict)
         values["eversion_damping.B"] = {vine: B * factor for vine, B in by_vine.items()}
-        nature = Nature(
+        nature = GroundTruth(
             effects=BASE, values=values, damping_scatter=scatter, pressure_scatter=0.005, yield_error_kPa=0.1,
             noise_m=1e-4, noise_correlation=0.3, seed=40 + k,
         )  # fmt: skip

@@ -41,7 +41,7 @@ from vinetrack.explorer.series import (
     symmetric_range,
     vine_colours,
 )
-from vinetrack.laboratory.tracks import grow, read_nature
+from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.results.folder_layout import ResultsError
 
 GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"
@@ -170,7 +170,7 @@ def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_p
     assert bare.floors_m == {}
     assert len(bare.trials) == 6
     assert choice_in_use(bare).numbers["eversion_damping.n"] == 0.37
-    true = {one.stated.name: one for one in grow(bare.experiment.trials, read_nature(DEMO))}
+    true = {one.stated.name: one for one in grow(bare.experiment.trials, read_ground_truth(DEMO))}
     for seen in bare.trials:
         # The last frame at rest, where 0.1 mm of noise hides the first two milliseconds of the motion.
         assert seen.release_s == pytest.approx(true[seen.name].release_s, abs=2.5e-3)

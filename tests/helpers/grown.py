@@ -10,7 +10,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
 from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
@@ -49,7 +49,7 @@ def sheet(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hiding(Nature):
+class Hiding(GroundTruth):
     """A nature with effects of a user's own files."""
 
     own: Mapping[str, Effect] = field(default_factory=dict)

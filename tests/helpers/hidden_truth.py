@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
@@ -27,7 +27,7 @@ def grown(
     trials = trials if trials is not None else sheet(payload_g)
     values = dict(values or {})
     effects = tuple(dict.fromkeys(name.split(".")[0] for name in values))
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, *effects),
         values={**damping_values(trials), **values},
         damping_scatter=0.02,

@@ -18,7 +18,7 @@ from vinetrack.diagnosis.initial_fit import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import Trajectory
 from vinetrack.inference.position_change import position_change
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 TIMES_S = np.arange(0.0, 0.3, 1e-3)
@@ -61,7 +61,7 @@ def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone()
         for trial in bare
         for load in (0.0, 0.03)
     ]
-    nature = Nature(
+    nature = GroundTruth(
         effects=(*BASE, "payload_friction"),
         values={**damping_values(trials), "payload_friction.mu_p": 0.3},
         damping_scatter=2e-3,

@@ -21,7 +21,7 @@ from vinetrack.kinematics.summary import (
     redo_damping,
     summarise_trial,
 )
-from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_pressures_kPa, damping_values, isometric_vine
 from vinetrack.laboratory.vine_campaigns import campaign as of_vine
 
@@ -36,7 +36,7 @@ def running_down(seed: int) -> list[tuple[Trial, Track]]:
         for trial in of_vine(isometric_vine(scale), damping_pressures_kPa(scale, 6), 3, prefix=f"R{scale}_")
     ]
     trials = list(with_names(trials))
-    nature = Nature(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=seed)
+    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=seed)
     return [(one.stated, one.track) for one in grow(trials, nature)]
 
 

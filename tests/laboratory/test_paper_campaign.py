@@ -8,8 +8,8 @@ import pytest
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory import __main__ as command
-from vinetrack.laboratory.filming import before_the_camera, make_filming
-from vinetrack.laboratory.tracks import read_nature
+from vinetrack.laboratory.filming import make_filming, recording_experiment
+from vinetrack.laboratory.tracks import read_ground_truth
 from vinetrack.laboratory.vine_campaigns import paper_campaign, paper_values
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def test_the_papers_sheet_is_its_campaign() -> None:
 
 def test_the_papers_nature_has_the_printed_numbers() -> None:
     """B of a printed diameter is in proportion to the wall; of the 25 mm vine it is 6.44 × ½ × (25/24)^0.75 = 3.320."""
-    hidden = read_nature(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
+    hidden = read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
     trials = paper_campaign()
     assert hidden.values == paper_values(trials)
     B = hidden.values["eversion_damping.B"]
@@ -49,7 +49,7 @@ def test_the_papers_nature_has_the_printed_numbers() -> None:
 def test_tracks_are_put_before_a_camera_on_request(tmp_path: Path) -> None:
     chosen = ["fig4_28kPa_1", "fast_62kPa_1"]
     filming = make_filming({"target": {"squares": [14, 5], "square_m": 0.015, "marker_m": 0.011}})
-    filmed = before_the_camera(read_experiment(PAPER), chosen, filming, tmp_path / "filmed")
+    filmed = recording_experiment(read_experiment(PAPER), chosen, filming, tmp_path / "filmed")
     assert [trial.name for trial in filmed.trials] == sorted(chosen, key=lambda name: filmed.lines[name])
     assert {trial.name for trial in filmed.trials} == set(chosen)
     for trial in filmed.trials:
@@ -63,9 +63,9 @@ def test_tracks_are_put_before_a_camera_on_request(tmp_path: Path) -> None:
 
 def test_an_experiment_of_recordings_is_not_filmed_again(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="recordings already"):
-        before_the_camera(read_experiment(ROOT / "data" / "demo"), [], make_filming({}), tmp_path / "filmed")
+        recording_experiment(read_experiment(ROOT / "data" / "demo"), [], make_filming({}), tmp_path / "filmed")
     with pytest.raises(ValueError, match="name another folder"):
-        before_the_camera(read_experiment(PAPER), [], make_filming({}), PAPER)
+        recording_experiment(read_experiment(PAPER), [], make_filming({}), PAPER)
 
 
 def test_a_pattern_that_no_trial_matches_is_said(capsys: pytest.CaptureFixture) -> None:

@@ -18,10 +18,10 @@ from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.tracks import (
-    Nature,
+    GroundTruth,
     VirtualTrial,
     grow,
-    read_nature,
+    read_ground_truth,
     write_experiment,
     write_tracks,
     write_truth,
@@ -44,8 +44,8 @@ def few() -> list[Trial]:
     return list(with_names(campaign(isometric_vine(4), (14, 20, 28), 2, prefix="R4_")))
 
 
-def nature(**changes: object) -> Nature:
-    return Nature(values=damping_values(few()), **changes)  # type: ignore[arg-type]
+def nature(**changes: object) -> GroundTruth:
+    return GroundTruth(values=damping_values(few()), **changes)  # type: ignore[arg-type]
 
 
 EXACT = {"damping_scatter": 0.0, "pressure_scatter": 0.0, "noise_m": 0.0}
@@ -111,7 +111,7 @@ def test_leaving_a_trial_out_changes_no_other(missing: int) -> None:
 
 def test_leaving_a_vine_out_changes_no_other() -> None:
     thick, thin = few(), list(with_names(campaign(isometric_vine(2), (20, 30), 1, prefix="R2_")))
-    truth = Nature(values=damping_values([*thick, *thin]), seed=2, yield_error_kPa=0.3)
+    truth = GroundTruth(values=damping_values([*thick, *thin]), seed=2, yield_error_kPa=0.3)
     both = {grown.stated.name: grown for grown in grow([*thick, *thin], truth)}
     for grown in grow(thin, truth):
         assert grown.true.yield_pressure_Pa == both[grown.stated.name].true.yield_pressure_Pa != 3e3
@@ -214,9 +214,9 @@ def test_repeated_frames_show_the_one_before_to_the_last_digit() -> None:
 
 def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
     trials = [replace(trial, chamber_m3=1e-3) for trial in few()]
-    effects = (*Nature().effects, "reservoir_depletion")
+    effects = (*GroundTruth().effects, "reservoir_depletion")
     values = {**damping_values(trials), "reservoir_depletion.gamma": 1.0}
-    quiet = Nature(effects=effects, values=values, trace_sigma_kPa=0.0, seed=1)
+    quiet = GroundTruth(effects=effects, values=values, trace_sigma_kPa=0.0, seed=1)
     for grown in grow(trials, quiet):
         gauge, y = grown.track.pressure_Pa, grown.true_lead_position_m
         assert gauge is not None
@@ -231,7 +231,7 @@ def test_a_recorded_pressure_is_what_drove_it_and_noise() -> None:
 
 def test_a_hidden_measurement_effect_shows_in_the_track_and_not_in_the_truth() -> None:
     values = {**damping_values(few()), "length_scale.eps": 0.05}
-    wrong = Nature(effects=(*Nature().effects, "length_scale"), values=values, seed=1, **EXACT)  # type: ignore[arg-type]
+    wrong = GroundTruth(effects=(*GroundTruth().effects, "length_scale"), values=values, seed=1, **EXACT)  # type: ignore[arg-type]
     for grown in grow(few()[:1], wrong):
         seen = grown.track.lead_position_m - grown.origin_m
         np.testing.assert_allclose(seen, 1.05 * grown.true_lead_position_m, atol=1e-12)
@@ -287,7 +287,7 @@ def test_the_truth_holds_what_was_hidden(tmp_path: Path) -> None:
 def test_the_demonstration_can_be_grown(tmp_path: Path) -> None:
     """Every trial of the shipped sheet, filmed or tracked, moves as the demonstration's nature says."""
     demo = read_experiment(ROOT / "data" / "demo")
-    hidden = read_nature(command.DEMO)
+    hidden = read_ground_truth(command.DEMO)
     grown = grow(demo.trials, hidden)
     assert len(grown) == len(demo.trials) > 5
     for one in grown:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.figures.registry import PAPER_FIGURES
-from vinetrack.laboratory.tracks import grow, read_nature, write_experiment
+from vinetrack.laboratory.tracks import grow, read_ground_truth, write_experiment
 from vinetrack.pipeline.workflow import PAPER_TABLES
 
 ROOT = Path(__file__).parents[2]
@@ -37,7 +37,7 @@ def run(*arguments: object) -> Result:
 def small_part(folder: Path, published: str) -> Path:
     trials = [trial for trial in read_experiment(ROOT / "data" / "paper").trials if trial.name in CHOSEN]
     assert len(trials) == len(CHOSEN)
-    nature = read_nature(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
+    nature = read_ground_truth(ROOT / "vinetrack" / "laboratory" / "paper.yaml")
     write_experiment(grow(trials, nature), folder, f"chamber_l: 3.7\n{published}")
     return folder
 

@@ -19,7 +19,7 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
 from vinetrack.laboratory.render import Truth
-from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge import outline, track_edge
 from vinetrack.video.edge_state import EdgeState, core_frames
@@ -70,7 +70,7 @@ def clip(tmp_path_factory) -> Clip:
     (folder / "experiment.yaml").write_text(
         f"capture_fps: {CAPTURE_FPS:g}\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
     )
-    nature = Nature(
+    nature = GroundTruth(
         values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
         damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
     )  # fmt: skip

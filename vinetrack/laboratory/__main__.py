@@ -1,13 +1,13 @@
-"""Grow the trials of an experiment folder in the virtual laboratory and make what its sheet names.
+"""Simulate the trials of an experiment folder and write the recordings or tracks that its sheet names.
 
     python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE] [--processes N]
     python -m vinetrack.laboratory data/paper --film FOLDER [--only PATTERN]
 
 Trials with a `video` are filmed, with the calibration picture that `experiment.yaml` names; those with a `track` are
-measured. The sheet says what is to be grown; `--nature` what is true and hidden (default: the file here that is called
-as the experiment's folder is, else that of the demonstration). `--film` makes an experiment of recordings of one whose
-trials are tracks: the same trials, or those whose names match a pattern such as 'fig4_*', before a camera. The truth is
-written only where `--truth` says, never inside the experiment.
+measured. The sheet defines the trials, and `--nature` the ground truth (default: the file of this package with the name
+of the experiment's folder, else that of the demonstration). `--film` makes an experiment of recordings from one of
+tracks, with all its trials or those whose names match a pattern such as 'fig4_*'. The truth is written only to the file
+that `--truth` names, never inside the experiment.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from pathlib import Path
 import yaml
 
 from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.laboratory.filming import Filming, before_the_camera, film, make_filming, picture_target
-from vinetrack.laboratory.tracks import VirtualTrial, grow, read_nature, write_tracks, write_truth
+from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target, recording_experiment
+from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth, write_tracks, write_truth
 
 DEMO = Path(__file__).with_name("demo.yaml")
 
@@ -44,19 +44,19 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
-    path = given.nature or _nature_of(experiment)
-    nature, content = read_nature(path), yaml.safe_load(path.read_text(encoding="utf-8"))
+    path = given.nature or _truth_of(experiment)
+    truth, content = read_ground_truth(path), yaml.safe_load(path.read_text(encoding="utf-8"))
     filming = make_filming(content.get("filming", {}))
     chosen = [trial for trial in experiment.trials if fnmatch.fnmatch(trial.name, given.only)]
     if not chosen:
         parser.error(f"no trial of {given.experiment} matches {given.only!r}")
     if given.film is not None:
         try:
-            experiment = before_the_camera(experiment, [trial.name for trial in chosen], filming, given.film)
+            experiment = recording_experiment(experiment, [trial.name for trial in chosen], filming, given.film)
         except ValueError as error:
             parser.error(str(error))
         chosen = list(experiment.trials)
-    grown = grow(chosen, nature)
+    grown = grow(chosen, truth)
     filmed = [trial for trial in grown if trial.stated.video is not None]
     measured = [trial for trial in grown if trial.stated.track is not None]
     for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
@@ -69,21 +69,21 @@ def main(arguments: list[str] | None = None) -> None:
             f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest.",
             flush=True,
         )
-        _film(experiment, filmed, filming, nature.seed, given.processes)
+        _film(experiment, filmed, filming, truth.seed, given.processes)
     if given.truth is not None:
-        write_truth(grown, nature, given.truth)
+        write_truth(grown, truth, given.truth)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
 
 
-def _nature_of(experiment: Experiment) -> Path:
-    """What is true in an experiment of this name, or else in the demonstration."""
+def _truth_of(experiment: Experiment) -> Path:
+    """File with the ground truth of an experiment of this name, or else of the demonstration."""
     beside_this_file = Path(__file__).with_name(f"{experiment.name}.yaml")
     return beside_this_file if beside_this_file.exists() else DEMO
 
 
 def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:
-    """Film every trial, in a few processes, with a line for each that is done."""
+    """Film every trial in parallel processes, and print a line for each finished one."""
     image = getattr(experiment.settings.calibration, "image", None)
     if image is not None:
         picture_target(filming, experiment.folder / image, seed)

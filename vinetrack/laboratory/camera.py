@@ -1,8 +1,8 @@
-"""The laboratory's camera: where a point of the plane of growth lands in the picture, and back.
+"""Camera model of the laboratory: projection of the plane of growth to the picture, and its inverse.
 
 A pinhole with radial distortion looks at a plane that may be tilted. Pixel centres have whole-number coordinates,
-x to the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the plane's origin put on
-the picture's centre: without tilt and distortion they are the picture's own pixels.
+x to the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the origin of the plane at
+the centre of the picture: without tilt and distortion they are the pixels of the picture.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 
 UNDISTORT_STEPS = 10
-"""Newton steps of the inverse of the distortion; exact to rounding after about six for lenses such as cameras have.
-Chosen; half might not suffice for a wide lens, twice costs time alone."""
+"""Newton steps of the inverse of the distortion. Chosen: about six are exact to rounding for usual lenses; half might
+not suffice for a wide lens, twice only costs time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +40,12 @@ class Camera:
 
     @property
     def centre_px(self) -> tuple[float, float]:
-        """Where the optical axis meets the picture: its middle, px."""
+        """Principal point, the centre of the picture, px."""
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
     @property
     def is_plain(self) -> bool:
-        """Whether plane pixels and picture pixels are the same thing."""
+        """Whether plane pixels and picture pixels are the same."""
         return self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
 
     @property
@@ -77,8 +77,8 @@ class Camera:
         spatial = offset @ self.rotation[:, :2].T + np.array([0.0, 0.0, self.focal_px])
         ray = spatial[..., :2] / spatial[..., 2:]
         radius2 = (ray**2).sum(axis=-1, keepdims=True)
-        bent = ray * (1 + self.k1 * radius2 + self.k2 * radius2**2)
-        return np.asarray(bent * self.focal_px + self.centre_px)
+        distorted = ray * (1 + self.k1 * radius2 + self.k2 * radius2**2)
+        return np.asarray(distorted * self.focal_px + self.centre_px)
 
     def plane_from_picture(self, picture_px: Floats) -> Floats:
         """Map points of the picture to the plane of growth.
@@ -91,24 +91,24 @@ class Camera:
         -------
         plane pixels, shape (..., 2).
         """
-        bent = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
-        ray = np.concatenate([self._undistorted(bent), np.ones((*bent.shape[:-1], 1))], axis=-1)
+        distorted = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
+        ray = np.concatenate([self._undistorted(distorted), np.ones((*distorted.shape[:-1], 1))], axis=-1)
         normal = self.rotation[:, 2]
         depth = normal[2] * self.focal_px / (ray @ normal)
         spatial = ray * depth[..., None] - np.array([0.0, 0.0, self.focal_px])
         return np.asarray(spatial @ self.rotation[:, :2] + self.centre_px)
 
-    def _undistorted(self, bent: Floats) -> Floats:
+    def _undistorted(self, distorted: Floats) -> Floats:
         """Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent."""
-        bent_radius = np.sqrt((bent**2).sum(axis=-1, keepdims=True))
-        radius = bent_radius.copy()
+        distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
+        radius = distorted_radius.copy()
         for _ in range(UNDISTORT_STEPS):
-            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - bent_radius
+            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - distorted_radius
             radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
-        return bent * np.divide(radius, bent_radius, out=np.ones_like(radius), where=bent_radius > 0)
+        return distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
 
     def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Plane pixel seen by each pixel of the picture: x and y, each of shape (height_px, width_px)."""
+        """Plane pixel of each picture pixel: x and y, each of shape (height_px, width_px)."""
         grid = np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
         plane = grid if self.is_plain else self.plane_from_picture(grid)
         return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)

@@ -1,8 +1,8 @@
-"""A campaign grown in the virtual laboratory and filmed: recordings, and a picture of the calibration target.
+"""Simulated recordings of a campaign, and a picture of the calibration target.
 
-The vine grows first (`tracks.grow`); the camera then films the true motion, so that whatever a tracker makes of the
-recording can be held against it. An experiment of tracks is made one of recordings with the same sheet, a camera and a
-target in place of tracks.
+The campaign is simulated first (`tracks.grow`), and its true motion is then filmed, so that the results of a tracker
+can be compared with it. An experiment of tracks is turned into one of recordings with the same sheet, a camera and a
+target.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from vinetrack.laboratory.targets import Target, render_target
 from vinetrack.laboratory.tracks import VirtualTrial
 
 FINE_STEPS = 8
-"""Instants a frame at which the true motion is handed to the camera. Chosen: at 500 m/s² and 1000 frames a second even
-a straight line between them errs by 1 µm (a·h²/8)."""
+"""Samples per frame of the true motion. Chosen: at 500 m/s² and 1000 frames per second even linear interpolation
+between them errs by only 1 µm (a·h²/8)."""
 
 
 @dataclass(frozen=True)
 class Filming:
-    """How a campaign is filmed: scene preset, camera, exposure as a part of the time between frames, and the target."""
+    """How a campaign is filmed: scene preset, camera, exposure as a fraction of the frame interval, and the target."""
 
     scene: str = "demo"
     camera: Camera = field(default_factory=Camera)
@@ -43,7 +43,7 @@ class Filming:
 
 
 def make_filming(content: dict[str, Any]) -> Filming:
-    """Read how trials are filmed from YAML's mapping.
+    """Read how trials are filmed from a YAML mapping.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def make_filming(content: dict[str, Any]) -> Filming:
 
 
 def scene_of(stated: Trial, filming: Filming) -> Scene:
-    """Make the scene with the trial's own tube before the camera, of the size that the sheet states.
+    """Return the scene with a tube of the size that the sheet states for the trial.
 
     Parameters
     ----------
@@ -89,13 +89,13 @@ def scene_of(stated: Trial, filming: Filming) -> Scene:
 
 
 def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
-    """Film one grown trial; its truth is returned and written nowhere.
+    """Film one simulated trial; its truth is returned and not written.
 
     Parameters
     ----------
-    trial : grown by `tracks.grow`.
+    trial : from `tracks.grow`.
     filming : scene, camera and exposure.
-    out_path : the recording; its ending chooses the form.
+    out_path : the recording; its suffix determines the format.
     seed : of noise and textures.
 
     Returns
@@ -115,13 +115,13 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
 
 
 def _motion(trial: VirtualTrial, duration_s: float, steps: int) -> tuple[Floats, Floats]:
-    """True lead position at times far finer than the frames, s and m."""
+    """True lead position at times much finer than the frames, s and m."""
     time_s = np.linspace(0.0, duration_s, steps + 1)
     return time_s, simulate(trial.model, trial.true, time_s - trial.release_s).lead_position_m
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
-    """Write a picture of the calibration target, held up in the plane of growth, as PNG.
+    """Write a picture of the calibration target in the plane of growth as PNG.
 
     Parameters
     ----------
@@ -141,8 +141,8 @@ SETTINGS = "experiment.yaml"
 TARGET = "calibration/board.png"
 
 
-def before_the_camera(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
-    """Write sheet and settings of an experiment in which these trials are filmed; nothing is filmed yet.
+def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
+    """Write sheet and settings of an experiment of recordings of these trials; nothing is filmed yet.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def before_the_camera(experiment: Experiment, trials: Sequence[str], filming: Fi
     Raises
     ------
     ValueError
-        If the experiment brings recordings or a calibration already, the target is no board, or `folder` is the
+        If the experiment already has recordings or a calibration, the target is not a ChArUco board, or `folder` is the
         experiment itself.
     """
     if experiment.settings.calibration is not None or any(trial.video for trial in experiment.trials):
@@ -176,13 +176,13 @@ def before_the_camera(experiment: Experiment, trials: Sequence[str], filming: Fi
 
 
 def _camera_settings(experiment: Experiment, filming: Filming) -> str:
-    """What `experiment.yaml` has to say of the camera and the target."""
+    """The lines of `experiment.yaml` about exposure and calibration."""
     target = filming.target
     if target.kind != "charuco":
         raise ValueError(f"the target is a {target.kind}; a recording needs a charuco board")
     exposures_us = {round(1e6 * filming.exposure_fraction / trial.capture_fps, 3) for trial in experiment.trials}
     if len(exposures_us) != 1:
-        raise ValueError("trials were captured at several rates: one exposure does not fit all")
+        raise ValueError("trials have several frame rates, so that no single exposure can be stated")
     board = {
         "kind": target.kind,
         "image": TARGET,

@@ -1,4 +1,4 @@
-"""A motion becomes a recording: pictures of a scene, frame by frame, and the truth about each.
+"""Rendering of a motion as a recording: pictures of a scene, frame by frame, and the truth of each.
 
 **The leading edge** is the foremost point of the tube on its own centreline. A sharp picture of it would be a step
 there; optics and pixel blur that step with a Gaussian of `psf_px`, the exposure with the tip's own motion, so that at
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Scene, Tube
-from vinetrack.laboratory.scene_motion import Motion, Staging
+from vinetrack.laboratory.scene_motion import Motion, SceneMotion
 from vinetrack.laboratory.scene_objects import BallLayer, DoorLayer, PathMaps, TubeLayer
 from vinetrack.laboratory.targets import lay_target, plane_seen
 
@@ -99,7 +99,7 @@ class FrameRenderer:
                 f"An exposure of {self.exposure_s * 1e6:.0f} µs does not fit between frames at {capture_fps:g} a "
                 "second; choose a shorter one."
             )
-        self.staging = Staging(
+        self.staging = SceneMotion(
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )
         maps = PathMaps(scene)

@@ -1,4 +1,4 @@
-"""What stands before the camera of the virtual laboratory, and how it is recorded: plain settings and presets.
+"""Settings and presets of a scene of the virtual laboratory: objects, light, camera, sensor, recording.
 
 Brightness is radiance as a fraction of the sensor's full scale. Lengths that end in `_px` are plane pixels (see
 `camera`). Presets are made by `preset(name)`; `dataclasses.replace` changes them.

@@ -1,4 +1,4 @@
-"""Who is where at what time in a recording: tip, tail's end, sway of the tube, shake of the camera; and the lamps.
+"""Motion of a scene over time: tip, end of the tail, sway of the tube, shake of the camera, door; and the lamps.
 
 All positions are in plane pixels (see `camera`), all times in seconds from the start of the first exposure.
 """
@@ -18,19 +18,19 @@ Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]
 """Lead position in metres against time in seconds: a function of an array, or samples (time_s, lead_position_m)."""
 
 FASTEST_PAYLOAD_M_S = 150.0
-"""Largest speed with which a payload flies off. Chosen above any vine; it keeps the picture finite where a motion
-jumps."""
+"""Largest speed of a payload that leaves the vine. Chosen above any vine, so that the picture stays finite where a
+motion jumps."""
 
 RELEASE_TRAVEL_M = 1e-5
 """Travel from which a vine counts as released. Chosen: a thirtieth of a pixel."""
 
 EVENT_STEPS = 10
-"""Steps a frame in which release and exit of the tail are looked for. Chosen: doors and payloads then start within a
-tenth of a frame."""
+"""Steps per frame of the search for the release and the exit of the tail. Chosen: doors and payloads then start within
+a tenth of a frame."""
 
 
 def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
-    """Return a motion as a function; samples are joined by monotone cubics and held before and after.
+    """Return a motion as a function; samples are interpolated by monotone cubics (PCHIP) and constant outside.
 
     Parameters
     ----------
@@ -53,8 +53,8 @@ def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
     return position_m
 
 
-class Staging:
-    """Positions of everything that moves in `scene` while its tip, or its body, follows `motion`.
+class SceneMotion:
+    """Positions of everything that moves in a scene whose tip, or body, follows a given motion.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Staging:
         self._lamp_phase = float(rng.uniform(0, 2 * np.pi))
 
     def _find_exit(self, grid_s: Floats, lead_m: Floats) -> tuple[float, float]:
-        """When the tail's end comes out of the tip, and its speed there (px/s): twice the tip's."""
+        """Time at which the end of the tail leaves the tip, and its speed there (px/s), twice that of the tip."""
         if not isinstance(self.scene.subject, Tube):
             return math.inf, 0.0
         out = np.flatnonzero(lead_m >= self.scene.subject.length_m - 1e-4)
@@ -118,7 +118,7 @@ class Staging:
         return np.asarray((self.scene.start_m + lead_m) / self.scene.camera.m_per_px)
 
     def tail_end_px(self, time_s: Floats | float) -> Floats:
-        """Where the tail ends, and the payload is: 2y − L along the path, then on at the speed of the exit.
+        """Return the position of the tail's end and payload: 2y − L, and at constant speed after the exit.
 
         Parameters
         ----------
@@ -139,12 +139,12 @@ class Staging:
 
     @property
     def sway_length_px(self) -> float:
-        """Growth at which the sway is `sway_px`; it grows with the square of the distance, as a cantilever's does."""
+        """Growth at which the sway is `sway_px`; sway grows with the square of the distance, as for a cantilever."""
         subject = self.scene.subject
         return subject.length_m / self.scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
 
     def sway_px(self, time_s: float) -> float:
-        """Sideways displacement of the tube at `sway_length_px`; starts softly at the release.
+        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class Staging:
         return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
-        """Displacement of the whole picture (x, y): six sinusoids of rms 1 together, a kick that rings on release.
+        """Return the displacement of the picture (x, y): six sinusoids of joint rms 1, and a damped kick at release.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class Staging:
         return float(self.scene.shake_px * sway[0]), float(self.scene.shake_px * sway[1])
 
     def lamp(self, frame: int) -> float:
-        """Brightness of the lamps averaged over the exposure: sin averaged over T is sin at its middle · sinc(fT).
+        """Return the brightness of the lamps averaged over the exposure T: the sine at its middle times sinc(fT).
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class Staging:
         return 1 + light.flicker * float(np.sinc(light.flicker_Hz * self.exposure_s)) * math.sin(phase)
 
     def door_angle_rad(self, time_s: float) -> float:
-        """Angle of the door: 0 closed, evenly accelerated, then rebounding a little from its stop.
+        """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class Staging:
         return math.radians(door.open_deg - 12 * math.exp(-after / 1.5) * abs(math.sin(2.2 * after)))
 
     def tip_plane_px(self, time_s: Floats) -> Floats:
-        """Tip of the tube or body in plane pixels, with sway and shake, shape (n, 2).
+        """Return the tip of the tube or body in plane pixels, with sway and shake.
 
         Parameters
         ----------

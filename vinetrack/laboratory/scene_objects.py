@@ -1,4 +1,4 @@
-"""What moves in front of the backdrop: tube, ball and door, each laid over the light of a frame."""
+"""Moving objects in front of the backdrop: tube, ball and door, each composited over the light of a frame."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
-from vinetrack.laboratory.scene_motion import Staging
+from vinetrack.laboratory.scene_motion import SceneMotion
 
 Image = NDArray[np.float32]
 
 EXPOSURE_PIECES = 4
-"""Straight pieces the tip's path over an exposure is cut into; at 3000 m/s² over 0.5 ms each is off by a·(T/4)²/8 = 6
-µm at most, a sixtieth of a pixel of 0.36 mm. Derived."""
+"""Straight pieces that approximate the path of the tip over an exposure. Derived: at 3000 m/s² over 0.5 ms each errs by
+a·(T/4)²/8 = 6 µm at most, a sixtieth of a pixel of 0.36 mm."""
 TABLE_STEP_PX = 1 / 16
 """Steps of the table of covers along the path. Chosen: linear interpolation of an edge blurred by 0.8 px then errs by
 2e-4."""
 
 PROFILE_PER_PX = 16
-"""Entries a pixel of the profiles across. Chosen as TABLE_STEP_PX."""
+"""Entries per pixel of the profiles across. Chosen as TABLE_STEP_PX."""
 
 SLOPES = np.linspace(1.0, 4.0, 7)
 """How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)."""
 TAIL_PERIOD_PX = 4096
-"""Length after which the tail's texture repeats. Chosen: longer than any picture, so that the period does not show."""
+"""Period of the texture of the tail. Chosen: longer than any picture, so that the period does not show."""
 
 BALL_STEP_PX = 0.7
 """Distance of the centres over which a moving ball is averaged. Chosen: less than a pixel."""
@@ -61,9 +61,9 @@ class PathMaps:
 
 
 class TubeLayer:
-    """Lays the everting tube, with its payload, over a frame."""
+    """Composites the everting tube with its payload over a frame."""
 
-    def __init__(self, staging: Staging, maps: PathMaps, rng: np.random.Generator) -> None:
+    def __init__(self, staging: SceneMotion, maps: PathMaps, rng: np.random.Generator) -> None:
         scene = staging.scene
         assert isinstance(scene.subject, Tube)
         self._staging, self._maps, self._tube, self._psf_px = staging, maps, scene.subject, scene.psf_px
@@ -167,11 +167,11 @@ def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, N
 
 
 class BallLayer:
-    """Lays a ball whose centre follows `centre_px` over a frame; it is seen from `emerges_at_px` on."""
+    """Composites a ball whose centre follows `centre_px` over a frame; it is visible from `emerges_at_px` on."""
 
     def __init__(
         self,
-        staging: Staging,
+        staging: SceneMotion,
         maps: PathMaps,
         rng: np.random.Generator,
         ball: Ball,
@@ -216,9 +216,9 @@ class BallLayer:
 
 
 class DoorLayer:
-    """Lays the door over a frame: a plate hinged beside the resting tip, closed across the path, then swung away."""
+    """Composites the door over a frame: a plate hinged beside the resting tip that swings out of the path."""
 
-    def __init__(self, staging: Staging, door: Door) -> None:
+    def __init__(self, staging: SceneMotion, door: Door) -> None:
         scene = staging.scene
         scale = scene.camera.m_per_px
         self._staging, self._door = staging, door

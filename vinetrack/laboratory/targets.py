@@ -1,7 +1,7 @@
-"""Calibration targets in the plane of growth: pictures and clips of a ChArUco board or a checkerboard, seen truly.
+"""Exactly projected pictures and clips of a calibration target, ChArUco board or checkerboard, in the plane of growth.
 
-Every picture pixel holds POINTS points; each is traced through lens and tilt to the plane and finds its
-own black or white there, so that corners lie where geometry puts them, without interpolation of any picture.
+Every picture pixel is sampled at POINTS points, each traced through lens and tilt to the plane, where it is black or
+white. Corners are therefore exactly where geometry puts them, and no picture is interpolated.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Target:
         return np.asarray(along_board / self.square_m + np.array(self.squares) / 2)
 
     def pattern(self) -> NDArray[np.uint8]:
-        """What is printed, 1 where white: PATTERN_PX a square as OpenCV draws a ChArUco board, 1 for a checkerboard."""
+        """Printed pattern, 1 where white; per square PATTERN_PX for a ChArUco board (by OpenCV), 1 for a checkerboard."""
         import cv2
 
         if self.kind != "charuco":
@@ -212,7 +212,7 @@ class TargetRenderer:
 
 
 def _target_scene(scene: Scene) -> Scene:
-    """Return `scene` with launcher, door and ruler put away, as when the target is held up."""
+    """Return `scene` without launcher, door and ruler, as for the picture of a target."""
     backdrop = replace(scene.backdrop, launcher=False, ruler=False, clutter=False)
     return replace(scene, backdrop=backdrop, door=None)
 

@@ -1,8 +1,7 @@
-"""A campaign grown in the virtual laboratory and measured as tracks.
+"""Simulated campaigns measured as tracks, with known ground truth.
 
-Every trial draws from its own stream of random numbers, so that leaving one out changes no other.
-
-A `Nature` is what is true and hidden from the analysis: physics, scatter, noise, faults.
+Every trial has its own stream of random numbers, so that leaving one out does not change the others. A `GroundTruth` is
+what is hidden from the analysis: physics, scatter, noise, faults.
 """
 
 from __future__ import annotations
@@ -29,11 +28,10 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 @dataclass(frozen=True)
 class VirtualTrial:
-    """One trial as it was grown and as it was measured.
+    """One simulated trial and its measurement.
 
-    `stated` is the trial as the sheet states it, `true` as it was, `model` what drove it. `track` is what the analysis
-    gets; its zeros are arbitrary. The rest is the truth at the track's rows: SI, the release at `release_s` on the
-    track's clock.
+    `stated` is the trial as the sheet states it, `true` as it was, `model` the true model. `track` is what the analysis
+    gets; its zeros are arbitrary. The rest is the truth at the track's rows, SI; `release_s` is on the track's clock.
     """
 
     stated: Trial
@@ -50,33 +48,33 @@ class VirtualTrial:
     repeated: tuple[int, ...]
 
 
-def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
-    """Grow and measure these trials; the same seed gives the same numbers.
+def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
+    """Simulate and measure trials; the same seed gives the same numbers.
 
     Parameters
     ----------
     trials : as the sheet states them.
-    nature : what is true and hidden.
+    truth : the ground truth.
 
     Returns
     -------
-    grown and measured trials, in their order.
+    simulated trials, in order.
     """
-    model = nature.model()
-    draws = [_draw(nature.seed, 0, trial.name) for trial in trials]
-    errors = _yield_errors(trials, nature)
+    model = truth.model()
+    draws = [_draw(truth.seed, 0, trial.name) for trial in trials]
+    errors = _yield_errors(trials, truth)
     true, damping = [], []
     theta = np.array([model.parameters_of(trial) for trial in trials])
     column = model.parameter_names.index("eversion_damping.B") if "eversion_damping" in model else None
     for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
-        set_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())
-        factor = 1 + nature.damping_scatter * draw.standard_normal()
+        set_Pa = trial.pressure_Pa * (1 + truth.pressure_scatter * draw.standard_normal())
+        factor = 1 + truth.damping_scatter * draw.standard_normal()
         true.append(replace(trial, pressure_Pa=set_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
         if column is not None:
             theta[i, column] *= factor
         damping.append(float(theta[i, column]) if column is not None else math.nan)
     times, release = zip(
-        *(_frame_times(trial, nature, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True
+        *(_frame_times(trial, truth, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True
     )
     moved = simulate_many(model, true, [t - t0 for t, t0 in zip(times, release, strict=True)], parameters=theta)
     grown = []
@@ -86,28 +84,28 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
             trial_model, true[i], times[i] - release[i], moved[i].lead_position_m, moved[i].lead_velocity_m_s
         )
         grown.append(
-            _measure(trial, true[i], trial_model, damping[i], times[i], release[i], moved[i], pressure_Pa, nature, draw)
+            _measure(trial, true[i], trial_model, damping[i], times[i], release[i], moved[i], pressure_Pa, truth, draw)
         )
     return grown
 
 
-def _yield_errors(trials: Sequence[Trial], nature: Nature) -> dict[str, float]:
-    """How far the true yield pressure of each vine lies from the stated one, Pa."""
+def _yield_errors(trials: Sequence[Trial], truth: GroundTruth) -> dict[str, float]:
+    """True minus stated yield pressure of each vine, Pa."""
     vines = dict.fromkeys(trial.vine for trial in trials)
-    return {vine: 1e3 * nature.yield_error_kPa * _draw(nature.seed, 1, vine).standard_normal() for vine in vines}
+    return {vine: 1e3 * truth.yield_error_kPa * _draw(truth.seed, 1, vine).standard_normal() for vine in vines}
 
 
 def _draw(seed: int, kind: int, name: str) -> np.random.Generator:
-    """A stream of random numbers that belongs to one trial (kind 0) or vine (kind 1), by its name."""
+    """The random generator of one trial (kind 0) or vine (kind 1), by its name."""
     return np.random.default_rng([seed, kind, zlib.crc32(name.encode())])
 
 
-def _frame_times(trial: Trial, nature: Nature, draw: np.random.Generator) -> tuple[Floats, float]:
-    """Times of all frames the camera could take, and the instant of release on the same clock, s."""
+def _frame_times(trial: Trial, truth: GroundTruth, draw: np.random.Generator) -> tuple[Floats, float]:
+    """Times of all possible frames, and the time of release on the same clock, s."""
     step_s = 1 / trial.capture_fps
-    resting = draw.integers(nature.release_frames[0], nature.release_frames[1], endpoint=True)
+    resting = draw.integers(truth.release_frames[0], truth.release_frames[1], endpoint=True)
     release_s = (resting - 1 + draw.uniform()) * step_s
-    return np.arange(nature.longest_frames, dtype=float) * step_s, float(release_s)
+    return np.arange(truth.longest_frames, dtype=float) * step_s, float(release_s)
 
 
 def _measure(
@@ -119,21 +117,21 @@ def _measure(
     release_s: float,
     moved: Trajectory,
     pressure_Pa: Floats,
-    nature: Nature,
+    truth: GroundTruth,
     draw: np.random.Generator,
 ) -> VirtualTrial:
-    """What the camera and the gauge make of a trajectory: noise, an arbitrary origin, frames lost and repeated."""
+    """Measure a trajectory: noise, an arbitrary origin, dropped and repeated frames, gauge readings."""
     stop = time_s.size
     if moved.status == "ended":
-        stop = min(stop, int(np.searchsorted(time_s - release_s, moved.end_time_s)) + nature.frames_after_end)
-    origin_m = draw.uniform(*nature.origin_m)
-    noise = ar1_noise(stop, nature.noise_m, nature.noise_correlation, draw)
-    shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], nature, draw)
+        stop = min(stop, int(np.searchsorted(time_s - release_s, moved.end_time_s)) + truth.frames_after_end)
+    origin_m = draw.uniform(*truth.origin_m)
+    noise = ar1_noise(stop, truth.noise_m, truth.noise_correlation, draw)
+    shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], truth, draw)
     measured = (origin_m + moved.observed_position_m[:stop] + noise)[shown]
     gauge = None
-    if nature.trace_sigma_kPa is not None:
-        gauge = pressure_Pa[shown] + 1e3 * nature.trace_sigma_kPa * draw.standard_normal(shown.size)
-    sigma_m = np.full(shown.size, nature.noise_m) if nature.stated_sigma else None
+    if truth.trace_sigma_kPa is not None:
+        gauge = pressure_Pa[shown] + 1e3 * truth.trace_sigma_kPa * draw.standard_normal(shown.size)
+    sigma_m = np.full(shown.size, truth.noise_m) if truth.stated_sigma else None
     track = plain_track(time_s[index], measured, sigma_m=sigma_m, pressure_Pa=gauge)
     return VirtualTrial(
         stated=trial,
@@ -152,19 +150,19 @@ def _measure(
 
 
 def _faults(
-    velocity_m_s: Floats, nature: Nature, draw: np.random.Generator
+    velocity_m_s: Floats, truth: GroundTruth, draw: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], tuple[int, ...]]:
-    """Which true frame each row shows, and which instant its index claims.
+    """True frame that each row shows, and the frame number it claims; then dropped frames and repeated rows.
 
-    A dropped frame is missing and nobody knows: the rows after it claim one frame too early. A repeated frame shows
-    its predecessor once more in place of itself.
+    A dropped frame is missing without notice, so all later rows claim a time one frame too early. A repeated frame
+    shows its predecessor instead of itself.
     """
     moving = velocity_m_s > 0
-    dropped = moving & (draw.uniform(size=velocity_m_s.size) < nature.dropped)
+    dropped = moving & (draw.uniform(size=velocity_m_s.size) < truth.dropped)
     shown = np.flatnonzero(~dropped)
-    stale = moving[shown] & (draw.uniform(size=shown.size) < nature.repeated)
+    stale = moving[shown] & (draw.uniform(size=shown.size) < truth.repeated)
     stale[0] = False
-    # Where several follow each other, all show the last frame that was fresh.
+    # Consecutive repeated rows all show the last new frame.
     shown = shown[np.maximum.accumulate(np.where(stale, 0, np.arange(shown.size)))]
     rows = np.flatnonzero(stale)
     return shown, np.arange(shown.size), tuple(np.flatnonzero(dropped).tolist()), tuple(rows.tolist())
@@ -201,7 +199,7 @@ SHEET_COLUMNS = (
 
 
 def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
-    """The trial sheet of a campaign whose tracks lie in `tracks/`.
+    """Return the trial sheet of a campaign whose tracks lie in `tracks/`.
 
     Parameters
     ----------
@@ -209,7 +207,7 @@ def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
 
     Returns
     -------
-    a row a trial.
+    one row for each trial.
     """
     rows = [
         (
@@ -243,19 +241,19 @@ def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str 
         write_text(folder / "experiment.yaml", settings)
 
 
-def write_truth(grown: Sequence[VirtualTrial], nature: Nature, path: Path) -> None:
-    """Write what is hidden to a JSON file.
+def write_truth(grown: Sequence[VirtualTrial], truth: GroundTruth, path: Path) -> None:
+    """Write the ground truth to a JSON file.
 
     Parameters
     ----------
     grown : from `grow`.
-    nature : what was true.
+    truth : the ground truth.
     path : of the JSON file.
 
     Raises
     ------
     ValueError
-        If the file would lie in a folder that holds a trial sheet, or below one: the analysis looks there.
+        If the file would lie in or below a folder with a trial sheet, where the analysis reads.
     """
     for parent in path.absolute().parents:
         if (parent / "trials.csv").exists():
@@ -273,21 +271,22 @@ def write_truth(grown: Sequence[VirtualTrial], nature: Nature, path: Path) -> No
         }
         for trial in grown
     }
-    write_json(path, {"nature": asdict(nature), "trials": trials})
+    write_json(path, {"nature": asdict(truth), "trials": trials})
 
 
 BASE = BASE_EFFECTS
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nature:
-    """The truth behind a campaign.
+class GroundTruth:
+    """Ground truth of a simulated campaign.
 
-    `effects` and `values` are the physics. Scatter is a standard deviation from trial to trial, relative to B and to P;
-    `yield_error_kPa` that of the yield pressure stated for each vine. `release_frames` bounds the rest frames before
-    release, whose instant is uniform between two frames; `origin_m` bounds the unknown zero of position. Noise is
-    AR(1) with standard deviation `noise_m` and lag-one correlation `noise_correlation`. `dropped` and `repeated` are
-    probabilities per moving frame. `trace_sigma_kPa` is the noise of a recorded pressure (None: none is recorded).
+    `effects` and `values` are the physics. Scatter is a relative between-trial standard deviation of B or P;
+    `yield_error_kPa` is the standard deviation of the error of the stated yield pressures. `release_frames` are the
+    limits of the number of frames at rest, and the release is uniform between two frames; `origin_m` are the limits of
+    the unknown zero of position. Noise is AR(1) with standard deviation `noise_m` and lag-one correlation
+    `noise_correlation`. `dropped` and `repeated` are probabilities per moving frame. `trace_sigma_kPa` is the noise of
+    a recorded pressure (None: none is recorded).
     """
 
     effects: tuple[str, ...] = BASE
@@ -312,8 +311,8 @@ class Nature:
         return make_model(self.effects).with_values(self.values)
 
 
-def read_nature(path: Path) -> Nature:
-    """Read a nature from YAML; its keys are the fields of `Nature`, and `filming`, which is not read here.
+def read_ground_truth(path: Path) -> GroundTruth:
+    """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is ignored here.
 
     Parameters
     ----------
@@ -321,11 +320,11 @@ def read_nature(path: Path) -> Nature:
 
     Returns
     -------
-    the nature.
+    the ground truth.
     """
     content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     content.pop("filming", None)
     for key in ("effects", "release_frames", "origin_m"):
         if key in content:
             content[key] = tuple(content[key])
-    return Nature(**content)
+    return GroundTruth(**content)

@@ -1,9 +1,8 @@
-"""Campaigns: which vines are grown at which pressures with which payloads, how often.
+"""Campaigns: vines, pressures, payloads and number of replicates.
 
-`paper_campaign` is everything the paper grew: four isometric vines at about ten pressures each, walls of one diameter,
-payloads, 24 kPa for all scales, efficiencies, the fast vine; four trials of each. Where the paper gives no number
-(lengths other than 280 and 400 mm, the pressures themselves, payloads other than 35.6 g, which walls) ours are stated
-here.
+`paper_campaign` has all trials of the paper: four isometric vines at about ten pressures each, walls of one diameter,
+payloads, 24 kPa for all scales, efficiencies, the fast vine; four trials of each. Numbers that the paper does not give
+(lengths other than 280 and 400 mm, the pressures themselves, payloads other than 35.6 g, which walls) are stated here.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ PAPER_N = published.EXPONENT
 WALLS_UM = tuple(published.THICKNESS_UM.values())
 PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
 EFFICIENCY_LENGTH_MM = 200.0
-"""Beyond the 150 mm at which the paper takes the efficiency. Length of the vines whose efficiency is taken. Chosen: 50
-mm beyond, so that the end of growth stays away."""
+"""Length of the vines whose efficiency is evaluated. Chosen: 50 mm beyond the 150 mm at which the paper evaluates it,
+so that the end of growth has no effect."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Vine:
         name : of the trial.
         pressure_kPa : gauge pressure.
         payload_g : mass that rides on the tail.
-        capture_fps : frames a second.
+        capture_fps : frames per second.
 
         Returns
         -------
@@ -262,7 +261,7 @@ def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]
 
     Returns
     -------
-    values as `Nature.values` takes them; B in N·(s/m)ⁿ.
+    values as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
     """
     by_vine = {trial.vine: float(f"{_paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
@@ -277,7 +276,7 @@ def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | floa
 
     Returns
     -------
-    values as `Nature.values` takes them; B in N·(s/m)ⁿ.
+    values as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
     """
     by_vine = {trial.vine: PAPER_B[round(trial.diameter_m / 6e-3)] for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
