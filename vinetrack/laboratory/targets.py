@@ -72,7 +72,7 @@ class Target:
         return np.asarray(along_board / self.square_m + np.array(self.squares) / 2)
 
     def pattern(self) -> NDArray[np.uint8]:
-        """Printed pattern, 1 where white; per square PATTERN_PX for a ChArUco board (by OpenCV), 1 for a checkerboard."""
+        """Printed pattern, 1 where white: PATTERN_PX per square for a ChArUco board, 1 for a checkerboard."""
         import cv2
 
         if self.kind != "charuco":
