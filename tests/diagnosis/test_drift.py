@@ -1,4 +1,4 @@
-"""Parameters that drift with what they should not know, on vines from the virtual laboratory.
+"""Parameters that drift with conditions on which they should not depend, on vines from the virtual laboratory.
 
 Seeds 100 to 140 and 300 to 347 were looked at while the tests of drift were built; those here, from 51, score.
 """

@@ -157,7 +157,7 @@ def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they
     assert (outcome.verdict, outcome.answer_set, outcome.effects) == ("unexplained", (), ())
     assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
     assert f"Without t2 the verdict is `{others.verdict}`" in outcome.explanation
-    assert outcome.explanation.endswith("With t2: what the verdict would be rests on it alone. A friction is missing.")
+    assert outcome.explanation.endswith("With t2: the verdict would rest on it alone. A friction is missing.")
 
 
 def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaign):

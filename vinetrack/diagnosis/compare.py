@@ -1,14 +1,14 @@
-"""Model against measurement, condition by condition, beside what repeated trials differ by.
+"""Errors of a fitted model by condition, compared with the scatter of replicates.
 
-A trial's prediction has a release and an origin of its own and nothing else: its pressure and B deviate by nothing, as
-for a trial that was left out of the fit. The origin is where the vine is seen at rest; the release, and the origin
-where no rest was filmed, are where the root mean square is least. Replicates are laid on their mean in the same way,
-without any model: so one that lacks nothing comes out at the floor, at a ratio of 1.
+The prediction of a trial has its own release and origin, but no deviation of pressure and B, as for a trial that was
+left out of the fit. The origin is the position at standstill; the release, and the origin where no standstill was
+filmed, minimise the root mean square error. Replicates are aligned with their mean in the same way, without any model,
+so that a model which lacks nothing has an error equal to the replicate floor, a ratio of 1.
 
-The two errors are those of the paper's Table II (Alvarez et al., 2025): of the position over the whole growth, and of
-the final speed of the leading edge. A model whose vines stop and start again is followed through every stop, but the
-corners of such a motion may lie a frame apart in model and measurement, and its replicates are then no mere shifts of
-each other: their floor takes that for scatter.
+The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of the
+final speed of the leading edge. A vine that stops and starts again is simulated through every stop, but the corners of
+such a motion may differ by a frame between model and measurement, and its replicates are then not merely shifted
+against each other: the floor counts this as scatter.
 """
 
 from __future__ import annotations
@@ -58,24 +58,24 @@ TRAJECTORY_COLUMNS = (
 )
 
 FINAL_AT_FRACTION = 0.95
-"""Of the length, or of as much of it as was seen: a bare vine's speed has a meaning only with the place it is taken.
-Chosen as the fit's END_FRACTION."""
+"""Fraction of the length, or of the part seen, at which the final speed is taken: the speed of a vine without payload
+changes along the growth. Chosen as END_FRACTION of the fit."""
 
 MAX_DURATION_FACTOR = 3.0
-"""How many times longer than the recording the model is followed, to get where the measurement got. Chosen as a
-safeguard: a model three times slower has failed in any case."""
+"""Duration of the simulation, in durations of the recording, so that a slow model reaches the same position. Chosen as
+a safeguard: a model three times slower has failed in any case."""
 
 SMOOTHED_SHARE = 0.05
-"""Of the growth's duration, over which the misfit is averaged to find where it is worst: one frame's noise is not.
-Chosen: a twentieth averages 5 to 50 frames."""
+"""Fraction of the growth's duration over which the residual is averaged before its maximum is found, so that the noise
+of one frame is not. Chosen: a twentieth averages 5 to 50 frames."""
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """`table` has a row a condition, columns `COMPARISON_COLUMNS`.
+    """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`.
 
-    `trajectories` gives each condition's trials and what the model says of them, columns `TRAJECTORY_COLUMNS`: since
-    release, from the origin. `trials` are the predictions.
+    `trajectories` holds the trials of each condition with the model's prediction, columns `TRAJECTORY_COLUMNS`, with
+    time since release and position from the origin. `trials` are the predictions.
     """
 
     table: pd.DataFrame
@@ -111,19 +111,18 @@ def compare(
     kinematics: Mapping[str, Kinematics] | None = None,
     final_at_fraction: float = FINAL_AT_FRACTION,
 ) -> Comparison:
-    """Hold a fitted model against the trials of an experiment.
+    """Compare a fitted model with the trials of an experiment.
 
     Parameters
     ----------
     fit : the fitted model.
-    experiment : an experiment or its folder, or pairs of trial and track; trials that the fit did not use are passed
-        over.
+    experiment : an experiment or its folder, or pairs of trial and track; trials that the fit did not use are skipped.
     tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
     kinematics : mapping, optional
-        By name of trial, where they are known already; else they are estimated from the tracks.
+        By name of trial, where known already; otherwise estimated from the tracks.
     final_at_fraction : float
-        Fraction of the length at which the final speed is taken; where less was seen, the same fraction of that.
+        Fraction of the length, or of the part seen, at which the final speed is taken.
 
     Returns
     -------
@@ -132,7 +131,7 @@ def compare(
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the simulation of the model fails.
     ExperimentError
         If the experiment cannot be read.
     """
@@ -160,7 +159,7 @@ def compare(
 
 
 def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[str, float]:
-    """Errors of position of one condition while it moves: every trial counts alike, however many frames it has.
+    """Position errors of one condition in motion, with equal weight for every trial, however many its frames.
 
     Parameters
     ----------
@@ -188,17 +187,17 @@ def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[st
 
 
 def _worst(together: Replicates) -> tuple[float, float]:
-    """Time since release and growth where the replicates' mean, a little smoothed, is farthest from the model."""
+    """Time since release and growth where the smoothed mean residual of the replicates is largest."""
     moving = (together.time_s >= together.begin_s) & (together.present > 0)
     if not moving.any():
         return math.nan, math.nan
-    misfit_m, time_s = together.mean_residual_m[moving], together.time_s[moving]
-    half = int(SMOOTHED_SHARE * misfit_m.size / 2)
-    total = np.concatenate([[0.0], np.cumsum(misfit_m)])
-    low = np.maximum(np.arange(misfit_m.size) - half, 0)
-    high = np.minimum(np.arange(misfit_m.size) + half + 1, misfit_m.size)
-    worst = int(np.argmax(np.abs((total[high] - total[low]) / (high - low))))
-    return float(time_s[worst]), float((together.model_m[moving] + misfit_m)[worst])
+    residual_m, time_s = together.mean_residual_m[moving], together.time_s[moving]
+    half = int(SMOOTHED_SHARE * residual_m.size / 2)
+    cumulative = np.concatenate([[0.0], np.cumsum(residual_m)])
+    low = np.maximum(np.arange(residual_m.size) - half, 0)
+    high = np.minimum(np.arange(residual_m.size) + half + 1, residual_m.size)
+    worst = int(np.argmax(np.abs((cumulative[high] - cumulative[low]) / (high - low))))
+    return float(time_s[worst]), float((together.model_m[moving] + residual_m)[worst])
 
 
 def _final_speed_errors(
@@ -208,23 +207,23 @@ def _final_speed_errors(
     kinematics: Mapping[str, Kinematics],
     at_fraction: float = FINAL_AT_FRACTION,
 ) -> dict[str, float]:
-    """Model minus measurement of the leading edge's final speed, m/s, by name of trial; both at the same place.
+    """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position.
 
-    A model that never gets there has stopped: its speed there is 0. NaN where the measurement gives none.
+    A model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.
     """
     times = [MAX_DURATION_FACTOR * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
-    moved = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
+    runs = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
     errors = {}
-    for trial, time_s, run in zip(predicted, times, moved, strict=True):
-        known = kinematics.get(trial.name) or estimate_kinematics(
+    for trial, time_s, run in zip(predicted, times, runs, strict=True):
+        motion = kinematics.get(trial.name) or estimate_kinematics(
             tracks[trial.name], travel_ratio=trial.trial.travel_ratio
         )
-        travel_m = known.lead_position_m - trial.origin_m
+        travel_m = motion.lead_position_m - trial.origin_m
         seen_m = float(np.max(trial.lead_position_m)) - trial.origin_m
         length_m = trial.trial.length_m
         place_m = at_fraction * (min(length_m, seen_m) if math.isfinite(length_m) else seen_m)
-        measured = lead_velocity_at(travel_m, known.lead_velocity_m_s, place_m)
+        measured = lead_velocity_at(travel_m, motion.lead_velocity_m_s, place_m)
         by_model = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
         errors[trial.name] = (by_model if math.isfinite(by_model) else 0.0) - measured
     return errors
@@ -238,9 +237,9 @@ def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats
 
 
 def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.DataFrame:
-    """One condition's trials and the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
+    """Trials of one condition with the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
 
-    `replicates_mean_m` is the mean of the replicates then, `replicates_sigma_m` their standard deviation.
+    `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
 
     Parameters
     ----------

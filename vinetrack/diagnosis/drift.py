@@ -1,13 +1,13 @@
-"""Parameters that drift with a condition they should not know.
+"""Parameters that drift with a condition on which they should not depend.
 
-One B should do for a vine at every pressure, with every payload; one γ for all trials. So every trial is asked which
-value would suit it best, all else held at the common law: position, least squares, its release free. Values that follow
-the pressure point to what is missing. The scatter of replicates says how far such values stray by themselves; spreads
-and noise of the fit, which a model that fails inflates, are not asked.
+One B should describe a vine at every pressure and with every payload, one γ all trials. The best value is therefore
+fitted to each trial, with all other parameters at their common values, by least squares of position with its release
+free. Values that follow the pressure point to what is missing. Their scatter by chance is taken from replicates, not
+from the between-trial standard deviations and noise of the fit, which a model that fails inflates.
 
-The common law was fitted to the same trials and has taken part of the drift upon itself (n most of it, where B would
-follow the pressure): what is found is what is left, and its z errs to the small side. What it cannot take over is a B
-that would have to change along the growth; and it shows in a yield pressure that is pulled away from the sheet's
+The common parameters were fitted to the same trials and have absorbed part of the drift (n most of it, where B follows
+the pressure): what is found is the remainder, and its z is too small rather than too large. A change of B along the
+growth cannot be absorbed, and a yield pressure that is pulled away from the sheet's is a sign of it
 (`vinetrack.diagnosis.drift_along`).
 """
 
@@ -82,24 +82,24 @@ GROUP_COLUMNS = (
 )
 
 MOST_ITERATIONS = 15
-"""Iterations of a refit at most. Chosen: it begins beside its end."""
+"""Maximum number of iterations of a refit. Chosen: it starts near its minimum."""
 
 
 FALSE_ALARM_LEVEL = 0.01
-"""How often any drift at all is called significant where nothing drifts. Chosen: the usual 1 %, shared over all
-parameters and conditions by Bonferroni."""
+"""Family-wise probability that any drift is called significant where nothing drifts. Chosen: the usual 1 %, shared
+among all parameters and conditions (Šidák)."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """What drifts, most significant first, and the values behind it; SI.
+    """Drifts, most significant first, and the values of the groups; SI.
 
-    `table`, columns `DRIFT_COLUMNS`, has a row a parameter, vine (blank: all) and condition: from `from_level` to
-    `to_level` of the nominal condition (`growth`: parts of it; `sheet`: what it states) it rises by `change` ±
-    `change_sigma` (`relative`: of itself). `z` is that in standard errors by Student's t with `dof` degrees of freedom,
-    `z_constancy` how unlikely groups so different are.
+    `table`, columns `DRIFT_COLUMNS`, has one row for each parameter, vine (blank: all) and condition. From `from_level`
+    to `to_level` of the nominal condition (`growth`: fractions of it; `sheet`: the stated value) the parameter rises by
+    `change` ± `change_sigma` (`relative`: as a fraction). `z` is its significance by Student's t with `dof` degrees of
+    freedom, `z_constancy` that of the differences between groups.
     `groups`, columns `GROUP_COLUMNS`, has the mean value of every group: `level` is the nominal condition, NaN where
-    the groups are vines; `ratio` the value over that of the common law.
+    the groups are vines; `ratio` the value divided by the common value.
     """
 
     table: pd.DataFrame
@@ -108,19 +108,19 @@ class Drift:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """A sentence for every parameter and condition it drifts with, of the row that says so most clearly."""
+        """One sentence for each parameter and condition with a significant drift, of the most significant row."""
         significant = self.table[self.table["significant"]].drop_duplicates(["parameter", "against"])
         return tuple(significant["sentence"])
 
 
 def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
-    """Ask every parameter whether it drifts with pressure, payload, angle, chamber, inlet, vine or along the growth.
+    """Test every parameter for drift with pressure, payload, angle, chamber, inlet, vine or along the growth.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit of the model.
     scatter : Scatter, optional
-        What replicates differ by, where it is known already.
+        Between-trial scatter, where known already.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the simulation of the model fails.
     """
     import pandas as pd
 
@@ -148,7 +148,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
 
 
 def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
-    """Return what suits every group of trials best under the first model and, where something was added, the last.
+    """Return the best values of each group of trials under the first model and, where something was added, the last.
 
     Parameters
     ----------
@@ -158,8 +158,8 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Columns `GROUP_COLUMNS` and `model` (`before` or `after`); the last model is left out where its drift cannot be
-        worked out.
+        Columns `GROUP_COLUMNS` and `model` (`before` or `after`); without the last model where its drift cannot be
+        computed.
     """
     import pandas as pd
 
@@ -174,12 +174,12 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
 
 def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
     keys = [key for key in fit.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
-    laid, damping = align_trials(fit), None
+    aligned, damping = align_trials(fit), None
     for key in keys:
         try:
-            estimates = per_trial_estimates(fit, key, laid)
+            estimates = per_trial_estimates(fit, key, aligned)
         except SimulationError:
-            notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
+            notes.append(f"{key} could not be fitted to single trials: the simulation fails there.")
             continue
         damping = estimates if key == DAMPING else damping
         for against in COVARIATES:
@@ -188,13 +188,13 @@ def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTe
     yield from against_the_sheet(fit)
     if damping is not None:
         try:
-            yield from along_growth(fit, laid, damping)
+            yield from along_growth(fit, aligned, damping)
         except SimulationError:
-            notes.append("B could not be followed along the growth: the model cannot be followed there.")
+            notes.append("B along the growth could not be estimated: the simulation fails there.")
 
 
 def _against(estimates: PerTrialEstimates, against: Covariate) -> Iterator[ConstancyTest]:
-    """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
+    """Tests of one parameter against one condition: each vine alone where the parameter is per vine, and all."""
     levels = np.array([against.level(trial) for trial in estimates.trials])
     usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
     vines = np.array([trial.vine for trial in estimates.trials])
@@ -253,18 +253,18 @@ def _slope(
         "dof": sums.dof,
         "n_trials": int(sums.x.size),
     }
-    row["sentence"] = _said(estimates, against, row, steadily=p <= p_groups)
+    row["sentence"] = _sentence(estimates, against, row, steadily=p <= p_groups)
     return ConstancyTest(row, min(1.0, 2 * min(p, p_groups)), groups)
 
 
-def _said(estimates: PerTrialEstimates, against: Covariate, row: Mapping[str, Any], *, steadily: bool) -> str:
-    """A row in words; `steadily` where a straight line says more than that groups differ."""
+def _sentence(estimates: PerTrialEstimates, against: Covariate, row: Mapping[str, Any], *, steadily: bool) -> str:
+    """A row in words; `steadily` where the slope is more significant than the differences between groups."""
     who = f"{estimates.symbol} of {row['vine']}" if row["vine"] else estimates.symbol
     start, stop = against.formatted(row["from_level"]), against.formatted(row["to_level"])
     if steadily:
         return (
             f"{who} rises by {_amount(estimates, row['change'], row['change_sigma'])} from {start} to {stop}"
-            f" of {against.label} ({row['z']:.1f} σ), though it should not know the {against.label}."
+            f" of {against.label} ({row['z']:.1f} σ), though it should not depend on the {against.label}."
         )
     low, high = sorted((row["from_level"], row["to_level"]))
     return (
@@ -274,7 +274,7 @@ def _said(estimates: PerTrialEstimates, against: Covariate, row: Mapping[str, An
 
 
 def _amount(estimates: PerTrialEstimates, change: float, error: float) -> str:
-    """A change with its error, in per cent or in the unit it reads best in."""
+    """A change with its standard error, in per cent or in its display unit."""
     unit, factor = ("%", 100.0) if estimates.logarithmic else display_unit(estimates.unit)
     digits = max(decimals(error * factor) - 1, 0)
     return f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
@@ -288,7 +288,7 @@ def _groups(
     sums: BlockedDeviations,
     vine: str,
 ) -> list[dict[str, object]]:
-    """Mean value of every group; error from the scatter of replicates."""
+    """Mean value of every group, with its standard error from the scatter of replicates."""
     rows = []
     for level in np.unique(levels[chosen]):
         k = np.flatnonzero(chosen & (levels == level))
@@ -335,7 +335,7 @@ def _group_row(
 def _vine_row(
     key: str, symbol: str, unit: str, groups: Sequence[dict[str, object]], z: float, dof: float, n_trials: int
 ) -> dict[str, object]:
-    """A row for values that differ between vines; the change is from the lowest to the highest."""
+    """Row for a parameter that differs between vines; the change is from the lowest to the highest value."""
     ordered = sorted(groups, key=lambda group: float(str(group["value"])))
     low, high = ordered[0], ordered[-1]
     shown, factor = display_unit(unit)
@@ -359,26 +359,26 @@ def _vine_row(
         "z_constancy": z,
         "dof": dof,
         "n_trials": n_trials,
-        "sentence": f"{symbol} differs between the vines ({z:.1f} σ), though one should do for all: {ends}.",
+        "sentence": f"{symbol} differs between the vines ({z:.1f} σ), though one value should describe all: {ends}.",
     }
 
 
 def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
-    """Whether a number that all trials share suits every vine: each is fitted alone, with all its numbers free."""
+    """Test whether parameters shared by all trials differ between vines, each vine fitted alone."""
     shared = [n.key for n in fit.numbers if not n.vine and n.key != YIELD_PRESSURE]
-    parts = list(_alone(fit, scatter)) if shared else []
+    parts = list(_fit_vines(fit, scatter)) if shared else []
     for key in shared:
         estimates = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
         estimates = [estimate for estimate in estimates if math.isfinite(estimate[1].sigma) and estimate[1].sigma > 0]
         if len(estimates) > 1:
-            yield _apart(fit[key], estimates)
+            yield _compare_vines(fit[key], estimates)
 
 
-def _alone(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
-    """Every vine of several pressures fitted alone; trials scatter as replicates do."""
+def _fit_vines(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
+    """Fits of each vine with several pressures alone; the between-trial scatter is that of replicates."""
     spread = (max(scatter.pressure, LEAST_BETWEEN_TRIAL_SD[0]), max(scatter.damping, LEAST_BETWEEN_TRIAL_SD[1]))
     state = replace(fit.solution.state, spread=spread)
-    honest = replace(fit, solution=replace(fit.solution, state=state))
+    rescaled = replace(fit, solution=replace(fit.solution, state=state))
     for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
         members = [trial for trial in fit.trials if trial.trial.vine == vine]
         if len({trial.trial.pressure_Pa for trial in members}) < 2:
@@ -387,26 +387,26 @@ def _alone(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
         try:
             yield (
                 vine,
-                fit_subset(honest, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS),
+                fit_subset(rescaled, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS),
             )
         except FitError:
             continue
 
 
-def _apart(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
-    """The values of single vines against one for all."""
+def _compare_vines(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
+    """χ² test of the values of single vines against their mean."""
     from scipy.stats import chi2 as chi_square
 
     value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
     p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
-    groups = [_alone_group(*estimate, common.value) for estimate in estimates]
+    groups = [_vine_group(*estimate, common.value) for estimate in estimates]
     count = sum(estimate[2] for estimate in estimates)
     row = _vine_row(common.key, common.symbol, common.unit, groups, normal_deviate(p), math.inf, count)
     return ConstancyTest(row, p, groups)
 
 
-def _alone_group(vine: str, number: Number, count: int, common: float) -> dict[str, object]:
+def _vine_group(vine: str, number: Number, count: int, common: float) -> dict[str, object]:
     return {
         "parameter": number.key,
         "vine": vine,

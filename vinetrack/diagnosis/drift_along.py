@@ -1,8 +1,8 @@
-"""Whether B changes along the growth, and whether the sheet's yield pressure is kept.
+"""Tests of whether B changes along the growth, and whether the fitted yield pressure agrees with the sheet.
 
-What B would suit the first half of the growth of a trial, and what the second? The scatter of pressure and B from trial
-to trial is the same in both and drops out of their difference: an effect that builds up along the way, which n and the
-yield pressure may hide from every comparison between trials, shows here.
+B is estimated for the first and second half of the growth of each trial. The scatter of pressure and B between trials
+is the same in both halves and cancels in their difference. An effect that builds up along the growth shows here even
+where n and the yield pressure absorb it in every comparison between trials.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 STEP = 1e-3
-"""Relative step of a difference. Derived: 1000 times the integrator's error."""
+"""Relative step of a finite difference. Derived: 1000 times the integrator's error."""
 
 LEAST_SCATTER = 2e-3
-"""Of the rise of ln B in a single trial: that replicates agree better is taken for chance. Chosen: a tenth of the
-usual scatter of B within a batch."""
+"""Lower limit of the standard deviation of the rise of ln B in single trials: better agreement of replicates counts as
+chance. Chosen: a tenth of the usual scatter of B within a batch."""
 
 LARGEST_STEP = 3.0
-"""Deviation of ln B, a factor of 20, beyond which the linear step of a half says nothing: its trial is passed over.
-Chosen: what builds up along the way is some per cent to a factor of two; a tip that stands still in one half asks for
-e^1000. At half (4.5) and twice (400) the tests of sound trials are the same."""
+"""Deviation of ln B of a half (a factor of 20) beyond which the linear step is meaningless and the trial is skipped.
+Chosen: effects that build up along the growth are some per cent to a factor of two; a tip that stands still in one half
+would need e^1000. At half (4.5) and twice (400) the tests of sound trials are the same."""
 
 HALVES = (0.25, 0.75)
-"""Middles of the halves, as parts of the growth. Defined by the halves."""
+"""Midpoints of the halves, as fractions of the growth. Defined by the halves."""
 
 
 @dataclass(frozen=True)
 class _Halves:
-    """Deviation of ln B that suits each half of the growth of every trial, shape (n_trials, 2)."""
+    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2)."""
 
     trials: tuple[Trial, ...]
     deviation: Floats
 
 
-def along_growth(fit: Fit, laid: AlignedTrials, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
-    """Rows of B against the growth, for every vine and for all; `values` are those of B.
+def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
+    """Test B for a change along the growth, for every vine and for all.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    laid : its model aligned with its trials.
-    values : values of B by trial.
+    fit : the fit of the model.
+    aligned : the model aligned with its trials.
+    estimates : best-fit values of B by trial.
 
     Yields
     ------
@@ -64,54 +64,58 @@ def along_growth(fit: Fit, laid: AlignedTrials, values: PerTrialEstimates) -> It
     Raises
     ------
     SimulationError
-        If a trajectory cannot be followed.
+        If the simulation of a trajectory fails.
     """
-    if laid.predictor.damping_column < 0:
+    if aligned.predictor.damping_column < 0:
         return
-    halves = _halves(fit, laid, values.trial_effects)
+    halves = _halves(fit, aligned, estimates.trial_effects)
     vines = np.array([trial.vine for trial in halves.trials])
-    known = (np.abs(halves.deviation) <= LARGEST_STEP).all(axis=1)
-    names = list(dict.fromkeys(vines[known]))
+    usable = (np.abs(halves.deviation) <= LARGEST_STEP).all(axis=1)
+    names = list(dict.fromkeys(vines[usable]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
-        chosen = np.flatnonzero(known & ((vines == vine) | (vine == "")))
-        tested = _tested(fit, halves, str(vine), chosen)
-        if tested is not None:
-            yield tested
+        chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
+        test = _difference_test(fit, halves, str(vine), chosen)
+        if test is not None:
+            yield test
 
 
-def _halves(fit: Fit, laid: AlignedTrials, trial_effects: Floats) -> _Halves:
-    """About each trial's own B: about the common one, its scatter would count in the second order."""
+def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
+    """Deviations of ln B in both halves, linearised about each trial's own B.
+
+    About the common B, the between-trial scatter would enter in second order.
+    """
     motions = motions_of(fit, trial_effects)
-    data = laid.predictor.data
-    columns = laid.predictor.linearise(np.empty(0), trial_effects)
-    held = rest_is_seen(data)
-    middles = [
+    data = aligned.predictor.data
+    columns = aligned.predictor.linearise(np.empty(0), trial_effects)
+    origin_fixed = rest_is_seen(data)
+    middles_m = [
         0.5
         * float(np.max(np.interp(trial_data.time_s - trial_effects[i, RELEASE], motion.time_s, motion.lead_position_m)))
         for i, (trial_data, motion) in enumerate(zip(data, motions, strict=True))
     ]
-    pushes = [_pushes(*pair) for pair in zip(motions, middles, strict=True)]
+    pushes = [_pushes(*pair) for pair in zip(motions, middles_m, strict=True)]
     deviation = np.full((len(data), 2), math.nan)
-    for i, answers in enumerate(acceleration_sensitivities(fit, trial_effects, motions, pushes)):
-        others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
-        if laid.predictor.has_damping_deviation[i] and np.all(np.ptp(answers, axis=0) > 0):
-            deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
+    for i, sensitivities in enumerate(acceleration_sensitivities(fit, trial_effects, motions, pushes)):
+        others = columns[i][:, [RELEASE]] if origin_fixed[i] else columns[i][:, [RELEASE, ORIGIN]]
+        if aligned.predictor.has_damping_deviation[i] and np.all(np.ptp(sensitivities, axis=0) > 0):
+            design = np.column_stack([sensitivities, others])
+            deviation[i] = np.linalg.lstsq(design, columns[i][:, -1], rcond=1e-9)[0][:2]
     return _Halves(tuple(trial_data.trial for trial_data in data), deviation + trial_effects[:, [DAMPING_DEVIATION]])
 
 
 def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
-    """What a unit of ln B does to the tail's acceleration in each half of the growth, m/s², shape (n_times, 2)."""
+    """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
     value = motion.model.values[DAMPING]
     assert isinstance(value, float)
-    more = motion.model.with_values({DAMPING: value * math.exp(STEP)})
+    increased = motion.model.with_values({DAMPING: value * math.exp(STEP)})
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    changed = evaluate(more, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+    changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
     push = (changed - motion.model_acceleration) / STEP
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 
-def _tested(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
-    """The mean difference of the halves against how replicates differ in it."""
+def _difference_test(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
+    """Student's t test of the mean difference of the halves; None without enough degrees of freedom."""
     from scipy.stats import t as student
 
     rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
@@ -145,26 +149,26 @@ def _tested(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Constan
         "sentence": (
             f"{who} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} % larger in the {where[1]}"
             f" half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though it should not change along"
-            " the way."
+            " the growth."
         ),
     }
     return ConstancyTest(row, p, _groups(fit, halves, vine, chosen) if vine else [])
 
 
 def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
-    """Standard deviation of replicates about their mean, or of all trials where there are none; degrees of freedom."""
+    """Standard deviation of replicates about their means, or of all trials without replicates; degrees of freedom."""
     names = np.array(conditions)
-    left = values.copy()
+    deviations = values.copy()
     for name in set(conditions):
-        left[names == name] -= values[names == name].mean()
+        deviations[names == name] -= values[names == name].mean()
     dof = values.size - len(set(conditions))
     if dof < FEWEST_DEGREES:
-        left, dof = values - values.mean(), values.size - 1
-    return math.sqrt(float(np.sum(left**2)) / max(dof, 1)), dof
+        deviations, dof = values - values.mean(), values.size - 1
+    return math.sqrt(float(np.sum(deviations**2)) / max(dof, 1)), dof
 
 
 def _groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
-    """Mean value of each half; the error is that of their difference, shared between them."""
+    """Mean value of each half; the variance of their difference is divided equally between them."""
     rows: list[dict[str, object]] = []
     conditions = [halves.trials[i].condition for i in chosen]
     rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
@@ -191,11 +195,11 @@ def _groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[di
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
-    """Rows of yield pressures that the fit moved, beside the error that the sheet gives them.
+    """Compare fitted yield pressures with the sheet, in units of the standard error stated there.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
+    fit : the fit of the model.
 
     Yields
     ------
@@ -204,8 +208,8 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
     for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
         if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
             continue
-        away = number.value - free.start
-        z = abs(away) / free.prior_sd
+        change = number.value - free.start
+        z = abs(change) / free.prior_sd
         p = math.erfc(z / math.sqrt(2))
         row = {
             "parameter": number.key,
@@ -215,7 +219,7 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
             "against": "sheet",
             "from_level": free.start,
             "to_level": number.value,
-            "change": away,
+            "change": change,
             "change_sigma": free.prior_sd,
             "relative": False,
             "z": z,

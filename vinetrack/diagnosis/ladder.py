@@ -1,10 +1,10 @@
-"""The ladder of errors: what every added effect did to them, in sample and on what a model had not seen.
+"""The ladder of errors: in-sample and out-of-sample errors of each model as effects are added.
 
-All errors are those of `vinetrack.diagnosis.compare`: a trial has a release and an origin of its own and nothing else,
-the origin is where the vine was seen at rest, and every trial counts alike. They differ only in what the model was
-fitted to: to everything; to everything but the condition that is predicted, each in turn; to everything but the
-highest pressure of each vine. The floor is what replicates differ by. Where it is most of the error, the error itself
-hardly falls when the model gets better: the excess √(rms² − floor²) does.
+All errors are those of `vinetrack.diagnosis.compare`: each trial has its own release and origin and no other trial
+effect, the origin is the position at standstill, and every trial has the same weight. They differ in the data of the
+fit: all trials; all but the condition predicted, each in turn (leave-one-condition-out cross-validation); all but the
+highest pressure of each vine. The floor is the scatter of replicates. Where it dominates, the error hardly falls as the
+model improves, but the excess √(rms² − floor²) does.
 """
 
 from __future__ import annotations
@@ -41,33 +41,33 @@ LADDER_COLUMNS = (
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
 MAX_FOLDS = 48
-"""Parts in which conditions are left out at most; of more conditions several are left out at once, so that the time
-grows as the number of trials alone and not as that times the number of conditions. Chosen: the fit still sees 98 % of
-the conditions; at half 96 %, at twice the time of this step doubles."""
+"""Maximum number of folds of the cross-validation; of more conditions several are left out at once, so that the time
+grows with the number of trials and not also with that of conditions. Chosen: each fit still uses 98 % of the
+conditions; at half 96 %, at twice the time of this step doubles."""
 
 MOST_ITERATIONS = 6
-"""A fit without one condition begins beside its end, and settles in two or three. Chosen."""
+"""Iterations of a fit without one condition, which starts near its minimum and converges in two or three. Chosen."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Predictions of trials, and for those that cannot be predicted the reason, by name of trial."""
+    """Predictions of trials, and the reason for each trial that cannot be predicted, by name."""
 
     trials: tuple[TrialFit, ...]
     not_predicted: Mapping[str, str]
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the position errors while something moves, every trial alike; NaN where there is none."""
+        """Root mean square position error in motion, with equal weight for every trial; NaN without trials."""
         squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in self.trials]
         return math.sqrt(float(np.mean(squares))) if squares else math.nan
 
     @cached_property
     def floor(self) -> tuple[float, float]:
-        """What replicates differ by, over all conditions that have any, and its standard error, m; NaN where none has.
+        """Replicate floor over all conditions with replicates, and its standard error, m; NaN where none has any.
 
-        Mean of the conditions' variances weighted by their numbers of trials; the error of a variance s² of ν degrees
-        of freedom is s²√(2/ν).
+        Root of the mean variance of the conditions, weighted by their numbers of trials; the standard error of a
+        variance s² of ν degrees of freedom is s²√(2/ν).
         """
         conditions = dict.fromkeys(trial.trial.condition for trial in self.trials)
         squares, counts, degrees = [], [], []
@@ -87,23 +87,23 @@ class Errors:
 
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
-    """Errors of the model that the user came with and of every one after it.
+    """Compute the errors of the initial model and of every enlarged one.
 
     Parameters
     ----------
     fits : fits of the models in order, all to the same trials.
     added : what each added to the one before; blank for the first.
-    partial : how many of the last are steps that mend a part of what nothing mends in full.
+    partial : number of partial steps at the end, which remove only part of the misfit.
 
     Returns
     -------
     DataFrame
-        A row a model, columns `LADDER_COLUMNS`. `attrs["notes"]` holds sentences about what could not be predicted.
+        One row for each model, columns `LADDER_COLUMNS`. `attrs["notes"]` reports trials that could not be predicted.
 
     Raises
     ------
     FitError
-        If a model cannot be followed.
+        If the simulation of a model fails.
     """
     import pandas as pd
 
@@ -120,7 +120,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
 
 
 def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
-    """The row of one model, and sentences about what could not be predicted."""
+    """The row of one model, and notes about trials that could not be predicted."""
     inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)
     floor_m, floor_sigma_m = inside.floor
     row: dict[str, object] = {
@@ -142,7 +142,7 @@ def excess(rms_m: float, floor_m: float) -> float:
     Parameters
     ----------
     rms_m, floor_m : float, m
-        Error and what replicates differ by.
+        Error and replicate floor.
 
     Returns
     -------
@@ -167,9 +167,9 @@ def in_sample(fit: Fit) -> Errors:
 
 
 def left_out(fit: Fit) -> Errors:
-    """Predictions of every condition by the model fitted to all the others.
+    """Predictions of every condition by the model fitted to all others (cross-validation).
 
-    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine as far apart as it goes.
+    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine in different folds.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ def left_out(fit: Fit) -> Errors:
     """
     vines = {trial.trial.condition: trial.trial.vine for trial in fit.trials}
     conditions = list(vines) if len(vines) <= MAX_FOLDS else sorted(vines, key=lambda name: vines[name])
-    parts = [set(conditions[k::MAX_FOLDS]) for k in range(min(len(conditions), MAX_FOLDS))]
-    return _together([_without(fit, [trial.trial.condition in part for trial in fit.trials]) for part in parts])
+    folds = [set(conditions[k::MAX_FOLDS]) for k in range(min(len(conditions), MAX_FOLDS))]
+    return _combined([_held_out(fit, [trial.trial.condition in fold for trial in fit.trials]) for fold in folds])
 
 
 def highest_pressure(fit: Fit) -> Errors:
@@ -202,11 +202,11 @@ def highest_pressure(fit: Fit) -> Errors:
     for trial_fit in fit.trials:
         trial = trial_fit.trial
         highest[trial.vine] = max(highest.get(trial.vine, -math.inf), trial.pressure_Pa)
-    return _without(fit, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in fit.trials])
+    return _held_out(fit, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in fit.trials])
 
 
-def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
-    """Predictions of the trials that are `gone` by the model fitted to the rest."""
+def _held_out(fit: Fit, gone: Sequence[bool]) -> Errors:
+    """Predictions of the trials left out (`gone`) by the model fitted to the others."""
     data = [as_recorded(trial_data) for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         others = fit_subset(
@@ -218,19 +218,19 @@ def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
         )
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
-    alone = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
-    alone = {vine for vine in alone if _has_numbers_of_its_own(fit, vine)}
-    known = [trial_data for trial_data in data if trial_data.trial.vine not in alone]
-    left = {
-        trial_data.trial.name: f"no other condition of the vine {trial_data.trial.vine} says what its numbers are"
+    undetermined = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
+    undetermined = {vine for vine in undetermined if _has_own_parameters(fit, vine)}
+    predictable = [trial_data for trial_data in data if trial_data.trial.vine not in undetermined]
+    not_predicted = {
+        trial_data.trial.name: f"no other condition of the vine {trial_data.trial.vine} determines its parameters"
         for trial_data in data
-        if trial_data.trial.vine in alone
+        if trial_data.trial.vine in undetermined
     }
-    return _together([_predicted(others, known), Errors((), left)])
+    return _combined([_predicted(others, predictable), Errors((), not_predicted)])
 
 
 def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
-    """Predictions of trials; those that the model cannot be followed for are left without one, by their reason."""
+    """Predictions of trials; where the simulation of a trial fails, the reason instead."""
     if not data:
         return Errors((), {})
     try:
@@ -238,14 +238,14 @@ def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
     except FitError as error:
         if len(data) == 1:
             return Errors((), {data[0].trial.name: str(error)})
-        return _together([_predicted(fit, [trial_data]) for trial_data in data])
+        return _combined([_predicted(fit, [trial_data]) for trial_data in data])
 
 
-def _has_numbers_of_its_own(fit: Fit, vine: str) -> bool:
+def _has_own_parameters(fit: Fit, vine: str) -> bool:
     return any(number.vine == vine and number.key in fit.model.parameter_names for number in fit.numbers)
 
 
-def _together(parts: Sequence[Errors]) -> Errors:
+def _combined(parts: Sequence[Errors]) -> Errors:
     return Errors(
         tuple(trial for part in parts for trial in part.trials),
         {name: why for part in parts for name, why in part.not_predicted.items()},
@@ -263,14 +263,14 @@ def _notes(what: str, errors: Errors) -> list[str]:
 
 
 def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
-    """How the numbers moved along the ladder: a row a number of each model, columns `MOVED_COLUMNS`, SI.
+    """Table of the parameters of every model of the ladder, columns `MOVED_COLUMNS`, SI.
 
     Parameters
     ----------
     fits : sequence of Fit
-        One a step of the ladder.
+        One for each step of the ladder.
     added : sequence of str
-        What each step added; blank for the first.
+        Effect added by each step; blank for the first.
 
     Returns
     -------

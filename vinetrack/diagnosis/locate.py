@@ -1,8 +1,8 @@
-"""Where a model fails beyond what replicates explain.
+"""Locate where a model fails by more than the scatter of replicates.
 
-By condition; along time, position and speed; and by which parameter drifts with a condition it should not know
-(`vinetrack.diagnosis.drift`). A prediction has a release and an origin of its own and nothing else, as in
-`vinetrack.diagnosis.compare`. Errors are those of the mean of the trials there, from how replicates scatter
+By condition; along time, position and speed; and by which parameter drifts with a condition on which it should not
+depend (`vinetrack.diagnosis.drift`). A prediction has its own release and origin and no other trial effect, as in
+`vinetrack.diagnosis.compare`. Standard errors are those of the mean over trials, from the scatter of replicates
 (`vinetrack.diagnosis.replicate_scatter`): a thousand frames of one trial are one trial.
 """
 
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0
-"""Standard deviations from which a model is said to fail (one condition among many must be less likely still), and of
-a condition that is then said to be missed."""
+"""Significance from which a model is said to fail (with a Bonferroni correction for single conditions), and from which
+a condition then counts as failing."""
 
 CONDITION_COLUMNS = (
     "vine",
@@ -68,11 +68,11 @@ SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s",
 class Failure:
     """Where a model fails; tables in SI, a residual is measurement minus model.
 
-    `by_condition`, columns `CONDITION_COLUMNS`, has the largest root mean square first, which every page calls the
-    worst condition; `z` tells how replicate_z replicates alone make the course of the mean residual. `along_time`,
+    `by_condition`, columns `CONDITION_COLUMNS`, has the largest root mean square first, which all pages call the worst
+    condition; `z` is the significance of the mean residual compared with the scatter of replicates. `along_time`,
     `along_position` and `along_speed` (since release; growth and speed of the leading edge in the model) hold the mean
-    residual of a stretch with its error; rows with a blank `condition` take all trials of a vine together. `drift`
-    tells which parameter knows a condition it should not.
+    residual of each stretch with its standard error; rows with a blank `condition` combine all trials of a vine.
+    `drift` states which parameters depend on a condition on which they should not.
     """
 
     model: str
@@ -85,11 +85,11 @@ class Failure:
 
     @property
     def fails(self) -> bool:
-        """Whether the conditions are off the model by more than replicates explain: the worst, or all together."""
+        """Whether the worst condition, or all together, deviate by more than the scatter of replicates."""
         return _fail(self.by_condition["z"].to_numpy(float))
 
     def sentences(self) -> tuple[str, ...]:
-        """Where it fails most, by how much, and what drifts, in plain words."""
+        """Where the model fails most, by how much, and what drifts, in words."""
         return (*_where(self.by_condition, self.fails), *self.drift.sentences)
 
 
@@ -99,7 +99,7 @@ def locate(fit: Fit) -> Failure:
     Parameters
     ----------
     fit
-        The fit that is questioned.
+        The fit of the model.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def locate(fit: Fit) -> Failure:
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the simulation of the model fails.
     """
     import pandas as pd
 
@@ -141,7 +141,7 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
     covariance = stretch_covariance(scatter, stretches)
     mean, count = stretches.means_m.mean(axis=0), len(members)
     sigma = np.sqrt(np.diag(covariance) / count)
-    # Replicates that were filmed at no common time, or in too few frames of it, have no means to hold against.
+    # Replicates without enough frames at common times have no stretch means.
     worst = int(np.argmax(np.abs(mean))) if mean.size else None
     trial = members[0].trial
     return {
@@ -169,7 +169,7 @@ def _along(
     columns: Sequence[str],
     scatter: Scatter,
 ) -> pd.DataFrame:
-    """Conditions of a vine along the same stretches, and all of its trials together."""
+    """Mean residuals of each condition in the same stretches, and of all trials of a vine together."""
     parts = []
     for members in whole.values():
         edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
@@ -190,7 +190,7 @@ def _table(
 def _mean_rows(
     members: Sequence[ResidualCourse], along: str, edges: Floats, condition: str, scatter: Scatter
 ) -> list[tuple[object, ...]]:
-    """Mean residual of every stretch over the trials that reach it, and its error."""
+    """Mean residual of every stretch over the trials that reach it, with its standard error."""
     parts = [stretch_means(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     present = np.isfinite(both).all(axis=2)
@@ -210,7 +210,7 @@ def _mean_rows(
 
 
 def _fail(z: Floats) -> bool:
-    """Whether the largest of so many deviates, or all of them together by Fisher's way, are too replicate_z."""
+    """Whether the largest deviate (Bonferroni), or all together (Fisher's combined test), are significant."""
     from scipy.stats import chi2, norm
 
     level = float(norm.sf(FAILED_SIGMAS))
@@ -225,7 +225,7 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
     if not fails:
         worst = table.sort_values("z").iloc[-1]
         return [
-            "Nowhere does the mean of the replicates leave the model by more than they explain themselves"
+            "In no condition does the mean of the replicates deviate from the model by more than their scatter explains"
             f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
         ]
     worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
@@ -241,12 +241,12 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
         f" ({worst['z']:.1f} σ in all)."
     ]
     where = "every condition" if len(failing) == len(table) else f"{len(failing)} of {len(table)} conditions"
-    places.append(f"It fails in {where} beyond what replicates explain.")
+    places.append(f"It fails in {where} by more than the scatter of replicates.")
     return places + _trend(table)
 
 
 def _trend(table: pd.DataFrame) -> list[str]:
-    """Whether it fails more and more towards one end of the pressures (or payloads)."""
+    """Say whether the misfit grows with pressure or payload."""
     trends = []
     for column, words, low, high in (
         ("pressure_Pa", "pressure", "lower", "higher"),
@@ -259,14 +259,14 @@ def _trend(table: pd.DataFrame) -> list[str]:
             continue
         ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
         if all(rank > 0.75 for rank in ranks):
-            trends.append(f"The {high} the {words}, the more it fails.")
+            trends.append(f"The {high} the {words}, the larger the misfit.")
         elif all(rank < -0.75 for rank in ranks):
-            trends.append(f"The {low} the {words}, the more it fails.")
+            trends.append(f"The {low} the {words}, the larger the misfit.")
     return trends
 
 
 def _named(row: pd.Series, table: pd.DataFrame) -> str:
-    """A condition in words: pressure, payload and vine as far as they vary."""
+    """A condition in words: pressure, and payload and vine where they vary."""
     words = f"{row['pressure_Pa'] / 1e3:.3g} kPa"
     if len(set(table["payload_kg"])) > 1:
         words += f" with {row['payload_kg'] * 1e3:.3g} g"
@@ -280,7 +280,7 @@ def _mm(metres: float) -> str:
 
 
 def _off(row: pd.Series) -> str:
-    """How far off, with its error, mm."""
+    """The largest mean residual with its standard error, mm."""
     off, sigma = 1e3 * abs(row["worst_residual_m"]), 1e3 * row["worst_sigma_m"]
     digits = decimals(sigma)
     return f"{off:.{digits}f} ± {sigma:.{digits}f} mm"

@@ -1,14 +1,15 @@
-"""Single trials that do not go with the others: a row of the sheet that belongs to another recording, a typing error.
+"""Outlying trials: a row of the sheet that belongs to another recording, or a typing error.
 
-One such trial among thirty leaves more than any effect explains, and the verdict is `unexplained`. It is looked for
-without the model that failed: over the middle of its growth the tail moves about so fast that damping holds the force,
+One such trial among thirty causes a misfit that no effect explains, and the verdict is `unexplained`. Outliers are
+detected without the model that failed: over the middle of the growth damping roughly balances the force,
 
     ln F_j = ln B_vine + n ln v_j + c (ln v_j)²,    F = (P − P_y) A + r m̄ g cos θ
 
-with a bend c for what goes with another power of speed. What a trial leaves of a robust fit of these curves is held
-against what the others leave. Effects that the model lacks bend all trials of a condition alike; a pressure with its
-digits swapped does not. Whether row or recording is wrong only the user can tell: nothing is left out by itself, but
-what the others say without it is said too, and a name that rests on such trials alone is taken back.
+with a curvature c for a force of another power of speed. The residual of a trial from a robust fit of these curves is
+compared with the residuals of the others. An effect that the model lacks changes all trials of a condition alike; a
+pressure with its digits swapped does not. Only the user can tell whether row or recording is wrong: no trial is left
+out automatically, but the diagnosis without it is reported too, and an effect that only such trials support is
+withdrawn.
 """
 
 from __future__ import annotations
@@ -33,34 +34,35 @@ from vinetrack.narrative.verdict_text import odd_in_words
 Indices = NDArray[np.int_]
 
 USUAL_EXPONENT = 0.37
-"""Where the exponent begins. PHYSICS: published for vines of 6 to 24 mm."""
+"""Starting value of the exponent. PHYSICS: published for vines of 6 to 24 mm."""
 
 USUAL_SCATTER = 0.05
-"""Scatter of ln F from which the robust fit gives trials less weight. Chosen: B of one vine scatters by 1 to 4 % and
-the pressure by 1 to 2 %; at half and twice only the efficiency of the fit changes."""
+"""Residual of ln F from which the robust fit reduces the weight of a trial. Chosen: B of one vine scatters by 1 to 4 %
+and the pressure by 1 to 2 %; at half and twice only the efficiency of the fit changes."""
 
 LEAST_SCATTER = 0.02
-"""Scatter of ln F that is allowed at least: what careful trials differ by. Chosen; at half and twice campaigns of a few
-very careful trials alone change."""
+"""Lower limit of the scatter of ln F: the scatter of careful trials. Chosen; at half and twice only campaigns of a few
+very careful trials change."""
 
 CHANCE = 1e-4
-"""Chance that normal scatter makes a trial of a campaign odd. Chosen: it is asked where the verdict is `unexplained`
-alone, and changes none; at ten times the limit falls from 10 to 8 standard deviations for 24 trials."""
+"""Probability that normal scatter makes any trial of a campaign an outlier. Chosen: small, since outliers matter where
+the verdict is `unexplained`; at ten times the limit falls from 10 to 8 standard deviations for 24 trials."""
 
 EFFICIENCY = 0.37
-"""Of a standard deviation from the median of absolute values, against the mean square. Derived for the normal
-distribution."""
+"""Efficiency of a standard deviation from the median absolute deviation, relative to the mean square. Derived for the
+normal distribution."""
 
 FEWEST_TRIALS, LARGEST_SHARE = 8, 0.125
-"""Trials from which some can be odd, and the part of them that may be; two at least, for rows are exchanged. Chosen:
-with eight, most say what is usual; where more than an eighth stand apart, they are no slips but a kind of their own."""
+"""Number of trials from which outliers are looked for, and the largest fraction that may be outliers (at least two, for
+rows get exchanged). Chosen: with eight, most trials define the usual; where more than an eighth deviate, they are no
+slips but a group of their own."""
 
 
 @dataclass(frozen=True)
 class OddTrial:
-    """A trial that does not go with the others: its pressure as stated and the one that it moves as with, Pa.
+    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa.
 
-    `like_Pa` is NaN where none is known.
+    `implied_pressure_Pa` is NaN where it is not known.
     """
 
     name: str
@@ -69,16 +71,16 @@ class OddTrial:
 
 
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
-    """Trials whose speed the stated numbers contradict, though those of the others agree.
+    """Find trials whose speed contradicts the sheet although the other trials agree with it.
 
     Parameters
     ----------
-    data : trials of evertible tubes, as they were fitted.
+    data : trials of everting tubes, as they were fitted.
 
     Returns
     -------
     list of OddTrial
-        In the order of the trials; none where they are many, or where there are too few to say what is usual.
+        In the order of the trials; empty where there would be many, or too few trials to define the usual.
     """
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
@@ -90,42 +92,45 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     if np.count_nonzero(moved) < FEWEST_TRIALS:
         return []
     names = [trial.vine for trial in trials]
-    known, place = np.unique(
+    vines, vine_index = np.unique(
         [name for name, is_moved in zip(names, moved, strict=True) if is_moved], return_inverse=True
     )
-    usual = _curves(np.log(force[moved]), np.log(speed[moved]), place)
-    which = {vine: k for k, vine in enumerate(known)}
-    left = np.full(len(data), -np.inf)
-    left[moved] = np.log(force[moved]) - usual(np.log(speed[moved]), place)
-    scatter = max(float(np.median(np.abs(left[moved]))) / 0.6745, LEAST_SCATTER)
+    curves = _fit_curves(np.log(force[moved]), np.log(speed[moved]), vine_index)
+    index_of = {vine: k for k, vine in enumerate(vines)}
+    residual = np.full(len(data), -np.inf)
+    residual[moved] = np.log(force[moved]) - curves(np.log(speed[moved]), vine_index)
+    scatter = max(float(np.median(np.abs(residual[moved]))) / 0.6745, LEAST_SCATTER)
     allowed = _limit(len(data)) * scatter
-    alike = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
+    replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip
-    # Where a replicate stands as far off it is the condition, and physics.
+    # Where a replicate deviates as much, the cause is physics of the condition.
     odd = [
         k
-        for k in np.flatnonzero(np.abs(left) > allowed).tolist()
-        if all(abs(left[j]) < allowed < abs(left[k] - left[j]) for j in alike[k])
+        for k in np.flatnonzero(np.abs(residual) > allowed).tolist()
+        if all(abs(residual[j]) < allowed < abs(residual[k] - residual[j]) for j in replicates[k])
     ]
     if len(odd) > max(2, int(LARGEST_SHARE * len(data))):
         return []
-    due = {k: float(usual(np.log(speed[k]), which[names[k]])) if names[k] in which else math.nan for k in odd}
-    return [OddTrial(trials[k].name, stated[k], _like_Pa(trials[k], math.exp(due[k]))) for k in odd]
+    expected = {
+        k: float(curves(np.log(speed[k]), index_of[names[k]])) if names[k] in index_of else math.nan for k in odd
+    }
+    return [OddTrial(trials[k].name, stated[k], _implied_pressure_Pa(trials[k], math.exp(expected[k]))) for k in odd]
 
 
 def _limit(count: int) -> float:
+    """Residual, in standard deviations, beyond which one of so many trials is an outlier (Bonferroni)."""
     from scipy.stats import t
 
     return float(t.isf(CHANCE / (2 * count), max(EFFICIENCY * count, 3.0)))
 
 
 def _stated_Pa(trial_data: FitTrial) -> float:
-    """Pressure of the row, or of the gauge where it was recorded."""
+    """Pressure of the row, or the median of the recorded pressure."""
     return trial_data.trial.pressure_Pa if trial_data.trace is None else float(np.median(trial_data.trace[1]))
 
 
 def _force_N(trial: Trial, pressure_Pa: float) -> float:
-    """Twice the force on the head less what begins growth and the weight, as in `kinematics.force`."""
+    """Twice the driving force on the tip: pressure above the yield pressure, and weight; as in `kinematics.force`."""
     return (pressure_Pa - float(np.nan_to_num(trial.yield_pressure_Pa))) * trial.area_m2 + _weight_N(trial)
 
 
@@ -135,24 +140,25 @@ def _weight_N(trial: Trial) -> float:
     return trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
 
 
-def _like_Pa(trial: Trial, force_N: float) -> float:
+def _implied_pressure_Pa(trial: Trial, force_N: float) -> float:
+    """Pressure at which this force would act."""
     return (force_N - _weight_N(trial)) / trial.area_m2 + float(np.nan_to_num(trial.yield_pressure_Pa))
 
 
-def _curves(log_force: Floats, log_speed: Floats, place: Indices) -> Callable[[Floats, Indices | int], Floats]:
-    """Logarithm of force by that of speed and the place of the vine: a level for each, a slope and a bend of all."""
+def _fit_curves(log_force: Floats, log_speed: Floats, vine_index: Indices) -> Callable[[Floats, Indices | int], Floats]:
+    """Fit ln F against ln v robustly (Cauchy loss): a level for each vine, a slope and a curvature common to all."""
     from scipy.optimize import least_squares
 
-    vines, middle = int(place.max()) + 1, float(np.median(log_speed))
+    n_vines, middle = int(vine_index.max()) + 1, float(np.median(log_speed))
 
     def curve(values: Floats, log_v: Floats, vine: Indices | int) -> Floats:
         return np.asarray(values[vine] + values[-2] * (log_v - middle) + values[-1] * (log_v - middle) ** 2)
 
     straight = log_force - USUAL_EXPONENT * (log_speed - middle)
-    begun = [float(np.median(straight[place == vine])) for vine in range(vines)]
+    levels = [float(np.median(straight[vine_index == vine])) for vine in range(n_vines)]
     fit = least_squares(
-        lambda values: log_force - curve(values, log_speed, place),
-        [*begun, USUAL_EXPONENT, 0.0],
+        lambda values: log_force - curve(values, log_speed, vine_index),
+        [*levels, USUAL_EXPONENT, 0.0],
         loss="cauchy",
         f_scale=USUAL_SCATTER,
     )
@@ -160,17 +166,17 @@ def _curves(log_force: Floats, log_speed: Floats, place: Indices) -> Callable[[F
 
 
 def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callable[[list[str]], Diagnosis]) -> Diagnosis:
-    """What trials that do not go with the others mean for a diagnosis.
+    """Add what outlying trials mean for a diagnosis.
 
-    Of an adequate model, and where the others bear a name out, they are a note. Where nothing explains all trials and
-    the others are explained, that is said. Where the others are explained and do not bear the name out, it rests on
-    these trials alone, and the verdict is `unexplained`.
+    Where the model is adequate, or the other trials support the same effect, they are a note. Where no effect explains
+    all trials but one explains the others, the explanation says so. Where the other trials are explained without the
+    effect, only the outliers support it, and the verdict becomes `unexplained`.
 
     Parameters
     ----------
-    result : of all trials.
-    odd : of them.
-    without : gives the diagnosis without the trials of these names.
+    result : the diagnosis of all trials.
+    odd : the outlying trials.
+    without : returns the diagnosis without the trials of these names.
 
     Returns
     -------
@@ -186,29 +192,29 @@ def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callabl
         others = without([trial.name for trial in odd])
     except (FitError, SimulationError):
         return noted
-    nothing = UNEXPLAINED in (result.verdict, result.final_verdict)
+    unexplained = UNEXPLAINED in (result.verdict, result.final_verdict)
     if UNEXPLAINED in (others.verdict, others.final_verdict):
-        return result if nothing else noted
-    if not nothing and set(result.answer_set) & set(others.answer_set):
+        return result if unexplained else noted
+    if not unexplained and set(result.answer_set) & set(others.answer_set):
         return noted
     result = replace(result, odd_trials=tuple(trial.name for trial in odd))
     names = joined(result.odd_trials)
     words = f"{words} Without {names} the verdict is `{others.verdict}`: {others.explanation} With {names}:"
-    if nothing:
+    if unexplained:
         return replace(result, explanation=f"{words} {result.explanation}")
-    named = f"what the verdict would be rests on {'it' if len(odd) == 1 else 'them'} alone. {result.explanation}"
-    return _taken_back(result, f"{words} {named}")
+    basis = f"the verdict would rest on {'it' if len(odd) == 1 else 'them'} alone. {result.explanation}"
+    return _withdrawn(result, f"{words} {basis}")
 
 
-def _taken_back(result: Diagnosis, words: str) -> Diagnosis:
-    """A diagnosis whose names do not stand."""
+def _withdrawn(result: Diagnosis, words: str) -> Diagnosis:
+    """The diagnosis as `unexplained`, with its effects withdrawn."""
     first = result.rounds[0]
     ranking = tuple(replace(candidate, in_answer_set=False) for candidate in first.ranking)
-    asked = replace(
+    withdrawn = replace(
         first, verdict=UNEXPLAINED, answer_set=(), ranking=ranking, explanation=words, fits={}, sets=(), partial=()
     )
     return Diagnosis(
-        rounds=(replace(asked, partial_fits=()),),
+        rounds=(replace(withdrawn, partial_fits=()),),
         effects=(),
         explanation=words,
         fits=result.fits[:1],
