@@ -168,4 +168,4 @@ def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:
     assert [label.get_text() for label in ax.get_yticklabels()] == ["leak, 1/τ", "air drag, C_D"]
     texts = {text.get_text() for text in told.texts}
     assert "3.0" in texts
-    assert {"found\n50 %", "found\n90 %"} <= texts
+    assert {"50 %\npower", "90 %\npower"} <= texts
