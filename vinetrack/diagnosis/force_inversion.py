@@ -1,4 +1,4 @@
-"""Linear inversion for missing forces: generalised least squares beside model parameters and trial effects.
+"""Linear inversion for missing forces: generalised least squares with model parameters and trial effects free.
 
 The fit is linearised about its parameters and about given trial effects. With a force of amplitudes f, positions are
 
@@ -291,20 +291,20 @@ class LinearInversion:
         matrix[held, :] = matrix[:, held] = cross[held] = 0.0
         return matrix, cross, products[:, k:, k:].sum(axis=0)
 
-    def _estimate(self, products: Floats, parameter_response: Floats, reduced: Floats, place: slice) -> ForceEstimate:
-        """The force whose amplitudes are at `place`, from the equations with all other unknowns eliminated.
+    def _estimate(self, products: Floats, parameter_response: Floats, reduced: Floats, columns: slice) -> ForceEstimate:
+        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated.
 
         Its standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
         """
-        information, score = reduced[place, place], reduced[place, -1]
+        information, score = reduced[columns, columns], reduced[columns, -1]
         size = np.diag(information)
         estimable = size > LEAST_RELATIVE_INFORMATION * max(float(size.max()), 1e-300)
         if not estimable.any():
             return ForceEstimate(0.0, np.zeros(score.size), math.inf, np.zeros(parameter_response.shape[0]), 0)
         covariance = scaled_pseudo_inverse(information, LEAST_RELATIVE_INFORMATION, estimable)
         amplitude = covariance @ score
-        shift = parameter_response[:, -1] - parameter_response[:, place] @ amplitude
-        scores = self._scores_by_trial(products, parameter_response[:, place], place, amplitude, shift)
+        shift = parameter_response[:, -1] - parameter_response[:, columns] @ amplitude
+        scores = self._scores_by_trial(products, parameter_response[:, columns], columns, amplitude, shift)
         n_trials = len(scores)
         residual_dof = max(n_trials - shift.size - score.size, 1)
         robust = covariance @ (scores.T @ scores * n_trials / residual_dof) @ covariance
@@ -312,13 +312,13 @@ class LinearInversion:
         return ForceEstimate(float(score @ amplitude), amplitude, sigma, shift, int(np.count_nonzero(estimable)))
 
     def _scores_by_trial(
-        self, products: Floats, parameter_response: Floats, place: slice, amplitude: Floats, shift: Floats
+        self, products: Floats, parameter_response: Floats, columns: slice, amplitude: Floats, shift: Floats
     ) -> Floats:
         """Contribution of each trial to the score of the amplitudes at the estimate, shape (n_trials, n_columns)."""
         k = self.problem.index.shape[1]
         index = self.problem.index
         shift_of_keys = np.append(shift, 0.0)[index]
-        forces = slice(k + place.start, k + place.stop)
+        forces = slice(k + columns.start, k + columns.stop)
         residual_products = (
             products[:, :, -1]
             - np.einsum("nqk,nk->nq", products[:, :, :k], shift_of_keys)

@@ -1,4 +1,4 @@
-"""Nonlinear least squares for a missing force, beside the model parameters and the trial effects.
+"""Nonlinear least squares for a missing force, with model parameters and trial effects free.
 
 The linear inversion (`vinetrack.diagnosis.force_inversion`) tells laws apart; but a force that slows a vine down keeps
 it longer where the force acts, so that the linear estimate of a force of a tenth of the drive comes out a fifth too

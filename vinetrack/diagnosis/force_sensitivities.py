@@ -144,9 +144,9 @@ def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[
     if measured is None and any("chamber_rate" in effect.functions for effect in model):
         # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher order.
         measured = evaluate(model, trial, run.time_s, run.lead_position_m, run.lead_velocity_m_s).pressure_Pa
-    nothing = np.zeros_like(run.time_s)
-    unevaluated = FittedMotion(trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, nothing,
-                  nothing, nothing, nothing, nothing, nothing, _observed_slope(run),
+    zeros = np.zeros_like(run.time_s)
+    unevaluated = FittedMotion(trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros,
+                  zeros, zeros, zeros, zeros, zeros, _observed_slope(run),
                   run.observed_position_m - run.lead_position_m,
                   run.end_time_s if run.status == "ended" else math.inf)  # fmt: skip
     motion = with_model_terms(unevaluated)

@@ -57,7 +57,7 @@ from vinetrack.diagnosis.force_surface import (
     SmoothForce,
     candidate_domains,
 )
-from vinetrack.diagnosis.learned_variables import dependence, not_excluded, reference, variables_in_words
+from vinetrack.diagnosis.learned_variables import force_sentence, not_excluded, remarks
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
@@ -174,46 +174,20 @@ def learned_force(
     if inversion.chi2_without_force < LEAST_CHI2_PER_POINT * inversion.n_points:
         return None
     largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
-    effects = np.zeros_like(inversion.trial_effects)
-    effects[:, : inversion.problem.release_origin_mean.shape[1]] = inversion.problem.release_origin_mean
-    motions = on_tracks(inversion, effects, motions_of(fit, effects))
-    starts = [
-        SearchPoint(
-            inversion.state.theta,
-            effects,
-            surface,
-            np.zeros(surface.domain.size),
-            list(motions),
-            motions_include_force=False,
-        )
-        for surface in (SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(motions))
-    ]
-    likelihoods = [coefficient_likelihood(start, normal_equations(fit, inversion, start)) for start in starts]
-    if not all(likelihood.is_finite for likelihood in likelihoods):
+    linear = _linear_choices(fit, inversion, largest_N)
+    if linear is None or linear.log_bayes_factor(linear.choices[0][0]) < LEAST_LOG_BAYES_FACTOR:
         return None
-    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / inversion.n_points, 1.0)
-    log_evidence_without_force = -0.5 * likelihoods[0].chi2_at_zero / inflation - 0.5 * likelihoods[0].log_determinant
-    linear = [
-        (marginal_likelihood(start.law.domain, likelihood, inflation, largest_N), start)
-        for start, likelihood in zip(starts, likelihoods, strict=True)
-        if isinstance(start.law, SmoothForce)
-    ]
-    linear.sort(key=lambda pair: -pair[0].log_evidence)
-    if linear[0][0].log_evidence - log_evidence_without_force < LEAST_LOG_BAYES_FACTOR:
-        return None
-    refined = _refined_choices(fit, inversion, linear, inflation, largest_N)
+    refined = _refined_choices(fit, inversion, linear, largest_N)
     if not refined:
         return None
-    refined = _restarted_from_best(fit, inversion, refined, inflation, largest_N)
+    refined = _restarted_from_best(fit, inversion, refined, linear.inflation, largest_N)
     inflation = max(min(each.likelihood.least_chi2 for each in refined) / inversion.n_points, 1.0)
     choices = [marginal_likelihood(each.choice.domain, each.likelihood, inflation, largest_N) for each in refined]
     chi2 = min(choice.best().chi2 for choice in choices)
     noise_chi2 = inversion.n_points
     if inversion.chi2_without_force - chi2 < LEAST_EXPLAINED * (inversion.chi2_without_force - noise_chi2):
         return None
-    # Errors of ln Z: the tolerance of the search, and points that err together and so count as fewer.
-    points_per_part = max(inversion.n_points / (INDEPENDENT_PARTS_PER_TRIAL * len(inversion.data)), 1.0)
-    correlation_error = (1 + (inflation - 1) * points_per_part) / inflation
+    correlation_error = _correlation_error(inversion, inflation)
     error = max(0.5 * CONVERGENCE_TOLERANCE * chi2 / inflation, correlation_error)
     weights = variable_weights(choices, error)
     choice, solution = max(
@@ -221,47 +195,91 @@ def learned_force(
     )
     # Start conditions are compared at one solution, so that the tolerance of the search cancels.
     best = choice.best(correlation_error)
-    log_bayes_factor = (
-        next(choice.log_evidence for choice, _ in linear if choice.domain == best.domain) - log_evidence_without_force
-    )
-    remarks = []
-    if not replicates:
-        remarks.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
-    if not any("pressure" in choice.domain.variables for choice, _ in linear):
-        remarks.append("All trials had one pressure, so they do not show whether the force depends on it.")
     # Choices are excluded by the χ² of their best coefficients, without regard to how smooth those are.
     least_chi2 = {each.choice.domain.name: each.likelihood.least_chi2 for each in refined}
     losses = {name: (value - least_chi2[best.domain.name]) / inflation for name, value in least_chi2.items()}
-    all_domains = [choice.domain for choice, _ in linear]
-    alternatives = not_excluded(best.domain, weights, losses, ANSWER_SET_DELTA_CHI2 * error, all_domains, motions)
-    if alternatives:
-        remarks.append(
-            "Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
-            " them apart."
-        )
+    threshold = ANSWER_SET_DELTA_CHI2 * error
+    alternatives = not_excluded(best.domain, weights, losses, threshold, linear.domains, linear.motions)
     misfit = max(inversion.chi2_without_force - inversion.n_points, 1e-300)
     table = _table(best, solution.motions)
     explained = min(max((inversion.chi2_without_force - best.chi2) / misfit, 0.0), 1.0)
-    sentence = _sentence(best, weights, alternatives, explained, table, choice.undecided_N)
+    sentence = force_sentence(best, weights, alternatives, explained, table, choice.undecided_N)
     return LearnedForce(
         best=best,
         motions=solution.motions,
         weights=weights,
         not_excluded=tuple(alternatives),
-        log_bayes_factor=log_bayes_factor,
+        log_bayes_factor=linear.log_bayes_factor(
+            next(choice for choice, _ in linear.choices if choice.domain == best.domain)
+        ),
         explained=explained,
         table=table,
-        sentence=" ".join([sentence, *remarks]),
+        sentence=" ".join([sentence, *remarks(replicates, linear.domains, alternatives)]),
         undecided_N=choice.undecided_N,
     )
 
 
+@dataclass(frozen=True)
+class _LinearChoices:
+    """All choices of variables about motions on the tracks, by the linear inversion, most likely first.
+
+    Each has the point where its nonlinear fit starts. `inflation` is the ratio of residual to noise variance that the
+    best of them leaves.
+    """
+
+    choices: list[tuple[VariableChoice, SearchPoint]]
+    motions: list[FittedMotion]
+    inflation: float
+    log_evidence_without_force: float
+
+    @property
+    def domains(self) -> list[Domain]:
+        """The variables of all choices."""
+        return [choice.domain for choice, _ in self.choices]
+
+    def log_bayes_factor(self, choice: VariableChoice) -> float:
+        """Ln Z of a choice in excess of that of no force."""
+        return choice.log_evidence - self.log_evidence_without_force
+
+
+def _linear_choices(fit: Fit, inversion: LinearInversion, largest_N: float) -> _LinearChoices | None:
+    """Linearise about motions on the tracks and compute the marginal likelihood of every choice of variables."""
+    effects = np.zeros_like(inversion.trial_effects)
+    effects[:, : inversion.problem.release_origin_mean.shape[1]] = inversion.problem.release_origin_mean
+    motions = on_tracks(inversion, effects, motions_of(fit, effects))
+    forces = [SmoothForce(domain, np.eye(domain.size)) for domain in candidate_domains(motions)]
+    starts = [
+        SearchPoint(
+            inversion.state.theta,
+            effects,
+            force,
+            np.zeros(force.domain.size),
+            list(motions),
+            motions_include_force=False,
+        )
+        for force in forces
+    ]
+    likelihoods = [coefficient_likelihood(start, normal_equations(fit, inversion, start)) for start in starts]
+    if not all(likelihood.is_finite for likelihood in likelihoods):
+        return None
+    inflation = max(min(likelihood.least_chi2 for likelihood in likelihoods) / inversion.n_points, 1.0)
+    without_force = -0.5 * likelihoods[0].chi2_at_zero / inflation - 0.5 * likelihoods[0].log_determinant
+    choices = [
+        (marginal_likelihood(force.domain, likelihood, inflation, largest_N), start)
+        for force, start, likelihood in zip(forces, starts, likelihoods, strict=True)
+    ]
+    choices.sort(key=lambda pair: -pair[0].log_evidence)
+    return _LinearChoices(choices, motions, inflation, without_force)
+
+
+def _correlation_error(inversion: LinearInversion, inflation: float) -> float:
+    """Unit of differences of ln Z where residuals beyond the noise are correlated, so that points count as fewer."""
+    points_per_part = max(inversion.n_points / (INDEPENDENT_PARTS_PER_TRIAL * len(inversion.data)), 1.0)
+    return (1 + (inflation - 1) * points_per_part) / inflation
+
+
 def _refined_choices(
-    fit: Fit,
-    inversion: LinearInversion,
-    linear: Sequence[tuple[VariableChoice, SearchPoint]],
-    inflation: float,
-    largest_N: float,
+    fit: Fit, inversion: LinearInversion, linear: _LinearChoices, largest_N: float
 ) -> list[_RefinedChoice]:
     """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated.
 
@@ -270,10 +288,10 @@ def _refined_choices(
     """
     best_of_size = [
         pair
-        for size, most in CHOICES_REFINED.items()
-        for pair in [pair for pair in linear if len(pair[0].domain.variables) == size][:most]
+        for size, count in CHOICES_REFINED.items()
+        for pair in [pair for pair in linear.choices if len(pair[0].domain.variables) == size][:count]
     ]
-    refined = [_refined(fit, inversion, start, choice, inflation, largest_N) for choice, start in best_of_size]
+    refined = [_refined(fit, inversion, start, choice, linear.inflation, largest_N) for choice, start in best_of_size]
     return [
         _RefinedChoice(choice, *solution)
         for (choice, _), solution in zip(best_of_size, refined, strict=True)
@@ -388,25 +406,3 @@ def _rows(best: ForcePosterior, values: Sequence[Floats], trials: Floats, condit
     return pd.DataFrame(
         columns | {"force_N": force, "sigma_N": sigma, "trials": trials.astype(int), "condition": condition}
     )
-
-
-def _sentence(
-    best: ForcePosterior,
-    weights: Mapping[str, float],
-    alternatives: Sequence[str],
-    explained: float,
-    table: pd.DataFrame,
-    undecided_N: float,
-) -> str:
-    """The variables of the force and how sure they are, its range and error, and from where it is measured."""
-    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
-    low, high, sigma = (
-        float(value) for value in (visited["force_N"].min(), visited["force_N"].max(), visited["sigma_N"].median())
-    )
-    name = best.domain.name
-    subject = f" As a function of {variables_in_words(name)} it" if alternatives else " It"
-    return (
-        f"{dependence(name, weights, alternatives)}.{subject} ranges from {low:.2f} to {high:.2f} N where there are"
-        f" trials, with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
-        f" {reference(best.domain, best.at_start, undecided_N)} A law over other variables may fit the tracks as well."
-    ).replace("-", "−")

@@ -8,13 +8,18 @@ choice of variables is therefore excluded by the misfit that it leaves, not by i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_evidence import ForcePosterior
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 from vinetrack.diagnosis.force_surface import CONSTANT_AT_START, FREE_AT_START, Domain
 from vinetrack.narrative.verdict_summary import joined
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEAST_WEIGHT_NAMED = 0.05
 """Weight from which a choice of variables is reported with the best. Chosen: the usual 5 %."""
@@ -205,3 +210,74 @@ def reference(domain: Domain, at_start: str, undecided_N: float) -> str:
         " determine how it changes from there on, but not a part that is the same all along the"
         f" growth{competitors} could account for as well."
     )
+
+
+def force_sentence(
+    best: ForcePosterior,
+    weights: Mapping[str, float],
+    alternatives: Sequence[str],
+    explained: float,
+    table: pd.DataFrame,
+    undecided_N: float,
+) -> str:
+    """The variables of the force and how sure they are, its range and error, and from where it is measured.
+
+    Parameters
+    ----------
+    best : posterior of the force.
+    weights : mapping
+        Posterior weights by choice of variables.
+    alternatives : sequence of str
+        Further choices that are not excluded.
+    explained : float
+        Part of the misfit that the force takes away.
+    table : DataFrame
+        The force on a grid, as `LearnedForce.table`.
+    undecided_N : float
+        Standard error of a part that is the same all along the growth, N.
+
+    Returns
+    -------
+    str
+    """
+    visited = table[(table["condition"] == "") & (table["trials"] > 0)]
+    low, high, sigma = (
+        float(value) for value in (visited["force_N"].min(), visited["force_N"].max(), visited["sigma_N"].median())
+    )
+    name = best.domain.name
+    subject = f" As a function of {variables_in_words(name)} it" if alternatives else " It"
+    return (
+        f"{dependence(name, weights, alternatives)}.{subject} ranges from {low:.2f} to {high:.2f} N where there are"
+        f" trials, with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
+        f" {reference(best.domain, best.at_start, undecided_N)} A law over other variables may fit the tracks as well."
+    ).replace("-", "−")
+
+
+def remarks(replicates: int, domains: Sequence[Domain], alternatives: Sequence[str]) -> list[str]:
+    """What limits the result, and which trials would help.
+
+    Parameters
+    ----------
+    replicates : int
+        Trials beyond the first of each condition.
+    domains : sequence of Domain
+        All choices of variables.
+    alternatives : sequence of str
+        Choices that are not excluded, besides the best.
+
+    Returns
+    -------
+    list of str
+        Whole sentences.
+    """
+    sentences = []
+    if not replicates:
+        sentences.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
+    if not any("pressure" in domain.variables for domain in domains):
+        sentences.append("All trials had one pressure, so they do not show whether the force depends on it.")
+    if alternatives:
+        sentences.append(
+            "Trials that reach the same growth at another speed or time, by another pressure or payload, would tell"
+            " them apart."
+        )
+    return sentences

@@ -148,9 +148,9 @@ def _applies_to(number: Number, trial: Trial) -> bool:
 
 def _output_times(fit: Fit, trials: Sequence[Trial], at_m: float, longest_s: float) -> list[Floats]:
     """For each trial, output times from release to just after it reaches `at_m`, or to the end where it does not."""
-    whole = [longest_s * np.linspace(0, 1, N_TIMES)] * len(trials)
+    full_length = [longest_s * np.linspace(0, 1, N_TIMES)] * len(trials)
     ends = []
-    for run in _runs(fit, trials, None, whole):
+    for run in _runs(fit, trials, None, full_length):
         arrived = np.flatnonzero(run.lead_position_m >= at_m)
         ends.append(run.time_s[arrived[0]] if arrived.size else longest_s)
     return [ARRIVAL_MARGIN * end_s * np.linspace(0, 1, N_TIMES) for end_s in ends]

@@ -117,7 +117,7 @@ def fit_columns(fit: Fit) -> list[Floats]:
     try:
         return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
     except SimulationError:
-        # A vine that sticks may not be followed a step of another size away: then those that the fit itself ended with.
+        # A vine that sticks may fail to simulate with another finite-difference step: use the last columns of the fit.
         return list(fit.solution.columns)
 
 
@@ -142,11 +142,11 @@ def products_of(
     """
     keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(sensitivities.shapes)
     of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
-    whole: list[Floats] = []
+    assembled: list[Floats] = []
     for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
-        whole.append(np.column_stack([of_fit, sensitivities.columns[i], systematic]))
-        sensitivities.columns[i] = whole[-1][:, of_shapes]
-    return Products(tuple(whole), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
+        assembled.append(np.column_stack([of_fit, sensitivities.columns[i], systematic]))
+        sensitivities.columns[i] = assembled[-1][:, of_shapes]
+    return Products(tuple(assembled), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
 
 
 def products_without_trial_effects(fit: Fit, products: Products, state: FitState) -> Floats:

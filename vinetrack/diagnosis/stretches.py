@@ -136,11 +136,11 @@ def common_edges(members: Sequence[ResidualCourse]) -> Floats:
     -------
     array, shape (n_stretches + 1,), s
     """
-    begin = max(float(member.time_s[0]) for member in members)
+    start = max(float(member.time_s[0]) for member in members)
     end = min(float(member.time_s[-1]) for member in members)
-    frames = min(int(np.count_nonzero((member.time_s >= begin) & (member.time_s <= end))) for member in members)
+    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
     count = max(min(MAX_STRETCHES, frames // MIN_FRAMES_PER_STRETCH), 1)
-    return np.linspace(begin, max(end, begin), count + 1)
+    return np.linspace(start, max(end, start), count + 1)
 
 
 def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
