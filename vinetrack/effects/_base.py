@@ -1,10 +1,10 @@
-"""What an effect is made of: the state it sees, the rig it acts in, its parameters, its worked numbers.
+"""Parts of an effect: the state and trial inputs that its functions receive, its parameters, its worked numbers.
 
 All numbers are SI. The symbols are those of the model
 
     m(x) ẍ = (1/r) Σ tip forces + Σ tail forces,   x = r·y
 
-The tip is a moving pulley: whatever acts there counts 1/r on the tail; what acts on the tail itself counts whole.
+The tip is a moving pulley: a force there acts on the tail with the factor 1/r; a force on the tail itself acts in full.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ HOOKS = (
     "row_delay",
     "averaged_over",
 )
-"""What an effect may change, in the order in which the model asks: see `Effect`."""
+"""Quantities that an effect may change, in the order in which the model evaluates them: see `Effect`."""
 
 KINDS = ("base", "physical", "measurement")
 
 
 class State(NamedTuple):
-    """The moving vine at one instant, as an effect sees it (SI; arrays of one shape are as good as numbers)."""
+    """State of the moving vine at one instant, SI; the fields are numbers, or arrays of one shape."""
 
     time: float  #: s since release
     lead_position: float  #: y, m of growth
@@ -48,19 +48,19 @@ class State(NamedTuple):
     tail_position: float  #: x = r·y, m
     tail_velocity: float  #: ẋ, m/s
     set_pressure: float  #: gauge pressure at release, Pa, as the gauge should have read it
-    pressure: float  #: gauge pressure now, Pa, as changed by the effects asked before
+    pressure: float  #: present gauge pressure, Pa, as changed by effects evaluated before
     yield_pressure: float  #: Pa, as the gauge should have read it
     area: float  #: A, m²
     linear_density: float  #: λ, kg/m
     moving_mass: float  #: m(x), kg
     damping_gain: float  #: factor on B, 1 unless an effect changes it
     bend_angle: float  #: angle of the bends that the tip has passed, rad
-    tail_tension: float  #: T₁, what the tip's forces leave for the tail, N (asked for by `observed_position` only)
-    observed: float  #: position that the camera would report, m, as changed by the effects asked before
+    tail_tension: float  #: T₁, tension of the tail that balances the tip forces, N (for `observed_position` only)
+    observed: float  #: position that the camera reports, m, as changed by effects evaluated before
 
 
 class TrialInputs(NamedTuple):
-    """What stays the same during one trial (SI; NaN where the sheet is blank)."""
+    """Quantities that are constant during one trial, SI; NaN where the sheet is blank."""
 
     set_pressure: float
     yield_pressure: float
@@ -76,25 +76,25 @@ class TrialInputs(NamedTuple):
     ambient_pressure: float
     chamber_volume: float
     inlet_area: float
-    least_mass: float  #: floor of the moving mass: fold and gas, kg
+    least_mass: float  #: lower limit of the moving mass: fold and gas, kg
     has_bends: float  #: 1 where the sheet has bends
     tail_on_reel: float  #: 1 where the tail comes off a reel instead of lying in the body
     bend_count: float  #: number of bends in the sheet
-    bend_total: float  #: their angles added up, rad
+    bend_total: float  #: sum of their angles, rad
     as_printed: float  #: 1 where the paper's terms are taken literally
-    tail_free: float  #: 1 where a tail that would have to push goes slack
+    tail_free: float  #: 1 where the tail goes slack instead of carrying compression
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of an effect that can be fitted.
+    """A parameter of an effect that can be fitted.
 
-    `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials, one `vine`,
-    or one `day` where the sheet states it for every trial. `bounds` are what physics allows, `plausible` what an
-    experimenter would believe. One that is `held` is known beforehand: a fit leaves it at its value unless told to find
-    it. `tried` are values at which a diagnosis tries the effect where it is no size but a shape; without them two or
-    three of the plausible range. Values a `period` apart are the same. `slips` are sizes of a relative error that a
-    common slip in the sheet leaves, each with what was done: however large, such a size is plausible.
+    `zero` is the value at which the effect vanishes. `shared` says which trials have one value: `all`, those of one
+    `vine`, or of one `day` where the sheet states it for every trial. `bounds` are the physical limits, `plausible` the
+    range that an experimenter would expect. A `held` parameter is known and fixed unless it is freed by name. For a
+    shape parameter, `tried` are the values at which a diagnosis tests the effect; by default two or three of the
+    plausible range. Values a `period` apart are equivalent. `slips` are sizes of a relative error that a common slip in
+    the sheet causes, each with a description; such a size is plausible however large it is.
     """
 
     name: str
@@ -113,16 +113,16 @@ class Parameter:
 
     @property
     def sign(self) -> int:
-        """1 or −1 where physics lets it lie on one side of `zero` only, else 0."""
+        """1 or −1 where the bounds allow only values on one side of `zero`, else 0."""
         low, high = self.bounds
         return (1 if low >= self.zero else 0) - (1 if high <= self.zero else 0)
 
 
 @dataclass(frozen=True)
 class Worked:
-    """A number worked out by hand: `hook` of the effect at this state and rig must return `expected`.
+    """A value computed by hand: `hook` of the effect at this state and rig must return `expected`.
 
-    `how` shows the arithmetic, `rel` is the rounding of the hand-worked number.
+    `how` shows the arithmetic, `rel` is the relative rounding of the expected value.
     """
 
     hook: str
@@ -141,26 +141,26 @@ class Effect:
     `breakpoints` takes `(rig: TrialInputs, *parameters)`; its other functions take `(s: State, rig: TrialInputs,
     *parameters)` and return, by hook:
 
-    true_time           time since release at which what the camera stamps `s.time` really happened, s
-    trace_time          time since release at which what a pressure trace stamps `s.time` really happened, s
+    true_time           true time since release of a frame that the camera stamps `s.time`, s
+    trace_time          true time since release of a sample that a pressure trace stamps `s.time`, s
     film_gain           factor on the film's mass per metre
-    gauge               the gauge pressure that was truly there where the gauge read `s.pressure`, Pa
-    yield_gauge         the yield pressure that was truly there, Pa
-    area                the cross-section it leaves, m²
+    gauge               true gauge pressure where the gauge reads `s.pressure`, Pa
+    yield_gauge         true yield pressure, Pa
+    area                changed cross-section, m²
     chamber_rate        rate of change of the chamber's pressure, Pa/s (the chamber then follows its own equation)
-    pressure            the gauge pressure it leaves, Pa
-    damping_gain        the factor it leaves on B
-    added_mass          mass moving with the tail that it adds, kg
+    pressure            changed gauge pressure, Pa
+    damping_gain        changed factor on B
+    added_mass          additional mass that moves with the tail, kg
     tip_force           force at the tip, N, positive along growth
     tail_force          force on tail and payload, N, positive along growth
-    rest_force          force at the tip that holds a vine at rest and is gone once it moves, N, negative
+    rest_force          force at the tip that holds a vine at rest and vanishes once it moves, N, negative
     observed_position   position of the leading edge that the camera reports, m
-    row_delay           how much later the camera reads it by the metre of that position, s/m; asked at release
-    averaged_over       square of the time over which positions are averaged, s²; asked at release
+    row_delay           delay of the camera's readout per metre of that position, s/m; evaluated at release
+    averaged_over       square of the time over which positions are averaged, s²; evaluated at release
 
-    Effects of one hook are asked by rising `order`, then as they stand in the model, and each sees what the ones before
-    left. In the chain of pressures 1 is the chamber, 2 a leak, 3 losses on the way (as everywhere if not said); what
-    the camera makes of the position comes after what the vine does, at 4 and 5.
+    Effects of one hook are evaluated by increasing `order`, then in the order of the model, each on the result of the
+    one before. In the chain of pressures 1 is the chamber, 2 a leak, 3 a loss on the way (the default); effects of the
+    camera on the position come last, at 4 and 5.
     """
 
     name: str
@@ -173,10 +173,10 @@ class Effect:
     easily_taken_for: tuple[str, ...]
     worked: tuple[Worked, ...]
     path: Path
-    in_trace: bool = False  #: a pressure measured during growth already holds it
-    replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
+    in_trace: bool = False  #: a pressure measured during growth already includes it
+    replaces: tuple[str, ...] = ()  #: effects that it contains and that are inactive while it is in the model
     order: int = 3  #: place among the effects of one hook
-    finite: bool = False  #: small sizes look like something else (a later release): it is tried at finite ones too
+    finite: bool = False  #: small sizes resemble another effect (a later release), so finite ones are tested too
     breakpoints: Callable[..., Sequence[float]] | None = None  #: lead positions where its slope breaks, m
 
     @property
@@ -187,7 +187,7 @@ class Effect:
 
     @cached_property
     def zero(self) -> tuple[float, ...]:
-        """Values of the parameters at which it changes nothing, in their order."""
+        """Values of the parameters at which the effect vanishes, in their order."""
         return tuple(parameter.zero for parameter in self.parameters)
 
     def __hash__(self) -> int:
@@ -197,7 +197,7 @@ class Effect:
         return isinstance(other, Effect) and (self.name, self.path) == (other.name, other.path)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes as the file it was read from."""
+        """Pickle as the path of the file that it was read from."""
         from vinetrack.effects._catalogue import load_effect
 
         return load_effect, (self.path,)

@@ -1,6 +1,6 @@
-"""Effects are read from files: those beside this one are the catalogue, a user's own lie wherever they say.
+"""Reading effects from files: the catalogue in this folder, and a user's own effects from any path.
 
-`listing` and `explanation` put it in words, for the terminal.
+`listing` and `explanation` describe effects for the terminal.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ from vinetrack.effects._first_run import first_run
 
 
 class EffectError(UserError, ValueError):
-    """A file that should be an effect is not one, or a name is not in the catalogue; the message says what to mend."""
+    """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy."""
 
 
 _MODULES: dict[tuple[Path, str], ModuleType] = {}
-"""Effect files that have run, by place and name of the module: each place has functions of its own to be traced to."""
+"""Executed effect files, by path and module name, so that each path keeps its own functions."""
 
 _PLAIN_MODULES = frozenset(("__future__", "math", "numpy", "vinetrack"))
-"""What an effect may import and still do the same wherever its file lies."""
+"""Modules that an effect may import without depending on the location of its file."""
 
 
 def _load_module(path: Path) -> ModuleType:
-    """Run one effect file and return it as a module.
+    """Execute one effect file and return it as a module.
 
-    It is entered in `sys.modules` under a name made of its text, and of its place where it may depend on that: the
-    compiled form of a model looks there. Files of the same text share what is compiled, as do copies of the package.
+    It is registered in `sys.modules`, where the compiled form of a model looks for it, under a name derived from its
+    text, and from its path where it may depend on that. Files of the same text share compiled code, as do copies of the
+    package.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def _load_module(path: Path) -> ModuleType:
     if whole.is_relative_to(package):
         place = whole.relative_to(package).as_posix()
     else:
-        place = "" if _same_anywhere(text) else str(whole)
+        place = "" if _is_independent_of_path(text) else str(whole)
     digest = hashlib.sha256(place.encode() + text).hexdigest()[:12]
     name = f"vinetrack_effect_{path.stem}_{digest}"
     if (whole, name) in _MODULES:
@@ -66,20 +67,20 @@ def _load_module(path: Path) -> ModuleType:
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        # The text itself is run: bytecode kept beside a file is that of an older one saved within the same second.
+        # The text itself is executed: cached bytecode could be that of an older version saved within the same second.
         exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
     finally:
-        if before is not None:  # compiled forms look for the functions of the file that was there first
+        if before is not None:  # compiled forms refer to the functions of the file that was loaded first
             sys.modules[name] = before
     _MODULES[whole, name] = module
     return module
 
 
-def _same_anywhere(text: bytes) -> bool:
-    """Whether an effect does the same wherever its file lies: it imports nothing from there and asks for no place."""
+def _is_independent_of_path(text: bytes) -> bool:
+    """Whether an effect is independent of the location of its file: no local imports, no names such as `__file__`."""
     try:
         nodes = list(ast.walk(ast.parse(text)))
     except (SyntaxError, ValueError):
@@ -134,8 +135,8 @@ def load_effect(path: Path | str) -> Effect:
 
 
 def _effect_of(module: ModuleType, path: Path) -> Effect:
-    """What the file says, as yet unchecked."""
-    # From the source: from Python 3.13 on `__doc__`, as `getdoc` does, loses the indent where only the formula follows.
+    """The effect that a file defines, not yet checked."""
+    # From the source, because from Python 3.13 on `__doc__` loses the indentation that marks the formula.
     text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
     return Effect(
@@ -158,9 +159,9 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
 
 
 def _breakpoints(module: ModuleType) -> Any:
-    """The function `breakpoints` of an effect's file, of rig and parameters; under its former name for one release.
+    """The function `breakpoints` of rig and parameters in an effect's file, also under its former name `corners`.
 
-    One that takes the rig alone does not depend on parameters.
+    A function of the rig alone does not depend on parameters.
     """
     if hasattr(module, "corners") and not hasattr(module, "breakpoints"):
         warnings.warn(f"{module.__file__}: `corners` is now called `breakpoints`", FutureWarning, stacklevel=3)
@@ -207,13 +208,13 @@ def _is_slip(pair: Any) -> bool:
 
 
 def _is_range(pair: Any) -> bool:
-    """Whether it is two numbers."""
+    """Whether a value is a pair of numbers."""
     return isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(end, Real) for end in pair)
 
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Every effect that comes with vinetrack, by name: base effects first, then alphabetical.
+    """Return every effect of vinetrack by name: base effects first, then alphabetical.
 
     Examples
     --------
@@ -227,7 +228,7 @@ def catalogue() -> Mapping[str, Effect]:
 
 
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
-    """Return the effect of a name, from the user's own first, then from the catalogue.
+    """Return the effect of this name, from the user's own effects or else from the catalogue.
 
     Parameters
     ----------
@@ -262,7 +263,7 @@ _HEAD = ("name", "kind", "parameters")
 
 
 def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None = None) -> list[str]:
-    """Lines: name, kind, parameters with units, aligned, and below each its formula; base effects first.
+    """Return lines with name, kind and parameters of each effect, and its formula below; base effects first.
 
     Parameters
     ----------
@@ -273,13 +274,13 @@ def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None
     -------
     lines for the terminal.
     """
-    mine = set((user_effects or {}).values())
+    of_user = set((user_effects or {}).values())
     effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
     entries = []
     for effect in effects:
         parameters = ", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–"
         entries.append(
-            (effect.name, f"{effect.kind}, own" if effect in mine else effect.kind, parameters, effect.formula)
+            (effect.name, f"{effect.kind}, own" if effect in of_user else effect.kind, parameters, effect.formula)
         )
     head, *lines = table([entry[:3] for entry in entries], _HEAD)
     below = [f"    {entry[3]}" for entry in entries]
@@ -287,7 +288,7 @@ def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None
 
 
 def explanation(effect: Effect) -> list[str]:
-    """Lines: what one effect is, in the words of its file, then its parameters and how it stands to others.
+    """Return lines that describe one effect: the text of its file, its parameters and its relations to other effects.
 
     Parameters
     ----------
@@ -302,18 +303,18 @@ def explanation(effect: Effect) -> list[str]:
         lines += ["Parameters, in files by the name in brackets:", *_parameter_table(effect), ""]
     slips = [f"{p.symbol} = {size:.3g}, {done}" for p in effect.parameters for size, done in p.slips]
     facts = [
-        ("Sizes that a slip in the sheet leaves", "; ".join(slips)),
+        ("Sizes that result from slips in the sheet", "; ".join(slips)),
         ("Needs of the trial sheet", ", ".join(effect.needs)),
         ("Easily taken for", ", ".join(effect.easily_taken_for)),
         ("Replaces, while in the model", ", ".join(effect.replaces)),
-        ("A pressure measured during growth", "already holds it" if effect.in_trace else ""),
+        ("A pressure measured during growth", "already includes it" if effect.in_trace else ""),
         ("File", str(effect.path)),
     ]
     return [*lines, *(f"{what}: {words}" for what, words in facts if words)]
 
 
 def remedy(effect: Effect) -> str:
-    """How to reduce an effect or to measure it, as its file says, in one line; blank where it does not.
+    """Return how to reduce or measure an effect, as stated in its file, in one line; blank where it is not stated.
 
     Parameters
     ----------
@@ -327,7 +328,7 @@ def remedy(effect: Effect) -> str:
 
 
 def told_apart(effect: Effect) -> str:
-    """What it is easily taken for and what tells them apart, as its file says, in one line; blank where it does not.
+    """Return which effects it is easily taken for and how to distinguish them, as stated in its file; blank if not.
 
     Parameters
     ----------

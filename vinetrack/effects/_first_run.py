@@ -1,4 +1,4 @@
-"""A user's own effects are programs: each is named before it runs the first time, and remembered by what is in it."""
+"""First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 CATALOGUE = Path(__file__).resolve().parents[1]
-"""Files of the package itself need no naming."""
+"""Files below this folder belong to the package and are not announced."""
 POLICY = "VINETRACK_OWN_EFFECTS"
-"""Variable of the environment: `known` refuses own effects that never ran here."""
+"""Environment variable; with the value `known`, own effects that never ran here are refused."""
 
 
 def memory_file() -> Path:
-    """Where this user's effects that have run are remembered.
+    """Return the file that lists the user's effects that have run.
 
     Returns
     -------
@@ -27,7 +27,7 @@ def memory_file() -> Path:
 
 
 def first_run(path: Path) -> str:
-    """Name an own effect that has not run before, on standard error, and remember it.
+    """Announce an own effect that has not run before on standard error, and remember it.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def first_run(path: Path) -> str:
 
 
 def remember(path: Path) -> None:
-    """Count an own effect as known: it has been named, or this program wrote it.
+    """Remember an own effect as known, because it was announced or written by this program.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def remember(path: Path) -> None:
 
 
 def _known() -> dict[str, str]:
-    """Effects that have run, by the SHA-256 of their files; none where that cannot be read."""
+    """Effects that have run, by the SHA-256 of their files; empty where the list cannot be read."""
     try:
         known = json.loads(memory_file().read_text(encoding="utf-8"))
     except (OSError, ValueError, RuntimeError):

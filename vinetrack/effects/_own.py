@@ -1,4 +1,4 @@
-"""A user's own effects: read, and tried out before a model is built on them."""
+"""A user's own effects: read, and checked before a model uses them."""
 
 from __future__ import annotations
 
@@ -69,15 +69,15 @@ UNCHANGED = {
     "row_delay": 0.0,
     "averaged_over": 0.0,
 }
-"""What a function must leave behind, in the state above, where its effect has no size."""
+"""Values that functions must return in the state above where their effect vanishes."""
 
 
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
-    """A user's effects by name, each read and tried out.
+    """Read and check a user's effects.
 
     Parameters
     ----------
-    paths : files, one an effect.
+    paths : files, one for each effect.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
     Raises
     ------
     EffectError
-        If a file is no effect, two have one name, or one does not do what it says; one sentence.
+        If a file is not an effect, two have the same name, or one fails its checks; one sentence.
 
     Examples
     --------
@@ -107,9 +107,9 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
 
 
 def behaviour_faults(effect: Effect) -> Iterator[str]:
-    """What an effect does other than its file says: worked numbers missed, size where there should be none.
+    """Check an effect against its file: compilation, worked numbers, and that it vanishes at `zero`.
 
-    Effects that change nothing at rest are asked in motion; a function that cannot be compiled is named.
+    Functions are evaluated in motion, where every effect can act.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
 
     Yields
     ------
-    a sentence a fault, without full stop.
+    one sentence for each fault, without full stop.
     """
     for hook in effect.functions:
         yield from _compile_faults(effect, hook)
@@ -132,7 +132,7 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
 
 
 def _worked_value(effect: Effect, worked: Worked) -> float:
-    """What the effect gives at the state, rig and parameters of a worked number; all else is NaN.
+    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
 
 
 _COMPILED: dict[tuple[bytes, str], tuple[str, ...]] = {}
-"""What became of functions that were compiled in this process, by the text of their file and their name."""
+"""Faults found in compiling a function in this process, by the text of its file and its name."""
 
 
 def _compile_faults(effect: Effect, hook: str) -> tuple[str, ...]:
@@ -171,7 +171,7 @@ def _compiled_anew(effect: Effect, hook: str) -> Iterator[str]:
     from numba.core.errors import NumbaError
 
     try:
-        # As the kernel is compiled: without the means to make an array.
+        # Compiled like the kernel, without the runtime that allocates arrays.
         flags: dict[str, Any] = {"_nrt": False}
         compiled = njit(**flags)(effect.functions[hook])
         compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
