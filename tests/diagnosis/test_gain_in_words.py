@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import gain_in_words
-from vinetrack.narrative.verdict_summary import NONE_SEEN, size, size_interval, sizes
+from vinetrack.narrative.verdict_summary import NONE_SEEN, estimate_text, estimates_text, interval_text
 
 
 def fit(log_likelihood: float, converged: bool = True) -> Any:
@@ -36,20 +36,20 @@ def number(value: float, sigma: float, **more: float) -> Number:
 
 
 def test_a_size_at_its_bound_is_said_to_be_there() -> None:
-    assert size(number(-3.464e-12, float("nan"), bound=0.0)) == "1/E = 0 1/kPa (at its bound)"
+    assert estimate_text(number(-3.464e-12, float("nan"), bound=0.0)) == "1/E = 0 1/kPa (at its bound)"
 
 
 def test_a_negative_size_of_what_cannot_be_negative_is_said_to_be_one() -> None:
-    assert size(number(-2e-3, 1e-4, lower=0.0)).endswith("(negative, which is impossible)")
+    assert estimate_text(number(-2e-3, 1e-4, lower=0.0)).endswith("(negative, which is impossible)")
 
 
 def test_a_bound_that_an_interval_ends_at_is_named() -> None:
-    assert size_interval(number(1.0, 0.5, upper=1.5)).endswith("(its upper bound)")
-    assert size_interval(number(1.0, 0.5, upper=2.0)).endswith("1/kPa")
+    assert interval_text(number(1.0, 0.5, upper=1.5)).endswith("(its upper bound)")
+    assert interval_text(number(1.0, 0.5, upper=2.0)).endswith("1/kPa")
 
 
 def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
     from vinetrack.diagnosis.result import Candidate
 
     row = Candidate("tail_stretch", "physical", "refitted", 1.0, NONE_SEEN - 0.1, (number(1.0, 0.6),))
-    assert sizes(row).endswith(": not significant")
+    assert estimates_text(row).endswith(": not significant")

@@ -17,7 +17,7 @@ from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.prepared_trials import prepare
-from vinetrack.narrative.verdict_summary import meaning, sentence
+from vinetrack.narrative.verdict_summary import verdict_meaning, verdict_sentence
 
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 
@@ -98,8 +98,8 @@ def test_a_diagnosis_without_a_cause_names_the_row_and_says_what_the_others_say(
     assert printed.startswith("unexplained: t2 is inconsistent with the others, which the model explains")
     assert printed.rstrip().endswith("leave it out with `use: no`, and run again.")
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
-    assert sentence(result) == "t2 is inconsistent with the others, which the model explains."
-    assert meaning(result).startswith("The row of a trial in the sheet contradicts its motion.")
+    assert verdict_sentence(result) == "t2 is inconsistent with the others, which the model explains."
+    assert verdict_meaning(result).startswith("The row of a trial in the sheet contradicts its motion.")
 
 
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):

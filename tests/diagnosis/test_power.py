@@ -31,7 +31,7 @@ from vinetrack.diagnosis.shape_products import fit_columns
 from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis, rates_of, simulated_diagnosis
 from vinetrack.inference import sensitivity
 from vinetrack.narrative.power_text import effect_sentence
-from vinetrack.narrative.verdict_summary import facts
+from vinetrack.narrative.verdict_summary import summary_facts
 from vinetrack.planning.campaign_information import FilmingPlan
 
 CAMERA = FilmingPlan(500.0, 1e-4)
@@ -273,13 +273,13 @@ def test_a_verdict_never_stands_alone(power: Power) -> None:
     beside = "(false alarms in at most 0.42 % of such campaigns; "
     assert str(diagnosis).startswith(f"adequate: no missing effect can be detected {beside}")
     assert "Not detectable: air drag" in str(diagnosis)
-    said = {fact.question: fact for fact in facts(diagnosis, None)}
+    said = {fact.question: fact for fact in summary_facts(diagnosis, None)}
     assert said["False alarms"].answer == "at most 0.42 %"
     assert said["Detectable effects"].answer.endswith("of 8 effects")
     assert said["Detectable effects"].note.startswith("with 90 % power at their largest plausible size; not even")
     assert "air drag" in said["Detectable effects"].note
     wary = replace(diagnosis, power=replace(power, wary="the model is far off"))
-    assert [fact.note for fact in facts(wary, None) if fact.question == "Detectable effects"] == [
+    assert [fact.note for fact in summary_facts(wary, None) if fact.question == "Detectable effects"] == [
         "the model is far off"
     ]
     again = Diagnosis.from_json(json.loads(json.dumps(diagnosis.to_json())))

@@ -16,7 +16,7 @@ import vinetrack as vt
 from vinetrack.core.numbers import number
 from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.interface.loaded import LoadedResults
-from vinetrack.narrative.verdict_summary import facts, size, size_interval
+from vinetrack.narrative.verdict_summary import estimate_text, interval_text, summary_facts
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +65,12 @@ def test_the_report_quotes_the_final_model_first(report: str, loaded: LoadedResu
     assert f"{first_mm} → {last_mm} mm" in report
     assert f"replicate scatter {number(1e3 * last['floor_m'])} mm" in report
     for entry in diagnosis.parameters:
-        assert size(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
+        assert estimate_text(entry).partition(" = ")[2].partition(" (")[0].split(" N·")[0].split(" kPa")[0] in report
     assert report.index("The final model:") < report.index("The initial model, which the diagnosis refutes")
 
 
 def test_the_page_in_memory_and_the_page_in_the_file_say_the_same(report: str, diagnosis: Diagnosis) -> None:
-    for fact in facts(diagnosis, diagnosis.ladder):
+    for fact in summary_facts(diagnosis, diagnosis.ladder):
         assert f"{fact.question} {fact.answer}" in report
         assert fact.note in report
 
@@ -117,10 +117,10 @@ def test_the_explorer_starts_from_the_same_numbers_and_floors(small_run: Path, l
 def test_the_card_has_the_interval_and_the_bound_that_it_ends_at_if_it_does(report: str, diagnosis: Diagnosis) -> None:
     (gamma,) = [entry for entry in diagnosis.parameters if entry.symbol == "γ"]
     assert gamma.upper == 2.4
-    assert size_interval(gamma) in report
-    assert "bound" not in size_interval(gamma)
+    assert interval_text(gamma) in report
+    assert "bound" not in interval_text(gamma)
     cut = replace(gamma, high=gamma.upper)
-    assert "(its upper bound)" in size_interval(cut)
+    assert "(its upper bound)" in interval_text(cut)
 
 
 def test_every_figure_of_the_refuted_model_says_so(report: str, small_run: Path) -> None:

@@ -280,11 +280,22 @@ class Diagnosis:
         """
         import pandas as pd
 
-        from vinetrack.narrative.verdict_summary import sizes
+        from vinetrack.narrative.verdict_summary import estimates_text
 
         columns = ["round", "effect", "kind", "status", "delta_chi2", "sigma", "size", "in_answer_set", "plausible"]
         rows = [
-            (i, c.effect, c.kind, c.status, c.delta_chi2, c.sigma, sizes(c), c.in_answer_set, c.plausible, c.reason)
+            (
+                i,
+                c.effect,
+                c.kind,
+                c.status,
+                c.delta_chi2,
+                c.sigma,
+                estimates_text(c),
+                c.in_answer_set,
+                c.plausible,
+                c.reason,
+            )
             for i, step in enumerate(self.rounds, 1)
             for c in step.ranking
         ]
@@ -367,10 +378,12 @@ class Diagnosis:
         return f"Diagnosis({self.verdict or 'refused'}{f': {named}' if named else ''})"
 
     def _repr_html_(self) -> str:
-        from vinetrack.narrative.verdict_summary import facts, sentence
+        from vinetrack.narrative.verdict_summary import summary_facts, verdict_sentence
 
-        rows = [(fact.question, fact.answer, fact.note) for fact in facts(self, self.ladder)]
-        return html_table(("", "", ""), rows, f"{self.verdict or 'refused'}: {sentence(self)}", [self.explanation])
+        rows = [(fact.question, fact.answer, fact.note) for fact in summary_facts(self, self.ladder)]
+        return html_table(
+            ("", "", ""), rows, f"{self.verdict or 'refused'}: {verdict_sentence(self)}", [self.explanation]
+        )
 
     def __str__(self) -> str:
         from vinetrack.narrative.diagnosis_text import diagnosis_text

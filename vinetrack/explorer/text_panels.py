@@ -21,7 +21,7 @@ from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.verdict_summary import size
+from vinetrack.narrative.verdict_summary import estimate_text
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
@@ -78,7 +78,7 @@ def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel)
     fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
     for name in dict.fromkeys(name for numbers in fits for name in numbers):
         title = next(numbers[name].title for numbers in fits if name in numbers)
-        rows.append((title, *(size(n[name]).partition(" = ")[2] if name in n else "–" for n in fits)))
+        rows.append((title, *(estimate_text(n[name]).partition(" = ")[2] if name in n else "–" for n in fits)))
     return table(rows, ("", "held", "now"), ())
 
 

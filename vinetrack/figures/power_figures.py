@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.figures.style import BLUE, GRID, INK, MUTED, blank, look
 from vinetrack.narrative.power_text import size_text
-from vinetrack.narrative.verdict_summary import plain
+from vinetrack.narrative.verdict_summary import spaced_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +95,7 @@ def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
     # A white line below the dots keeps them visible on the dark part of the map.
     ax.axvline(1.0, color="white", linewidth=2.2)
     ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    ax.set_yticks(range(len(entries)), [f"{plain(entry.effect)}, {entry.symbol}" for entry in entries])
+    ax.set_yticks(range(len(entries)), [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
     ax.tick_params(axis="y", length=0)
     for row in range(1, len(entries)):
         ax.axhline(row - 0.5, color=GRID, linewidth=0.7)

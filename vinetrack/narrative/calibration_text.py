@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from vinetrack.narrative.power_text import percent
-from vinetrack.narrative.verdict_summary import listed
+from vinetrack.narrative.verdict_summary import listed_names
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.null_calibration import CalibratedTest, NullCalibration
@@ -50,7 +50,7 @@ def calibration_lines(calibration: NullCalibration) -> list[str]:
     lines.append(_verdict_of(calibration))
     if unresolved:
         needed = math.ceil(1 / min(test.level for test in unresolved)) - 1
-        names = listed([test.name for test in unresolved])
+        names = listed_names([test.name for test in unresolved])
         lines.append(f"Too few campaigns to resolve the level of {names}: that takes {needed}.")
     if calibration.failed:
         lines.append(f"{calibration.failed} campaigns could not be fitted and are not counted.")

@@ -22,7 +22,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.narrative.between_text import difference_headline, trials_differ
 from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_brief
-from vinetrack.narrative.verdict_summary import ODD_MEANING, joined, sentence, sizes
+from vinetrack.narrative.verdict_summary import ODD_MEANING, estimates_text, joined, verdict_sentence
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,7 +118,7 @@ def _rows(table: pd.DataFrame) -> Iterator[Any]:
 
 def _headline(diagnosis: Diagnosis) -> str:
     if diagnosis.odd_trials:
-        return sentence(diagnosis).rstrip(".")
+        return verdict_sentence(diagnosis).rstrip(".")
     if diagnosis.verdict == MISSING:
         return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
     if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
@@ -142,7 +142,7 @@ def _ranking(step: Round) -> list[str]:
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
-                sizes(candidate),
+                estimates_text(candidate),
                 candidate.reason or _status(candidate),
             )
         )

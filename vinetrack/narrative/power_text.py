@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.numbers import number
 from vinetrack.core.units import display_unit
-from vinetrack.narrative.verdict_summary import joined, listed, plain
+from vinetrack.narrative.verdict_summary import joined, listed_names, spaced_name
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
@@ -69,7 +69,7 @@ def effect_sentence(power: EffectPower, n_trials: int) -> str:
     str
     """
     trials, detect = (f"These {n_trials} trials", "detect") if n_trials != 1 else ("This trial", "detects")
-    name, symbol = plain(power.effect), power.symbol
+    name, symbol = spaced_name(power.effect), power.symbol
     largest, at_largest = size_text(power, power.largest), power.probability_at(power.largest)
     if at_largest < LOW_POWER:
         text = (
@@ -94,7 +94,7 @@ def effect_sentence(power: EffectPower, n_trials: int) -> str:
             f"{size_text(power, power.size_at(LOW_POWER))}"
         )
     if power.taken_for and at_largest >= LOW_POWER:
-        names = [f"{plain(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:2]]
+        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(power.taken_for.items())[:2]]
         text += f"; it would be mistaken for {joined(names)} of campaigns"
     return f"{text}."
 
@@ -169,19 +169,19 @@ def could_have_seen(power: Power) -> list[str]:
     lines = []
     if detectable:
         sizes = "; ".join(
-            f"{plain(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
+            f"{spaced_name(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}"
             for entry in detectable
         )
         lines.append(f"Detectable with 90 % power: {sizes}.")
     if sometimes:
         parts = [
-            f"{plain(entry.effect)} ({percent(entry.probability_at(entry.largest))} at "
+            f"{spaced_name(entry.effect)} ({percent(entry.probability_at(entry.largest))} at "
             f"{entry.symbol} = {size_text(entry, entry.largest)})"
             for entry in sometimes
         ]
         lines.append(f"Detectable with less power, even at the largest plausible size: {joined(parts)}.")
     if undetectable := unseen(power):
-        lines.append(f"Not detectable: {listed(undetectable)}.")
+        lines.append(f"Not detectable: {listed_names(undetectable)}.")
     return lines
 
 
@@ -235,10 +235,10 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
     """
     rows = []
     for entry in effects:
-        taken = ", ".join(f"{plain(other)} {percent(rate)}" for other, rate in list(entry.taken_for.items())[:3])
+        taken = ", ".join(f"{spaced_name(other)} {percent(rate)}" for other, rate in list(entry.taken_for.items())[:3])
         rows.append(
             (
-                plain(entry.effect),
+                spaced_name(entry.effect),
                 entry.symbol,
                 size_text(entry, entry.size_at(0.5)),
                 size_text(entry, entry.size_at(0.9)),
@@ -271,7 +271,7 @@ def power_lines(power: Power) -> list[str]:
     if power.wary:
         lines.append(f"! {power.wary}")
     lines += _size_table(power.effects)
-    lines += [f"  not testable: {plain(name)}: {why}" for name, why in power.not_testable.items()]
+    lines += [f"  not testable: {spaced_name(name)}: {why}" for name, why in power.not_testable.items()]
     lines += [effect_sentence(entry, power.n_trials) for entry in _effects_in_sentences(power)]
     lines += [false_alarm_sentence(power)]
     if power.numbers:
@@ -338,7 +338,9 @@ def simulated_lines(power: Power) -> list[str]:
         named = ", ".join(f"{names} {count}" for names, count in rates.named[:4])
         if rates.effect:
             entry = power[rates.effect]
-            what = f"{plain(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: detected in {rate}, "
+            what = (
+                f"{spaced_name(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: detected in {rate}, "
+            )
             what += f"{percent(rates.promised)} by linear theory"
         else:
             what = f"nothing missing: a false alarm in {rate}, at most {percent(rates.promised)} by the tests' levels"
@@ -363,7 +365,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     from vinetrack.diagnosis.power import sheet_cells
 
     size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
-    what = f"{plain(plan.effect)} at {plan.symbol} = {size}"
+    what = f"{spaced_name(plan.effect)} at {plan.symbol} = {size}"
     if plan.before >= plan.target:
         return [f"{what} is detected with {percent(plan.before)} power by these trials: none need be added."]
     if not plan.n_conditions:
@@ -407,7 +409,7 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     if plan.is_reached and alternatives:
         lines.append(f"Without these changes: {', '.join(alternatives)} trials.")
     if plan.power is not None and plan.power.taken_for:
-        names = [f"{plain(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
+        names = [f"{spaced_name(other)} in {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3]]
         lines.append(f"With them it would be mistaken for {joined(names)} of campaigns (at the size of 90 % power).")
     return lines
 

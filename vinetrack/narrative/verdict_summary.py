@@ -71,7 +71,7 @@ class Fact:
     note: str = ""
 
 
-def plain(effect: str) -> str:
+def spaced_name(effect: str) -> str:
     """Return the name of an effect with blanks for underscores.
 
     Parameters
@@ -85,7 +85,7 @@ def plain(effect: str) -> str:
     return str(effect).replace("_", " ")
 
 
-def listed(names: Sequence[str], last: str = "and") -> str:
+def listed_names(names: Sequence[str], last: str = "and") -> str:
     """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`.
 
     Parameters
@@ -97,7 +97,7 @@ def listed(names: Sequence[str], last: str = "and") -> str:
     -------
     str
     """
-    return joined([plain(name) for name in names], last)
+    return joined([spaced_name(name) for name in names], last)
 
 
 def joined(names: Sequence[str], last: str = "and") -> str:
@@ -118,7 +118,7 @@ def joined(names: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
-def sentence(diagnosis: Diagnosis) -> str:
+def verdict_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence.
 
     Parameters
@@ -132,13 +132,13 @@ def sentence(diagnosis: Diagnosis) -> str:
     verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
     added = list(diagnosis.effects)
     if verdict == MISSING:
-        return f"Missing from the model: {listed(added or answers, 'and')}."
+        return f"Missing from the model: {listed_names(added or answers, 'and')}."
     if verdict == AMBIGUOUS:
-        return f"Missing from the model: {listed(answers, 'or')}. These trials cannot tell which."
+        return f"Missing from the model: {listed_names(answers, 'or')}. These trials cannot tell which."
     if verdict == ARTEFACT and trials_differ(answers):
         return f"The trials differ, and no physics is missing: {difference_headline(answers)}."
     if verdict == ARTEFACT:
-        return f"A fault of the measurement, not missing physics: {listed(answers, 'or')}."
+        return f"A fault of the measurement, not missing physics: {listed_names(answers, 'or')}."
     if verdict == ADEQUATE:
         return "No missing effect can be detected."
     if diagnosis.odd_trials:
@@ -149,7 +149,7 @@ def sentence(diagnosis: Diagnosis) -> str:
     return "No diagnosis could be made."
 
 
-def meaning(diagnosis: Diagnosis) -> str:
+def verdict_meaning(diagnosis: Diagnosis) -> str:
     """Return what the verdict means, and the verdict on the model with all added effects.
 
     Parameters
@@ -170,7 +170,7 @@ def meaning(diagnosis: Diagnosis) -> str:
     return f"{text} {final.replace('With it,', 'With them,') if len(added) > 1 else final}".strip()
 
 
-def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
+def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
     """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them.
 
     Parameters
@@ -193,7 +193,7 @@ def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
     return [fact for fact in entries if fact is not None]
 
 
-def known(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
     """Return whether a value of a JSON file is a finite number.
 
     Parameters
@@ -209,20 +209,20 @@ def known(value: Any) -> bool:
 
 def _significance(diagnosis: Diagnosis) -> Fact | None:
     ranking, verdict = diagnosis.ranking, diagnosis.verdict
-    tested = [row for row in ranking if known(row.delta_chi2)]
+    tested = [row for row in ranking if is_finite(row.delta_chi2)]
     others = [row for row in tested if not row.in_answer_set]
     best = max(tested, key=_gain, default=None)
     if verdict == ADEQUATE:
         # Ranked by the score: a predicted Δχ² may belong to a size of the wrong sign.
-        scored = [row for row in ranking if known(row.sigma)]
+        scored = [row for row in ranking if is_finite(row.sigma)]
         best = max(scored, key=lambda row: abs(row.sigma), default=None)
-        note = f"largest of {len(scored)} candidates: {plain(best.effect)}" if best else ""
+        note = f"largest of {len(scored)} candidates: {spaced_name(best.effect)}" if best else ""
         return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
     if diagnosis.odd_trials:
         return None
     if verdict == UNEXPLAINED and best is not None:
         note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
-        return Fact("Nearest candidate", plain(best.effect), note)
+        return Fact("Nearest candidate", spaced_name(best.effect), note)
     inside = [row for row in tested if row.in_answer_set]
     best = max(inside, key=_gain, default=None)
     if best is None:
@@ -235,7 +235,7 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     if rival is not None:
         behind = best.delta_chi2 - rival.delta_chi2
         # An implausible candidate, or one whose Δχ² is only predicted, may have the larger Δχ².
-        note = f"next best: {plain(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
+        note = f"next best: {spaced_name(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
         note += "" if rival.plausible else ", not plausible"
     return Fact("Significance", f"{_sigmas(best)} σ", note)
 
@@ -245,11 +245,11 @@ def _gain(row: Candidate) -> float:
 
 
 def _sigmas(row: Candidate) -> str:
-    sigma = abs(row.sigma) if known(row.sigma) else math.sqrt(max(row.delta_chi2, 0.0))
+    sigma = abs(row.sigma) if is_finite(row.sigma) else math.sqrt(max(row.delta_chi2, 0.0))
     return f"{sigma:.0f}" if sigma >= 9.5 else f"{sigma:.1f}"
 
 
-def value_alone(entry: Number) -> str:
+def value_text(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit, without symbol and unit: `1.170 ± 0.004`.
 
     Parameters
@@ -261,10 +261,10 @@ def value_alone(entry: Number) -> str:
     str
     """
     _, factor = display_unit(entry.unit)
-    return with_error(factor * entry.value, factor * entry.sigma if known(entry.sigma) else None)
+    return with_error(factor * entry.value, factor * entry.sigma if is_finite(entry.sigma) else None)
 
 
-def size(entry: Number) -> str:
+def estimate_text(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`.
 
     Parameters
@@ -277,15 +277,15 @@ def size(entry: Number) -> str:
         With a remark where it lies at or outside a bound.
     """
     unit, factor = display_unit(entry.unit)
-    if known(entry.bound):
+    if is_finite(entry.bound):
         return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
-    text = f"{entry.title} = {value_alone(entry)} {unit}".strip()
+    text = f"{entry.title} = {value_text(entry)} {unit}".strip()
     if entry.value < entry.lower or entry.value > entry.upper:
         text += " (negative, which is impossible)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
     return text
 
 
-def sizes(row: Candidate) -> str:
+def estimates_text(row: Candidate) -> str:
     """Return all fitted numbers of a candidate.
 
     Parameters
@@ -298,8 +298,8 @@ def sizes(row: Candidate) -> str:
         Blank where it has no fitted number; `not significant` follows where the candidate is less than 2 standard
         errors from no effect.
     """
-    text = ", ".join(size(entry) for entry in row.numbers if known(entry.value))
-    return f"{text}: not significant" if text and known(row.sigma) and abs(row.sigma) < NONE_SEEN else text
+    text = ", ".join(estimate_text(entry) for entry in row.numbers if is_finite(entry.value))
+    return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < NONE_SEEN else text
 
 
 def _sizes(diagnosis: Diagnosis) -> list[Fact]:
@@ -307,12 +307,16 @@ def _sizes(diagnosis: Diagnosis) -> list[Fact]:
     if diagnosis.effects:
         of = {name: [n for n in diagnosis.parameters if n.key.split(".")[0] == name] for name in diagnosis.effects}
         return [
-            Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0]) + _confounded_interval(diagnosis, n[0].key))
+            Fact(
+                f"Size of {spaced_name(name)}",
+                estimate_text(n[0]),
+                interval_text(n[0]) + _confounded_interval(diagnosis, n[0].key),
+            )
             for name, n in of.items()
             if n
         ]
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
-    return [Fact(f"If {plain(row.effect)}", sizes(row)) for row in members[:3]]
+    return [Fact(f"If {spaced_name(row.effect)}", estimates_text(row)) for row in members[:3]]
 
 
 def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
@@ -325,11 +329,11 @@ def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
         return ""
     factor = display_unit(alike[0].number.unit)[1]
     low, high = left_open(alike)
-    names = joined([plain(rival.effect) for rival in alike])
+    names = joined([spaced_name(rival.effect) for rival in alike])
     return f"; allowing for {names}: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
-def size_interval(entry: Number) -> str:
+def interval_text(entry: Number) -> str:
     """Return the 95 % interval of a fitted number in its display unit, a bound that it ends at named.
 
     Parameters
@@ -342,7 +346,7 @@ def size_interval(entry: Number) -> str:
         `95 %: 1.371 to 1.400 (its upper bound)`; `95 %: open` where unknown.
     """
     unit, factor = display_unit(entry.unit)
-    if not (known(entry.low) and known(entry.high)):
+    if not (is_finite(entry.low) and is_finite(entry.high)):
         return "95 %: open"
     text = f"95 %: {number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
     ends = entry.ends_at
@@ -369,7 +373,9 @@ def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
     if power.wary or not power.effects:
         return [alarm, Fact("Detectable effects", "not computed", power.wary)]
     undetectable = unseen(power)
-    listing = f"; not even then: {listed(undetectable)}" if 0 < len(undetectable) <= MOST_UNDETECTABLE_LISTED else ""
+    listing = (
+        f"; not even then: {listed_names(undetectable)}" if 0 < len(undetectable) <= MOST_UNDETECTABLE_LISTED else ""
+    )
     return [alarm, Fact("Detectable effects", detectable_count(power), f"{AT_LARGEST}{listing}")]
 
 
@@ -391,8 +397,8 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
 def _exponent(diagnosis: Diagnosis) -> list[Fact]:
     """The damping exponent of the final model."""
     for entry in diagnosis.parameters:
-        if entry.key == "eversion_damping.n" and known(entry.value):
-            return [Fact("Damping exponent", size(entry), size_interval(entry))]
+        if entry.key == "eversion_damping.n" and is_finite(entry.value):
+            return [Fact("Damping exponent", estimate_text(entry), interval_text(entry))]
     return []
 
 

@@ -25,7 +25,7 @@ from vinetrack.inference.fit_result import Number
 from vinetrack.inference.parameters import EXPONENT
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined, known, size, value_alone
+from vinetrack.narrative.verdict_summary import estimate_text, is_finite, joined, value_text
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
@@ -54,7 +54,7 @@ def sizes_in_words(numbers: Sequence[Number]) -> str:
     -------
     str
     """
-    return ", ".join(map(size, numbers))
+    return ", ".join(map(estimate_text, numbers))
 
 
 def explain(step: SelectionStep) -> str:
@@ -222,7 +222,7 @@ def _chamber(answers: Sequence[LikelihoodRatio]) -> str:
                  for p in effect.parameters if "chamber_l" in effect.needs and p.symbol == "γ"}  # fmt: skip
     for entry in (entry for hypothesis in answers for entry in hypothesis.numbers if entry.key in exponents):
         low, high = exponents[entry.key].plausible or (-math.inf, math.inf)
-        if not known(entry.sigma) or low - 2 * entry.sigma <= entry.value <= high + 2 * entry.sigma:
+        if not is_finite(entry.sigma) or low - 2 * entry.sigma <= entry.value <= high + 2 * entry.sigma:
             continue
         larger = entry.value < low
         how, times, hint = ("least", low, "; count the hoses too") if larger else ("most", high, "")
@@ -299,7 +299,7 @@ def _with_the_fault(step: SelectionStep) -> str:
     biased.sort(key=lambda number: number.key != EXPONENT)
     if not biased:
         return ""
-    changes = [f"{size(number)} instead of {value_alone(before[number.name])}" for number in biased]
+    changes = [f"{estimate_text(number)} instead of {value_text(before[number.name])}" for number in biased]
     more = len(changes) - MOST_BIASED_NAMED
     others = f", and {more} more parameter{'s change' if more > 1 else ' changes'}" if more > 0 else ""
     return f" Fitted together with {best.names[-1]}, {', '.join(changes[:MOST_BIASED_NAMED])}{others}."

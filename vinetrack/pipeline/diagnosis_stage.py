@@ -20,7 +20,7 @@ from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.diagnosis_text import to_go_on, verdict_line
 from vinetrack.narrative.power_text import power_brief
-from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
+from vinetrack.narrative.verdict_summary import joined, settled_rows, summary_facts
 from vinetrack.pipeline.model_stage import measured_trials, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -355,7 +355,9 @@ def diagnosis_lines(folder: Path) -> list[str]:
         return [diagnosis.explanation]
     beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
     reasons, _, contradicted = diagnosis.explanation.partition(CONTRADICTION_WARNING)
-    sizes = [fact.answer for fact in facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))]
+    sizes = [
+        fact.answer for fact in summary_facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))
+    ]
     told = f" ({'; '.join(sizes)})" if sizes else ""
     headline = f"{verdict_line(diagnosis)}{told}"
     return [

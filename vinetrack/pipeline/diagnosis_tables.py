@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.style import rows as iter_rows
-from vinetrack.narrative.verdict_summary import listed, sizes
+from vinetrack.narrative.verdict_summary import estimates_text, listed_names
 from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis as stored_diagnosis
 
@@ -123,7 +123,7 @@ def assemble_tables(
         ],
         cosines=(names, matrix),
         worst=worst,
-        added=listed(diagnosis.effects),
+        added=listed_names(diagnosis.effects),
         labels=labels,
         learned=learned,
     )
@@ -378,7 +378,7 @@ def round_heading(index: int, rounds: Sequence[Round]) -> str:
     if index == 0:
         return "Which effect is missing from the initial model?"
     added = [name for name in rounds[index].model if name not in rounds[0].model]
-    return f"Which is missing with {listed(added)} added?"
+    return f"Which is missing with {listed_names(added)} added?"
 
 
 def ranking_table(ranked: Round) -> pd.DataFrame:
@@ -397,7 +397,7 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
 
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
     rows = [
-        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, sizes(c), c.reason)
+        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, estimates_text(c), c.reason)
         for c in ranked.ranking
     ]
     return pd.DataFrame(rows, columns=columns)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import hand_corrected
 from vinetrack.figures.style import GREEN
-from vinetrack.narrative.verdict_summary import plain
+from vinetrack.narrative.verdict_summary import spaced_name
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -401,7 +401,7 @@ def position_to_px(track: pd.DataFrame) -> Any:
 def _added_effects(results: Results) -> str:
     """Return the effects that the diagnosis added, in words; blank if there are none."""
     diagnosis = read_diagnosis(results)
-    return " and ".join(map(plain, diagnosis.effects)) if diagnosis is not None else ""
+    return " and ".join(map(spaced_name, diagnosis.effects)) if diagnosis is not None else ""
 
 
 def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:

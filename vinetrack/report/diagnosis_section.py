@@ -14,7 +14,16 @@ from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.law_text import PREFERRED
 from vinetrack.narrative.power_text import POWER_COLUMNS, could_have_seen, false_alarm_sentence, power_rows
-from vinetrack.narrative.verdict_summary import facts, known, listed, meaning, plain, sentence, size, sizes
+from vinetrack.narrative.verdict_summary import (
+    estimate_text,
+    estimates_text,
+    is_finite,
+    listed_names,
+    spaced_name,
+    summary_facts,
+    verdict_meaning,
+    verdict_sentence,
+)
 from vinetrack.report.section import ReportTable
 
 if TYPE_CHECKING:
@@ -68,12 +77,12 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
     return {
         "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
         "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
-        "sentence": sentence(diagnosis),
-        "meaning": meaning(diagnosis),
+        "sentence": verdict_sentence(diagnosis),
+        "meaning": verdict_meaning(diagnosis),
         "summaries": [
             result.summaries[name] for name in diagnosis.effects or diagnosis.answer_set if name in result.summaries
         ],
-        "facts": facts(diagnosis, result.ladder),
+        "facts": summary_facts(diagnosis, result.ladder),
         "explanation": diagnosis.explanation,
         "ladder": ladder_table(result.ladder),
         "where": [line for line in diagnosis.where if line not in drifting],
@@ -126,18 +135,18 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
 
 def _step(added: str, partial: object = False) -> str:
     mark = " (partial)" if partial in (True, "True") else ""
-    return f"+ {listed(added.split('+'))}{mark}" if added else "initial model"
+    return f"+ {listed_names(added.split('+'))}{mark}" if added else "initial model"
 
 
 def _round(index: int, entry: Round) -> dict[str, Any]:
     head = ("Candidate", "kind", "Δχ²", "σ", "size", "status", "")
     rows = [
         (
-            ("● " if row.in_answer_set else "") + plain(row.effect),
+            ("● " if row.in_answer_set else "") + spaced_name(row.effect),
             row.kind,
             number(row.delta_chi2),
             number(row.sigma, 2),
-            sizes(row) or "–",
+            estimates_text(row) or "–",
             "fitted" if row.status == REFITTED else "predicted",
             "; ".join(part for part in ("" if row.plausible else "not plausible", row.reason) if part),
         )
@@ -164,7 +173,7 @@ def round_question(entry: Round) -> str:
     -------
     str
     """
-    return f"which effect is missing from {listed(entry.model)}?"
+    return f"which effect is missing from {listed_names(entry.model)}?"
 
 
 def _upper_limits(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
@@ -190,12 +199,12 @@ def upper_limit_table(
     for row in ranking:
         of = {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
         for name, largest in row.largest.items():
-            if not known(largest):
+            if not is_finite(largest):
                 continue
             short = name.split(".")[-1]
             symbol, unit = of.get(short) or (units or {}).get(f"{row.effect}.{short}") or (short, "SI")
             shown, factor = display_unit(unit)
-            rows.append((plain(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
+            rows.append((spaced_name(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
     if not rows:
         return None
     note = (
@@ -230,7 +239,9 @@ def power_entry(power: Power | None) -> dict[str, Any] | None:
 
 def _not_testable(ranking: Sequence[Candidate]) -> list[str]:
     """Candidates without an observable effect under these conditions, each with the reason."""
-    return [f"{plain(row.effect)}: {row.reason or 'no reason given'}" for row in ranking if row.status == NOT_TESTABLE]
+    return [
+        f"{spaced_name(row.effect)}: {row.reason or 'no reason given'}" for row in ranking if row.status == NOT_TESTABLE
+    ]
 
 
 def tied_pairs(entry: Round) -> list[str]:
@@ -249,9 +260,12 @@ def tied_pairs(entry: Round) -> list[str]:
         (abs(matrix[i][j]), names[i], names[j], matrix[i][j])
         for i in range(len(matrix))
         for j in range(i)
-        if known(matrix[i][j]) and abs(matrix[i][j]) >= TIED_COSINE
+        if is_finite(matrix[i][j]) and abs(matrix[i][j]) >= TIED_COSINE
     ]
-    return [f"{plain(b)} and {plain(a)} (cosine {number(value)})" for _, a, b, value in sorted(pairs, reverse=True)]
+    return [
+        f"{spaced_name(b)} and {spaced_name(a)} (cosine {number(value)})"
+        for _, a, b, value in sorted(pairs, reverse=True)
+    ]
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -269,7 +283,7 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         return None
     trials = [dict(trial) for trial in content.get("trials") or []]
     keys = ("replicates", *LIMITED["range"], *(name for name in LIMITED["choice"] if name != "growth_angle_deg"))
-    shown = [key for key in keys if any(known(trial.get(key)) for trial in trials)]
+    shown = [key for key in keys if any(is_finite(trial.get(key)) for trial in trials)]
     head = [{"replicates": "trials"}.get(key, key.rpartition("_")[0] + f" ({key.rpartition('_')[2]})") for key in shown]
     rows = [
         [number(trial.get(key)) if key != "replicates" else str(trial.get(key)) for key in shown] for trial in trials
@@ -277,7 +291,7 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     simulated = content.get("simulated_sigma") or {}
     separations = [
         (
-            " from ".join(plain(part.strip()) for part in str(pair).split("|")),
+            " from ".join(spaced_name(part.strip()) for part in str(pair).split("|")),
             number(sigma, 2),
             _simulated(simulated.get(pair) or {}),
         )
@@ -293,7 +307,7 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _simulated(entry: Mapping[str, Any]) -> str:
-    if not known(entry.get("mean")):
+    if not is_finite(entry.get("mean")):
         return "–"
     return f"{number(entry['mean'], 2)} ± {number(entry.get('sd'), 1)}"
 
@@ -314,7 +328,7 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     rows = [
         (
             str(law.get("words") or law.get("law") or ""),
-            f"{100 * float(law['explained']):.0f} %" if known(law.get("explained")) else "–",
+            f"{100 * float(law['explained']):.0f} %" if is_finite(law.get("explained")) else "–",
             with_error(law.get("amplitude_N"), law.get("sigma_N")),
         )
         for law in content.get("laws") or []
@@ -356,7 +370,7 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
     titles: dict[tuple[str, str], str] = {}
     for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
         key = (str(entry["parameter"]), str(entry["vine"]))
-        left, _, right = size(Number.from_json({str(k): v for k, v in entry.items()})).partition(" = ")
+        left, _, right = estimate_text(Number.from_json({str(k): v for k, v in entry.items()})).partition(" = ")
         titles[key] = left
         cells.setdefault(key, {})[str(entry["added"])] = right
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]

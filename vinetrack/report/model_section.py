@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.figures.style import rows
-from vinetrack.narrative.verdict_summary import listed, size_interval
+from vinetrack.narrative.verdict_summary import interval_text, listed_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,8 +80,8 @@ def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
             number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m", "floor_m")
         )
         text = (
-            f"With {listed(diagnosis.effects)} the error of the model is {inside} mm, and {outside} mm on conditions "
-            f"left out of the fit; replicate scatter is {floor} mm (root mean square)."
+            f"With {listed_names(diagnosis.effects)} the error of the model is {inside} mm, and {outside} mm on "
+            f"conditions left out of the fit; replicate scatter is {floor} mm (root mean square)."
         )
     return {
         "names": " + ".join(diagnosis.final_model),
@@ -131,7 +131,7 @@ def _number(entry: Number) -> dict[str, str]:
         "vine": entry.vine,
         "parameter": entry.key,
         "value": with_error(factor * entry.value, factor * entry.sigma),
-        "interval": size_interval(entry).removeprefix("95 %: ").removesuffix(f" {unit}"),
+        "interval": interval_text(entry).removeprefix("95 %: ").removesuffix(f" {unit}"),
         "unit": unit,
     }
 
