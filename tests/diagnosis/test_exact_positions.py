@@ -13,7 +13,7 @@ from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.trial_effect_tests import noise_in_motion_p
-from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.fit_problem import variance_floor
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_nothing_is_missing_from_a_simulation_of_the_model_itself(without_noise:
     said = vt.diagnose(folder, ladder=False, advice=False)
     assert said.verdict == "adequate"
     fit = said.fits[0]
-    assert all(trial_data.noise_m**2 < floor([trial_data])[0] for trial_data in fit.predictor.data)
+    assert all(trial_data.noise_m**2 < variance_floor([trial_data])[0] for trial_data in fit.predictor.data)
     assert np.isfinite(fit.chi2_per_dof)
     assert noise_in_motion_p(fit) == 1.0
     assert fit["n"].value == pytest.approx(n, abs=3 * fit["n"].sigma)

@@ -1,10 +1,8 @@
-"""Repair of edge fits that break the motion, errors of the edge by its bands, and the end of growth.
+"""Repair of edge fits that break the motion, and errors of the edge by its bands.
 
 The fit of every frame is compared with the motion; where it breaks it, the edge is searched again where the motion
 leads. The edge is also fitted in bands of rows, each alone: their disagreement is an error that needs no model of
 noise, since film, tail, glints and a swinging door touch one band and not another.
-
-Growth ends where something flies on: a payload in free flight leaves background behind it, film stays.
 """
 
 from __future__ import annotations
@@ -289,91 +287,3 @@ def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floa
         near = distance <= max(BAND_OFFSET_PX, float(np.partition(distance, fewest - 1)[fewest - 1]))
         out[t] = np.median(lead_px[core[near]], axis=0)
     return out
-
-
-BARE_PART = 0.2
-"""Share of the film's median difference from the background (in power) below which a column shows background again.
-Chosen: 0.45 of the film's contrast. By reasoning: at half, noise keeps bare columns from counting as bare; at twice,
-faint film counts as bare."""
-SHORTEST_BARE_PX = 10
-"""Fewest columns in a row that must show background again: more than any blur or ringing of the coder. Chosen. By
-reasoning: at half, ringing of the coder counts as bare; at twice, payloads that leave late are followed."""
-FILM_PARTS = (0.7, 0.35, 0.175)
-"""Parts of the columns passed, from the first, in at least one of which film is the majority. Derived: that holds where
-film covers from a tenth to all of what is passed; a payload flies on over several lengths of a short tube. By
-reasoning: with half of the least, a door's columns are half of it; with twice, a tube that is a fifth of the way counts
-as bare."""
-FLIGHT_SPEED_RATIO = 1.35
-"""Ratio of the speeds after and before, below which the motion is still growth: a payload leaves at the speed of the
-tail, twice that of the edge. Chosen between 1 and 2. By reasoning: nearer 1, accelerating growth counts as flight;
-nearer 2, a payload slowed by drag does not."""
-
-
-def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
-    """Column at which the film ends although something moves on; the end of `passed` where nothing does.
-
-    Going backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns
-    that look as they did before anything came, then film. The object must be faster than the edge was, or have leapt
-    ahead of it.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    path : column of the front by frame, shape (n_frames,), px.
-    passed : first column passed, and the one behind the last.
-
-    Returns
-    -------
-    column.
-    """
-    columns, frames = np.arange(passed[0], passed[1]), len(path)
-    if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:
-        return passed[1]
-    arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
-    difference = _lasting_change(strip, columns, arrival)
-    film_difference = max(float(np.median(difference[: int(part * len(difference))])) for part in FILM_PARTS)
-    is_bare = difference < BARE_PART * film_difference
-    bare_from = _first_bare_column(is_bare, strip.values.shape[1])
-    if bare_from < 3 * SHORTEST_BARE_PX or is_bare[bare_from - 2 * SHORTEST_BARE_PX : bare_from].mean() > 0.3:
-        return passed[1]
-    growth = _speed(arrival, bare_from - 6 * SHORTEST_BARE_PX, bare_from - 5)
-    flight = _speed(arrival, bare_from + 2, len(columns))
-    # An object that comes out is ahead of the film at once by its own length, however slowly it then flies.
-    exit_frame = int(arrival[bare_from])
-    leap = float(np.diff(path)[max(exit_frame - 2, 0) : exit_frame + 2].max(initial=0.0))
-    leaps = leap > max(FLIGHT_SPEED_RATIO * growth, growth + SHORTEST_BARE_PX / 2)
-    flies_on = flight > FLIGHT_SPEED_RATIO * growth or leaps
-    return int(columns[bare_from]) + 1 if flies_on else passed[1]
-
-
-def _first_bare_column(is_bare: NDArray[np.bool_], longest: int) -> int:
-    """First of SHORTEST_BARE_PX or more bare columns in a row, with at most `longest` after it that are not bare."""
-    film_after = np.cumsum(~is_bare[::-1])[::-1]
-    runs = np.convolve(is_bare, np.ones(SHORTEST_BARE_PX), mode="full")[SHORTEST_BARE_PX - 1 :] > SHORTEST_BARE_PX - 0.5
-    starts = np.flatnonzero(runs & (film_after <= longest))
-    return int(starts[0]) if len(starts) else 0
-
-
-def _speed(arrival: NDArray[np.int_], first: int, last: int) -> float:
-    """Mean speed between two columns, columns a frame."""
-    first, last = max(first, 0), min(last, len(arrival)) - 1
-    return (last - first) / max(float(arrival[last] - arrival[first]), 0.5)
-
-
-def _lasting_change(strip: Strip, columns: NDArray[np.int_], arrival: NDArray[np.int_]) -> Floats:
-    """Mean square over the rows of the last minus the first looks at each column, (n_columns,), averaged over 5."""
-    last = _mean(strip, slice(len(strip.values) - 2, len(strip.values)), columns)
-    out = np.zeros(len(columns))
-    for when in np.unique(arrival):
-        those = arrival == when
-        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
-        out[those] = np.mean((last[:, those] - before) ** 2, axis=0)
-    noise = strip.noise**2 * (0.5 + 0.2)
-    return np.convolve(np.clip(out - noise, 0, None), np.ones(5) / 5, mode="same")
-
-
-def _mean(strip: Strip, frames: slice, columns: NDArray[np.int_]) -> NDArray[np.float32]:
-    """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
-    values = strip.values[frames][:, :, columns].astype(np.float32)
-    level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
-    return np.asarray(level.mean(axis=0), dtype=np.float32)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import growth_end
+from vinetrack.video.motion_end import growth_end
 from vinetrack.video.strip import Strip
 
 LEAST_CHANGE = 5.0
