@@ -181,16 +181,8 @@ def track_frames(
     if along_path is not None:
         along = along_path(strip.axis)
         scale, position_m = along.m_per_px, along.position_m
-    notes = [*frames.notes, *quality.notes]
-    notes += _end_notes(frames, luma, trial, followed, quality, number, trial.length_m / scale)
-    if isinstance(strip.axis, CurvedAxis) and not axis_given:
-        notes.append(f"{name}: {curve_note(strip.axis)}")
-    if not followed.is_edge:
-        notes.append(
-            f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
-            "to about a pixel"
-        )
-    notes += selection.notes
+    length_px = trial.length_m / scale
+    notes = _notes(frames, selection, luma, trial, strip, followed, quality, length_px, axis_given)
     track = _assemble(frames, rows, followed, errors_px, quality, capture_fps, exposure_s, notes)
     track = in_metres(corrected_by_hand(track, trial.corrections), strip.axis, scale, position_m)
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
@@ -287,20 +279,27 @@ def _why_motionless(total_px: Floats, quality: PointQuality) -> str:
     return "nothing moves along the axis; check the recording, or give the axis"
 
 
-def _end_notes(
-    frames: Frames, luma: NDArray[Any], trial: Trial, followed: Positions, quality: PointQuality, number: Indices,
-    length_px: float,
+def _notes(
+    frames: Frames, selection: _Selection, luma: NDArray[Any], trial: Trial, strip: Strip, followed: Positions,
+    quality: PointQuality, length_px: float, axis_given: bool,
 ) -> list[str]:  # fmt: skip
-    """What ended the motion, where it is not that the whole vine has grown."""
-    name = frames.recording.path.name
+    """Sentences about the track: its points, its end, its axis, and the frames left out."""
+    name, number = frames.recording.path.name, selection.number
+    notes = [*frames.notes, *quality.notes]
     if followed.end is not None:
-        return [f"{name}: {body_end_note(followed.end, number)}"]
-    if is_grown(followed.edge_px, quality, length_px):
-        return []
-    notes = growth_end_notes(luma, quality, followed.edge_px, name, number)
-    if trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1:
-        notes += truncation_notes(followed.edge_px, quality, length_px, name)
-    return notes
+        notes.append(f"{name}: {body_end_note(followed.end, number)}")
+    elif not is_grown(followed.edge_px, quality, length_px):
+        notes += growth_end_notes(luma, quality, followed.edge_px, name, number)
+        if trial.travel_ratio == 2 and trial.frames_used is None and number[-1] == frames.n_recorded - 1:
+            notes += truncation_notes(followed.edge_px, quality, length_px, name)
+    if isinstance(strip.axis, CurvedAxis) and not axis_given:
+        notes.append(f"{name}: {curve_note(strip.axis)}")
+    if not followed.is_edge:
+        notes.append(
+            f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
+            "to about a pixel"
+        )
+    return [*notes, *selection.notes]
 
 
 def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, FrontShare]:
