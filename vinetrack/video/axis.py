@@ -29,8 +29,8 @@ MOST_TURN_DEG = 8.0
 errs by a degree or two; with half, an axis 5 degrees off stays off; with twice, a wide strip lets in what crosses
 it."""
 BEGINNINGS = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Fractions of a recording, from its start, that may be orderly where the whole is not. Chosen: steps of a quarter;
-more cost time alone."""
+"""Fractions of a recording, from its start, that may be orderly where the whole is not. Chosen: steps of about a
+quarter; more cost time alone."""
 FEWEST_REFINEMENTS, MOST_REFINEMENTS = 3, 20
 """Fewest and most times that a line is refined on the pixels that agree with it. Chosen: a line moves less than a pixel
 after the third; the band widens by a seventh each time, from 3 % of the picture's diagonal to the fifth that it may be
@@ -164,8 +164,8 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
 def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
     """Share of the change along an axis that is one front passing once.
 
-    Only pixels whose change lasts count (`SmallPictures.grown`), or all that change where hardly any of that lasts
-    (LEAST_GROWN).
+    Only pixels whose change lasts count (`SmallPictures.grown`); where hardly any of it lasts (LEAST_GROWN), all that
+    change count.
 
     Parameters
     ----------

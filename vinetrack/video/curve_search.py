@@ -28,10 +28,11 @@ bent, at 2 a bend half-way is missed."""
 BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
 """A curve is also used where the straight line needs a band this many times wider and the curve explains at least
 EQUAL_SHARE of what the line does. Measured, clips of seeds 3 and 4 (straight) and 1 to 4 (bent) of
-`benchmarks/tracking_accuracy.py`: 1.29 to 1.37 along bends of 25 degrees, 2 and more along an S, and the curve explains
-at least 0.999 of what the line does; at most 1.11 along straight vines, but for a contrast that reverses (1.20, and
-0.97). At 1.1 some would be taken for bent, at 1.5 bends for straight; with half the lack they are taken as now, with
-twice it a reversal of contrast is near."""
+`benchmarks/tracking_accuracy.py`: ratios of 1.29 to 1.37 along bends of 25 degrees, 2 and more along an S, and the
+curve explains at least 0.999 of what the line does; at most 1.11 along straight vines, except where the contrast
+reverses (1.20, and a share of 0.97). At 1.1 some straight vines would be taken for bent, at 1.5 bends for straight;
+with half of the 0.02 that EQUAL_SHARE leaves the same curves are used, with twice it a reversal of contrast comes
+near."""
 LEAST_LENGTH = 3.0
 """Least length of the band, in its widths, that has a path. Chosen: a shorter one is a blot; half or twice changes only
 vines that have hardly grown."""

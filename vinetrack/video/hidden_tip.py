@@ -24,7 +24,7 @@ edge is a guess. Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, wh
 at half, textured backgrounds count as hidden; at twice, payloads in front of the edge do not."""
 COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
 """Misfit above which nothing of the tip is visible, whatever its contrast. Chosen: an eighth more than HIDDEN_MISFIT.
-By reasoning: nearer 1 every guess is discarded; at twice, doors as bright as the film leave guesses."""
+By reasoning: with a factor nearer 1 every guess is discarded; at twice, doors as bright as the film leave guesses."""
 UNUSUAL_MISFIT_RATIO = 2.0
 """Ratio of the misfit to the median above which a frame differs from those clear of the start. Chosen. By reasoning:
 near 1 every textured start counts; at twice, dark doors in front of dark backgrounds do not."""

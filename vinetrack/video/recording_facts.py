@@ -32,8 +32,8 @@ GROWTH_TOLERANCE = {True: 0.06, False: 0.12}
 Measured (as above): up to 1.00 and 1.02 of it are seen; the rest is for a ruler beside the plane of growth."""
 EXPOSURE_TOLERANCE_PX = 3.0
 """Difference of the blur lengths of stated and seen exposure that is allowed; twice that is an error. Measured (seeds
-20900 and up): true exposures miss it by up to 0.8 px, one of a whole frame for a tenth by 3.4 to 34 px at 7 to 45 px a
-frame."""
+20900 and up): true exposures differ by up to 0.8 px; a whole frame stated for a tenth of one differs by 3.4 to 34 px at
+7 to 45 px a frame."""
 ERROR_FACTOR = 1.5
 """Factor between picture and sheet above which the difference is an error: no lens or ruler makes it. Chosen: the
 smallest usual slip, of an inch for a centimetre or a radius for a diameter, is 2 and more. At half (of its logarithm)
