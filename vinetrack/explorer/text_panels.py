@@ -202,7 +202,7 @@ def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fit
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    summary : the diagnosis; None where there is none.
+    summary : the diagnosis; None if there is none.
     fitted : the last fit; None before the first.
 
     Returns
@@ -279,7 +279,7 @@ def next_panel(campaign: Campaign, summary: DiagnosisSummary | None) -> str:
     Parameters
     ----------
     campaign : as `read_campaign` returns it.
-    summary : the diagnosis; None where there is none.
+    summary : the diagnosis; None if there is none.
 
     Returns
     -------

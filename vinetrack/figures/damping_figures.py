@@ -118,7 +118,7 @@ def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.
 
     Returns
     -------
-    array, shape (n_points,), or None where the fit states no finite covariance for this vine
+    array, shape (n_points,), or None if the fit states no finite covariance for this vine
     """
     covariance = fit.get("covariance") or {}
     names, matrix = covariance.get("parameters"), covariance.get("matrix")

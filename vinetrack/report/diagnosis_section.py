@@ -60,11 +60,11 @@ class DiagnosisResult:
 
 
 def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
-    """Return the section on the diagnosis as text for the template; None where there is no diagnosis.
+    """Return the section on the diagnosis as text for the template; None if there is no diagnosis.
 
     Parameters
     ----------
-    result : None where the results folder has no diagnosis.
+    result : None if the results folder has no diagnosis.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
 
 
 def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
-    """Return the errors of every model of `ladder.csv`, mm; None where there is no ladder.
+    """Return the errors of every model of `ladder.csv`, mm; None if there is no ladder.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def _upper_limits(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) ->
 def upper_limit_table(
     ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none.
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None if there are none.
 
     Parameters
     ----------

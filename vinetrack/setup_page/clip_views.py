@@ -144,7 +144,7 @@ class ClipStore:
 
         Returns
         -------
-        mapping of JSON types; None where there is no board.
+        mapping of JSON types; None if there is no board.
         """
         target = find_board(self.picture(name))
         if target is None:
