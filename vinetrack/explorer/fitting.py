@@ -90,10 +90,10 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
-    begin = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
-    result = begin(thorough=False)
+    run_fit = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
+    result = run_fit(thorough=False)
     if not result.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
-        result = begin()
+        result = run_fit()
     return _evaluated(campaign, choice, result, time.perf_counter() - started)
 
 
@@ -122,11 +122,11 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
     model = replace(sized_model(campaign, choice).model, values={})
     new = [effect for effect in model if effect.name not in before.model]
     values = sized_model(campaign, choice).model.values
-    begin = {key: value for effect in new for key, value in values.items() if key.startswith(f"{effect.name}.")}
-    result = refit(before, model, start=begin, watch=watch)
-    grew = set(before.model.names) <= set(model.names)
-    worse = grew and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
-    if new and (worse or not result.converged):
+    chosen = {key: value for effect in new for key, value in values.items() if key.startswith(f"{effect.name}.")}
+    result = refit(before, model, start=chosen, watch=watch)
+    is_larger = set(before.model.names) <= set(model.names)
+    is_worse = is_larger and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
+    if new and (is_worse or not result.converged):
         defaults: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
         other = refit(before, model, start=defaults, watch=watch)
         result = max((result, other), key=lambda result: result.log_likelihood)
@@ -260,9 +260,6 @@ class FitJob(Generic[Progress, Outcome]):
         self._on_progress(step)
 
 
-log = logging.getLogger(__name__)
-
-
 class BackgroundFit:
     """Computes in a thread `curves` and `errors_m` of the model in use, then its fit.
 
@@ -342,7 +339,7 @@ class BackgroundFit:
 
 
 _INITIAL_FRACTION = 0.04
-"""Of the progress bar at the start; chosen: visible at a width of 200 pixels."""
+"""Fraction of the progress bar filled at the start; chosen: visible at a width of 200 pixels."""
 
 
 class FitProgress:

@@ -91,7 +91,7 @@ class Page:
         document.add_periodic_callback(self._update_status, STATUS_INTERVAL_MS)
         self._background_changed()
 
-    # ---- layout -------------------------------------------------------------------------------------------------
+    # ---- layout ----------------------------------------------------------------------------------------------------
 
     def _build(self, reopen: Reopen | None) -> None:
         campaign = self.campaign
@@ -145,7 +145,7 @@ class Page:
             tally=f"{trials} trials, {conditions} conditions" + (f", {out} left out" if out else ""),
         )
 
-    # ---- user input ----------------------------------------------------------------------------------------------
+    # ---- user input ------------------------------------------------------------------------------------------------
 
     def _ticked(self, effect: str, wanted: bool) -> None:
         self.choice = self.choice.with_effect(effect, wanted)
@@ -218,16 +218,16 @@ class Page:
     def _background_changed(self) -> None:
         background = self.background
         if self.curves is None and background.curves is not None:
-            self._first_curves()
+            self._show_first_curves()
         if self.last is None and background.fitted is not None:
-            self._first_fit(background.fitted)
+            self._show_first_fit(background.fitted)
         if self._refit_requested and background.fitted is not None:
             self._begin_job(background.fitted)
         elif self._refit_requested and not background.running and background.fitted is None:
             self._end_job(background.failure)
         self._update_status()
 
-    def _first_curves(self) -> None:
+    def _show_first_curves(self) -> None:
         assert self.background.curves is not None
         self.curves, self.errors_m = self.background.curves, self.background.errors_m
         self._selection_changed()
@@ -240,7 +240,7 @@ class Page:
             self._sizes_changed = True
             self._redraw_soon()
 
-    def _first_fit(self, fitted: Fitted) -> None:
+    def _show_first_fit(self, fitted: Fitted) -> None:
         self.last = fitted
         self.fitted_models = [ladder_entry(self.campaign, fitted, None)]
         if self.choice is self.background.initial:
@@ -248,9 +248,9 @@ class Page:
             self.panel.show(self.choice, fitted)
         self._update_text()
 
-    def _begin_job(self, background: Fitted) -> None:
+    def _begin_job(self, first: Fitted) -> None:
         self._refit_requested = False
-        before = (self.last or background).fit
+        before = (self.last or first).fit
         self._step = None
         self._job = FitJob(
             partial(fit_choice, self.campaign, before, self.choice),
@@ -265,9 +265,9 @@ class Page:
 
     def _on_step(self, step: Step) -> None:
         """Called from a fit's thread. A page that cannot keep up draws only the newest step."""
-        first = self._step is None
+        is_idle = self._step is None
         self._step = step
-        if first:
+        if is_idle:
             self._in_document(self._show_step)
 
     def _show_step(self) -> None:
