@@ -57,9 +57,9 @@ class Equations:
     The last five are for tails that may go slack; otherwise they are the placeholders at the end of this file.
     """
 
-    name: str  #: of the model, unique in a process: it tells numba's types apart
+    name: str  #: of the model, unique in a process: it distinguishes numba's types
     rates: Callable  #: acceleration of the tail, m/s², and rate of change of the chamber's pressure, Pa/s
-    rest_acceleration: Callable  #: of a vine at rest (no v), with all that holds it there
+    rest_acceleration: Callable  #: of a vine at rest (no v), including the forces that hold it
     observed: Callable  #: position of the leading edge that the camera reports, m
     first_chamber: Callable  #: pressure of the chamber at release, of (trial) alone
     has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument

@@ -43,9 +43,9 @@ def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]
 class Model:
     """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
 
-    `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; what is not
-    given stands at its default. A value may be a mapping from names of vines, or of days (`day 2`). `user_effects`
-    holds the user's effects by name, which `model + name` looks up before the catalogue.
+    `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; parameters
+    that are not given have their defaults. A value may be a mapping from names of vines, or of days (`day 2`).
+    `user_effects` holds the user's effects by name, which `model + name` looks up before the catalogue.
 
     Examples
     --------

@@ -49,7 +49,7 @@ def assemble(
     left_out : mapping
         Trials that could not be used, with the reason.
     options : mapping
-        What the fit was told (`fixed`, `free`, `shared`, `held`), kept for refits.
+        Options of the fit (`fixed`, `free`, `shared`, `held`), kept for refits.
     profile : bool
         Whether intervals near a bound are found by profile.
 

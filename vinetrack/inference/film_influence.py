@@ -40,7 +40,7 @@ def film_influence(fit: Fit) -> Floats:
     Returns
     -------
     array, shape (n_numbers,)
-        In the units of `fit.numbers`, SI. Zeros where the mass of the film is a number of the fit, or moves nothing.
+        In the units of `fit.numbers`, SI. Zeros if the fit estimates the mass of the film, or it has no influence.
 
     Examples
     --------

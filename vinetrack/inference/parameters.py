@@ -191,11 +191,11 @@ class ParameterMap:
         values = self.values(theta)
         yields = np.full(rows.shape[0], math.nan)
         for column, key in enumerate(self.keys):
-            felt = self.index[:, column] >= 0
+            applies = self.index[:, column] >= 0
             if key == YIELD_PRESSURE:
-                yields[felt] = values[self.index[felt, column]]
+                yields[applies] = values[self.index[applies, column]]
             elif key in self.model.parameter_names:
-                rows[felt, self.model.parameter_names.index(key)] = values[self.index[felt, column]]
+                rows[applies, self.model.parameter_names.index(key)] = values[self.index[applies, column]]
         return rows, yields
 
     def term(self, key: str) -> BetweenTerm | None:

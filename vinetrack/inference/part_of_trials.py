@@ -28,8 +28,8 @@ def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
     -------
     array of int
     """
-    felt = np.unique(layout.index[rows])
-    return np.asarray(felt[felt >= 0])
+    applicable = np.unique(layout.index[rows])
+    return np.asarray(applicable[applicable >= 0])
 
 
 def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:

@@ -143,8 +143,8 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     plain, robust : arrays, shape (n_free, n_free)
         Of scaled parameters.
     """
-    nothing = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
-    plain, robust, _ = _sandwich(predictor, solution, nothing)
+    no_errors = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
+    plain, robust, _ = _sandwich(predictor, solution, no_errors)
     return plain, robust
 
 

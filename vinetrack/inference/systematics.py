@@ -23,10 +23,10 @@ from vinetrack.inference.position_errors import position_shapes
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
 
 PAYLOAD_ERROR = 0.005
-"""Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""
+"""Standard deviation of a payload's mass in addition to that of the sheet, relative: a gram in two hundred."""
 
 PRESSURE_ERROR_PA = 30.0
-"""Standard deviation of a set pressure beside what the sheet states: read to a tenth of a kilopascal."""
+"""Standard deviation of a set pressure in addition to that of the sheet: a gauge read to a tenth of a kilopascal."""
 
 FILM_ERROR = 0.02
 """Least standard deviation of the mass of a vine's film, relative. Chosen: a micrometer reads 50 to 150 µm to one or
@@ -160,10 +160,10 @@ def systematics_of(
     places = np.empty((len(points), sum(part.n_columns for part in parts)), dtype=int)
     count, begin, total = 0, 0, sum(part.count for part in parts)
     for part in parts:
-        beside = slice(begin, begin + part.n_columns)
-        places[:, beside] = np.where(part.places < part.count, count + part.places, total)
-        for column, felt in zip(columns, part.columns, strict=True):
-            column[:, beside] = felt
+        own_columns = slice(begin, begin + part.n_columns)
+        places[:, own_columns] = np.where(part.places < part.count, count + part.places, total)
+        for column, errors in zip(columns, part.columns, strict=True):
+            column[:, own_columns] = errors
         count, begin = count + part.count, begin + part.n_columns
     return Systematics(columns, places, total, recorded.estimated_m)
 
@@ -176,16 +176,16 @@ def _of_every_trial(columns: list[Floats]) -> Systematics:
 
 def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
     """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
-    nothing = Systematics.none([trial.time_s.size for trial in trials])
+    no_errors = Systematics.none([trial.time_s.size for trial in trials])
     loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
     if not loaded:
-        return nothing
+        return no_errors
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run([jobs[i] for i in loaded])
         heavier = predictor.run([jobs[i]._replace(payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
-        return nothing
+        return no_errors
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     for i, before, after in zip(loaded, plain, heavier, strict=True):
         columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
@@ -209,18 +209,18 @@ def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[Trial
         Without errors if the film affects no trial, or one cannot be simulated with another film mass.
     """
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
-    felt = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
+    with_film = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     other = Predictor(predictor.layout, [_with_heavier_film(each) for each in predictor.data], predictor.host)
     try:
         plain, moved = predictor.run(jobs), other.run(jobs)
     except SimulationError:
-        felt = []
-    for i in felt:
+        with_film = []
+    for i in with_film:
         columns[i][:, 0] = position_change(plain[i], moved[i])
-    if not felt:
+    if not with_film:
         return Systematics.none([trial.time_s.size for trial in trials])
-    return _one_per_group(columns, [trial.trial.vine if i in felt else None for i, trial in enumerate(trials)])
+    return _one_per_group(columns, [trial.trial.vine if i in with_film else None for i, trial in enumerate(trials)])
 
 
 def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
@@ -231,14 +231,18 @@ def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
 def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematics:
     """Error of the set pressure of each condition, shared by its replicates."""
     data = [trial_data.trial for trial_data in predictor.data]
-    feels = predictor.has_pressure_deviation & np.array([trial_data.trace is None for trial_data in predictor.data])
-    if not feels.any():
+    with_set_pressure = predictor.has_pressure_deviation & np.array(
+        [trial_data.trace is None for trial_data in predictor.data]
+    )
+    if not with_set_pressure.any():
         return Systematics.none([len(sensitivities) for sensitivities in solution.columns])
     columns = [np.zeros((len(sensitivities), 1)) for sensitivities in solution.columns]
-    for column, trial, sensitivities, felt in zip(columns, data, solution.columns, feels, strict=True):
-        if felt:
+    for column, trial, sensitivities, applies in zip(columns, data, solution.columns, with_set_pressure, strict=True):
+        if applies:
             column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
-    return _one_per_group(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
+    return _one_per_group(
+        columns, [trial.condition if applies else None for trial, applies in zip(data, with_set_pressure, strict=True)]
+    )
 
 
 def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
@@ -262,24 +266,24 @@ def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only:
         else each.trace_errors_Pa.shape[1]
         for each in data
     ]
-    felt = max(counts)
-    nothing = Systematics.none([trial_data.time_s.size for trial_data in data])
-    if not felt:
-        return nothing
-    columns = [np.zeros((trial_data.time_s.size, felt)) for trial_data in data]
-    places = np.full((len(data), felt), sum(counts))
+    n_columns = max(counts)
+    no_errors = Systematics.none([trial_data.time_s.size for trial_data in data])
+    if not n_columns:
+        return no_errors
+    columns = [np.zeros((trial_data.time_s.size, n_columns)) for trial_data in data]
+    places = np.full((len(data), n_columns), sum(counts))
     begins = np.cumsum([0, *counts])
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run(jobs)
-        for k in range(felt):
+        for k in range(n_columns):
             rows = [i for i, count in enumerate(counts) if count > k]
             other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
             for i, moved in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
                 columns[i][:, k] = position_change(plain[i], moved)
                 places[i, k] = begins[i] + k
     except SimulationError:
-        return nothing
+        return no_errors
     estimated_m = [np.zeros(trial_data.time_s.size) for trial_data in data]
     for trial_estimate_m, column, trial_data in zip(estimated_m, columns, data, strict=True):
         if trial_data.trace_error_sizes is not None:
