@@ -1,4 +1,4 @@
-"""What was left out, weighed: numbers worked out by hand, and each rule that a trial may break."""
+"""Neglected terms, with values computed by hand, and each rule that a trial may violate."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_gas_inertia_holds_the_mass_it_adds_times_the_acceleration() -> None:
     assert gas["force_N"] == pytest.approx(force[np.argmax(np.abs(force))], rel=1e-5)
 
 
-def test_tail_stretch_is_told_in_metres_at_the_edge() -> None:
+def test_tail_stretch_is_given_as_a_displacement_of_the_edge() -> None:
     # ½ (L T₁ + y (PA − 2 T₁))/(EπDt) at the last point, y = 0.95 L, with T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37
     tension = 0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37
     stretch = row(audit(BASE, [steady(trial())]), "tail_stretch")
@@ -89,13 +89,13 @@ def test_tail_stretch_is_told_in_metres_at_the_edge() -> None:
     assert math.isnan(stretch["force_N"])
 
 
-def test_what_the_model_holds_is_not_audited() -> None:
+def test_effects_of_the_model_are_not_audited() -> None:
     found = audit(BASE + catalogue()["supply_refill"] + catalogue()["air_drag"], [steady(trial())])
     assert not {"air_drag", "supply_refill", "reservoir_depletion", "gravity"} & set(found.table["term"])
     assert not any("reservoir" in words for words in found.warnings)
 
 
-def test_a_measured_pressure_holds_what_happens_in_the_chamber() -> None:
+def test_a_measured_pressure_includes_effects_in_the_chamber() -> None:
     found = audit(BASE, [steady(trial(), pressure=np.linspace(28e3, 20e3, 101))])
     assert not {"supply_refill", "reservoir_depletion", "leak"} & set(found.table["term"])
     assert not any("reservoir" in words for words in found.warnings)
@@ -107,7 +107,7 @@ def test_measurement_effects_are_no_neglected_terms() -> None:
     assert len(names) == sum(effect.kind == "physical" for effect in catalogue().values())
 
 
-def test_what_an_effect_lacks_is_said_in_its_row() -> None:
+def test_a_missing_input_of_an_effect_is_noted_in_its_row() -> None:
     found = audit(BASE, [steady(trial(chamber_m3=math.nan, inlet_m=math.nan))])
     assert "chamber_l" in row(found, "reservoir_depletion")["note"]
     assert "inlet_mm" in row(found, "inlet_loss")["note"]
@@ -158,7 +158,7 @@ def test_bends_of_thirty_degrees_are_warned_of(degrees: float, broken: bool) -> 
 
 
 @pytest.mark.parametrize(("P", "onset_s", "within_s"), [(7e3, 0.0, 4e-3), (14e3, 24e-3, 1e-3), (28e3, 145e-3, 2e-3)])
-def test_the_tail_that_would_have_to_push_is_found(P: float, onset_s: float, within_s: float) -> None:
+def test_compression_in_the_tail_is_found(P: float, onset_s: float, within_s: float) -> None:
     of = trial(pressure_Pa=P)
     spread = np.linspace(0.0, 1.0, 200) ** 2
     times = simulate(BASE, of, 30.0 * spread).end_time_s * spread[:-1]
@@ -170,13 +170,13 @@ def test_the_tail_that_would_have_to_push_is_found(P: float, onset_s: float, wit
     assert any("predicts compression in the tail" in words for words in found.warnings)
 
 
-def test_a_tail_let_go_slack_is_not_warned_of() -> None:
+def test_a_tail_that_may_go_slack_gives_no_warning() -> None:
     found = audit(BASE, [steady(trial(tail_slack="free"), 5.0)])
     assert row(found, "tail_tension")["force_N"] < 0
     assert not any("push" in words for words in found.warnings)
 
 
-def test_a_measured_motion_starts_at_release_and_at_nothing() -> None:
+def test_a_measured_motion_starts_at_release_and_at_zero() -> None:
     t = np.arange(10) * 0.01
     y = 0.5 + np.maximum(t - 0.03, 0.0)
     v = (t >= 0.03).astype(float)
@@ -188,7 +188,7 @@ def test_a_measured_motion_starts_at_release_and_at_nothing() -> None:
     np.testing.assert_allclose(motion.pressure_Pa, 28e3 - 100 * np.arange(7), rtol=1e-12)
 
 
-def test_the_inputs_are_left_as_they_were() -> None:
+def test_inputs_are_unchanged() -> None:
     motion = steady(trial())
     before = motion.lead_position_m.copy()
     model: Model = BASE

@@ -1,4 +1,4 @@
-"""A model as a sum of effects: adding, taking away, values, words; and what its terms say along a motion."""
+"""A model as a sum of effects: adding, removing, values, text; and its terms along a motion."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_adding_gives_a_new_model_and_leaves_the_old_one() -> None:
     assert "reservoir_depletion.gamma" in larger.parameter_names
 
 
-def test_taking_away_by_effect_or_by_name_takes_its_values_along() -> None:
+def test_removing_by_effect_or_by_name_removes_its_values() -> None:
     larger = (base_model() + effects.reservoir_depletion).with_values(
         {"reservoir_depletion.gamma": 1.2, "eversion_damping.B": 2.0}
     )
@@ -40,12 +40,12 @@ def test_taking_away_by_effect_or_by_name_takes_its_values_along() -> None:
         assert dict(smaller.values) == {"eversion_damping.B": 2.0}
 
 
-def test_taking_away_what_is_not_there_is_an_error() -> None:
+def test_removing_an_effect_that_is_not_there_is_an_error() -> None:
     with pytest.raises(EffectError, match="has no effect 'leak'; it has pressure_drive, gravity"):
         base_model() - "leak"
 
 
-def test_an_effect_stands_once() -> None:
+def test_an_effect_occurs_once() -> None:
     with pytest.raises(EffectError, match=r"An effect stands twice in the model: .*gravity, .*gravity"):
         base_model() + effects.gravity
     with pytest.raises(EffectError, match="twice"):
@@ -57,14 +57,14 @@ def test_an_unknown_effect_suggests_the_nearest() -> None:
         make_model(["pressure_drive", "reservoir_depletoin"])
 
 
-def test_an_unknown_value_is_named_with_what_there_is() -> None:
+def test_an_unknown_value_is_named_with_the_known_ones() -> None:
     with pytest.raises(EffectError, match=r"parameter eversion_damping\.b; it has .*eversion_damping\.B"):
         base_model().with_values({"eversion_damping.b": 1.0})
     with pytest.raises(EffectError, match="it has none"):
         Model((effects.pressure_drive,), {"gravity.g": 9.0})
 
 
-def test_values_stand_at_their_defaults_until_given() -> None:
+def test_values_have_their_defaults_until_given() -> None:
     model = base_model()
     named = dict(zip(model.parameter_names, model.parameters_for("any"), strict=True))
     assert named == {"gravity.g": 9.81, "eversion_damping.B": 3.0, "eversion_damping.n": 0.37}
@@ -98,7 +98,7 @@ def test_models_are_values() -> None:
     assert base_model() + effects.leak - effects.leak == base_model()
 
 
-def test_effects_of_no_size_and_replaced_ones_do_not_act() -> None:
+def test_effects_of_size_zero_and_replaced_ones_do_not_act() -> None:
     model = base_model() + effects.reservoir_depletion + effects.supply_refill + effects.air_drag
     rows = np.array([model.parameters_for(""), model.with_values({"air_drag.C_D": 0.0}).parameters_for("")])
     acting = effects_on(model, rows)

@@ -169,7 +169,7 @@ def test_a_reservoir_running_down() -> None:
 # ---- rest, stalls, traces ----
 
 
-def test_upward_growth_without_the_strength_stays_at_rest() -> None:
+def test_upward_growth_without_enough_drive_stays_at_rest() -> None:
     trial = replace(LOADED, growth_angle_rad=math.pi, pressure_Pa=3.2e3)
     found = simulate(with_damping(6.44), trial, np.linspace(-0.1, 2, 50))
     assert found.status == "stalled"
@@ -267,7 +267,7 @@ def test_a_trace_that_never_changes_is_the_set_pressure() -> None:
     np.testing.assert_allclose(traced.lead_position_m, set_only.lead_position_m, rtol=0, atol=1e-9)
 
 
-def test_a_trace_takes_the_place_of_set_pressure_and_reservoir() -> None:
+def test_a_trace_replaces_set_pressure_and_reservoir() -> None:
     times_s = np.linspace(0, 0.5, 40)
     trial = replace(LOADED, chamber_m3=1e-3)
     trace = (np.array([0.0, 1.0]), np.full(2, 9e3))
@@ -300,14 +300,14 @@ def test_no_times_no_rows() -> None:
     assert simulate_many(with_damping(6.44), [], []) == []
 
 
-def test_the_answer_does_not_depend_on_which_times_are_asked_for() -> None:
+def test_the_result_does_not_depend_on_the_requested_times() -> None:
     model = with_damping(6.44)
     many = simulate(model, VINE, np.linspace(0, 0.5, 501))
     few = simulate(model, VINE, np.array([0.1, 0.25, 0.5]))
     np.testing.assert_allclose(few.lead_position_m, many.lead_position_m[[100, 250, 500]], rtol=0, atol=1e-9)
 
 
-def test_many_at_once_are_each_alone() -> None:
+def test_many_at_once_agree_with_each_alone() -> None:
     model = with_damping(6.44)
     trials = [VINE, LOADED, replace(VINE, pressure_Pa=3.1e3)]
     times = [np.linspace(0, t, 20) for t in (0.3, 0.5, 2.0)]
@@ -318,7 +318,7 @@ def test_many_at_once_are_each_alone() -> None:
         np.testing.assert_array_equal(found.lead_position_m, alone.lead_position_m)
 
 
-def test_parameters_of_each_trial_take_the_place_of_the_models() -> None:
+def test_parameters_of_each_trial_replace_those_of_the_model() -> None:
     times = [np.linspace(0, 0.3, 10)] * 2
     model = with_damping(6.44)
     rows = np.array([model.parameters_for(""), with_damping(3.0).parameters_for("")])
@@ -326,7 +326,7 @@ def test_parameters_of_each_trial_take_the_place_of_the_models() -> None:
     np.testing.assert_array_equal(given[1].lead_position_m, simulate(with_damping(3.0), VINE, times[0]).lead_position_m)
 
 
-def test_arguments_are_left_alone() -> None:
+def test_arguments_are_unchanged() -> None:
     times_s, trace = np.linspace(0, 0.3, 10), (np.array([0.0, 1.0]), np.array([14e3, 13e3]))
     before = times_s.copy(), trace[0].copy(), trace[1].copy()
     simulate(with_damping(6.44), VINE, times_s, trace=trace)

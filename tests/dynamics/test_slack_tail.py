@@ -117,7 +117,7 @@ def by_hand(
 
 
 @pytest.mark.parametrize(("P", "onset", "within"), [(7e3, 0.0, 3e-3), (14e3, 24e-3, 1e-3), (28e3, 145e-3, 2e-3)])
-def test_slack_begins_when_the_physics_says(P: float, onset: float, within: float) -> None:
+def test_slack_begins_at_the_predicted_time(P: float, onset: float, within: float) -> None:
     got = simulate(MODEL, trial(P), np.linspace(0, 0.3, 100))
     assert abs(got.slack_from_s - onset) < within
 
@@ -132,7 +132,7 @@ def test_the_tip_follows_its_own_law_while_the_payload_falls(P: float) -> None:
     np.testing.assert_allclose(got.lead_position_m, truth.y, rtol=0, atol=1e-5 * truth.y[-1])
 
 
-def test_a_falling_tail_no_longer_pushes_the_tip_on() -> None:
+def test_a_falling_tail_no_longer_drives_the_tip() -> None:
     times = np.linspace(0, 0.15, 30)
     free = simulate(MODEL, trial(14e3), times).lead_position_m
     as_written = simulate(MODEL, trial(14e3, tail_slack="taut"), times).lead_position_m
@@ -160,7 +160,7 @@ def test_the_tip_takes_up_the_slack_of_a_payload_that_rubs() -> None:
     np.testing.assert_allclose(got.lead_position_m, truth.y, rtol=0, atol=1e-5 * truth.y[-1])
 
 
-def test_the_chamber_goes_on_filling_while_the_tail_is_slack() -> None:
+def test_the_chamber_continues_to_fill_while_the_tail_is_slack() -> None:
     def rate(ydot: float, y: float, P: float) -> float:
         return -1.4 * (P + 101_325) * A * ydot / (3.7e-3 + A * y) + (20e3 - P) / 0.5
 
@@ -196,7 +196,7 @@ def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays() -> None:
     assert simulate(MODEL, trial(2e3, tail_slack="taut"), np.linspace(0, 0.2, 20)).lead_position_m[-1] > 1e-5
 
 
-def test_upwards_a_steady_pressure_never_lets_it_go_slack() -> None:
+def test_upward_growth_at_steady_pressure_never_goes_slack() -> None:
     times = np.linspace(0, 0.3, 60)
     up = trial(28e3, growth_angle_rad=math.pi)
     got = simulate(MODEL, up, times)
@@ -206,7 +206,7 @@ def test_upwards_a_steady_pressure_never_lets_it_go_slack() -> None:
 
 
 @pytest.mark.parametrize("P", [14e3, 28e3])
-def test_terms_of_the_model_as_written_find_the_same_onset(P: float) -> None:
+def test_plain_python_terms_give_the_same_onset(P: float) -> None:
     times = np.linspace(1e-4, 0.16, 1600)
     taut = simulate(MODEL, trial(P, tail_slack="taut"), times)
     tension = evaluate(MODEL, trial(P), times, taut.lead_position_m, taut.lead_velocity_m_s).tension_N
@@ -214,7 +214,7 @@ def test_terms_of_the_model_as_written_find_the_same_onset(P: float) -> None:
     assert onset == pytest.approx(simulate(MODEL, trial(P), times).slack_from_s, abs=2e-4)
 
 
-def test_a_slack_phase_that_cannot_be_followed_says_when_it_was_given_up() -> None:
+def test_a_slack_phase_that_fails_states_the_time() -> None:
     """No step meets a tolerance of nothing: the tail goes slack at release and gets no further."""
     with pytest.raises(SimulationError, match=r"could not be integrated beyond \d[\d.e-]* s"):
         simulate(MODEL, trial(7e3), np.linspace(0, 0.2, 20), relative_tolerance=0.0)

@@ -1,4 +1,4 @@
-"""A fit that comes to a place beside which the model cannot be followed keeps what it had reached."""
+"""A fit whose next state cannot be simulated keeps the last one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.sensitivity import Predictor
 
 
-def test_a_step_into_the_unfollowable_ends_the_fit_where_it_was(monkeypatch: pytest.MonkeyPatch):
+def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch):
     whole, calls = Predictor.linearise, []
 
     def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:

@@ -1,4 +1,4 @@
-"""A trial that is seen to its end says no more about what an effect is than one cut off before."""
+"""A trial recorded to the end of growth carries no more information on an effect than one cut off before."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def grown(speed_m_s: float) -> Trajectory:
 
 
 @pytest.mark.parametrize("step_m_s", [0.03, -0.03])
-def test_the_derivative_is_that_of_the_growth_until_it_ends_and_nothing_behind(step_m_s: float):
+def test_the_sensitivity_is_zero_after_the_end_of_growth(step_m_s: float):
     plain = grown(2.0)
     change = position_change(plain, grown(2.0 + step_m_s)) / step_m_s
     growing = plain.time_s <= plain.end_time_s
@@ -52,7 +52,7 @@ def test_the_derivative_is_that_of_the_growth_until_it_ends_and_nothing_behind(s
     np.testing.assert_array_equal(change[~growing], 0.0)
 
 
-def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone():
+def test_a_force_that_acts_like_a_pressure_shows_only_in_the_scatter_of_trials():
     # A payload that rubs and a pressure that is lower move one trial in exactly the same way. The jump at the end of
     # growth, different for the two as their steps have different signs, once passed for knowledge of μ_p to 1e-4.
     bare = [trial for trial in sheet() if trial.vine == sheet()[0].vine]
@@ -82,8 +82,9 @@ def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone()
     assert size == pytest.approx(0.3, abs=3 * sigma)
 
 
-def test_a_fit_ends_where_one_begun_at_other_sizes_ends(tmp_path: Path) -> None:
-    """Frames about the end of growth hold the delay of a rolling shutter at too small a size, and trials deviate."""
+def test_a_fit_converges_to_the_same_values_from_other_starting_values(tmp_path: Path) -> None:
+    """Frames around the end of growth bias the delay of a rolling shutter towards zero, and trial deviations
+    compensate."""
     shot = campaign("rolling_shutter", 20122, (12, 16))
     write_experiment(shot, tmp_path / "laboratory")
     fit = vt.fit(vt.base_model() + "rolling_shutter", tmp_path / "laboratory", profile=False)

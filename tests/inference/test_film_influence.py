@@ -1,4 +1,4 @@
-"""What film of another mass would do to the numbers of a fit is what it does to them."""
+"""The predicted influence of the film mass on the numbers of a fit agrees with refits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def refitted(pairs, vine):
     return vt.fit(vt.base_model(), heavier, profile=False)
 
 
-def test_numbers_move_as_far_as_refits_with_heavier_film_do(pairs, fit):
+def test_film_influence_agrees_with_refits_with_heavier_film(pairs, fit):
     squares = np.zeros(len(fit.numbers))
     for vine in dict.fromkeys(trial.vine for trial, _ in pairs):
         other = refitted(pairs, vine)
@@ -49,14 +49,14 @@ def test_numbers_move_as_far_as_refits_with_heavier_film_do(pairs, fit):
     assert moved[n] > fit.numbers[n].sigma
 
 
-def test_film_that_is_fitted_moves_nothing(fit):
+def test_a_fitted_film_mass_has_no_influence(fit):
     with_film = vt.refit(fit, fit.model + "film_mass")
     assert not film_influence(with_film).any()
     assert summary_of(with_film).moved_by_film.shape == (len(with_film.numbers),)
     assert not any("mass of the film" in message for message in summary_of(with_film).messages)
 
 
-def test_a_summary_says_it_once_and_keeps_it(fit, tmp_path):
+def test_a_summary_contains_the_film_message_once(fit, tmp_path):
     summary = summary_of(fit)
     (said,) = [message for message in summary.messages if "mass of the film" in message]
     moved = dict(zip([number.key for number in fit.numbers], summary.moved_by_film, strict=True))
@@ -68,7 +68,7 @@ def test_a_summary_says_it_once_and_keeps_it(fit, tmp_path):
     assert FitSummary.from_json({"model": ["gravity"]}).moved_by_film.size == 0
 
 
-def test_what_is_smaller_than_the_errors_is_not_said(fit):
+def test_an_influence_below_the_errors_gives_no_message(fit):
     sigma = np.array([number.sigma for number in fit.numbers])
     assert film_messages(fit.numbers, 0.99 * MATTERS * sigma) == ()
     first = np.where(np.arange(sigma.size) == 0, 1.01 * MATTERS * sigma, 0.0)

@@ -1,4 +1,4 @@
-"""The fit to trajectories against vines grown by scipy, falling bodies and straight statistics."""
+"""The fit to trajectories, tested on vines simulated by SciPy, falling bodies and linear statistics."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     return trial, as_track(time_s, 0.02 + fallen + 2e-4 * draw.standard_normal(count))
 
 
-def test_what_passes_for_slow_noise_is_found_by_the_likelihood(
+def test_misfit_absorbed_as_slow_noise_is_recovered_by_the_likelihood(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Numbers off by a little, all that they miss taken for noise that wanders: the likelihood is no maximum there."""
+    """Parameters are slightly wrong and the whole misfit is absorbed as slow noise: not a maximum of the likelihood."""
     fit, pairs, _ = campaign
 
     def stuck(predictor: Predictor, *_: object, **__: object) -> Solution:
@@ -81,7 +81,7 @@ def test_what_passes_for_slow_noise_is_found_by_the_likelihood(
     assert again.noise_correlation == pytest.approx(fit.noise_correlation, abs=0.01)
 
 
-def test_the_numbers_of_a_campaign_are_found_within_their_errors(campaign: Campaign) -> None:
+def test_the_parameters_of_a_campaign_are_estimated_within_their_errors(campaign: Campaign) -> None:
     fit, pairs, _ = campaign
     truth = {trial.vine: B_TRUE[round(trial.diameter_m * 1e3, 3)] for trial, _ in pairs}
     z = [(fit["n"].value - N_TRUE) / fit["n"].sigma]
@@ -91,7 +91,7 @@ def test_the_numbers_of_a_campaign_are_found_within_their_errors(campaign: Campa
     assert fit["n"].sigma < 0.02
 
 
-def test_release_and_origin_of_every_trial_are_found_within_their_errors(campaign: Campaign) -> None:
+def test_release_and_origin_of_every_trial_are_estimated_within_their_errors(campaign: Campaign) -> None:
     fit, _, truth = campaign
     z = np.array(
         [
@@ -113,7 +113,7 @@ def test_deviations_of_the_trials_follow_the_true_ones(campaign: Campaign) -> No
     assert np.corrcoef(found, true)[0, 1] > 0.9
 
 
-def test_noise_and_its_correlation_are_found(campaign: Campaign) -> None:
+def test_noise_and_its_correlation_are_estimated(campaign: Campaign) -> None:
     fit = campaign[0]
     assert fit.noise_m == pytest.approx(NOISE_M, rel=0.05)
     assert fit.noise_correlation == pytest.approx(0.4, abs=0.03)
@@ -127,7 +127,7 @@ def test_whitened_residuals_are_white_and_of_size_one(campaign: Campaign) -> Non
     assert abs(neighbours) < 0.03
 
 
-def test_spreads_are_told_apart() -> None:
+def test_between_trial_standard_deviations_of_pressure_and_B_are_separated() -> None:
     pairs, _ = small_campaign(seed=11, damping=0.04, pressure=0.0, replicates=4)
     fit = vt.fit(vt.base_model(), pairs)
     assert fit.spreads["B"].value == pytest.approx(0.04, rel=0.35)
@@ -161,7 +161,7 @@ def test_refitting_from_the_solution_stays_there(campaign: Campaign) -> None:
     assert again.iterations <= 3
 
 
-def test_a_held_number_stays_and_the_likelihood_falls(campaign: Campaign) -> None:
+def test_a_fixed_parameter_stays_and_the_likelihood_falls(campaign: Campaign) -> None:
     fit = campaign[0]
     held = vt.refit(fit, start={"eversion_damping.n": fit["n"].value + 3 * fit["n"].sigma}, fixed=("n",))
     assert [number.key for number in held.numbers if number.symbol == "n"] == []
@@ -169,7 +169,7 @@ def test_a_held_number_stays_and_the_likelihood_falls(campaign: Campaign) -> Non
     assert 2 * (fit.log_likelihood - held.log_likelihood) == pytest.approx(9, rel=0.3)
 
 
-def test_one_B_for_all_vines_where_told_so(campaign: Campaign) -> None:
+def test_one_B_for_all_vines_if_requested(campaign: Campaign) -> None:
     shared = vt.fit(vt.base_model(), campaign[1][:8], shared={"B": "all"}, profile=False)
     assert [number.vine for number in shared.numbers if number.symbol == "B"] == [""]
     assert abs(shared["B"].value - B_TRUE[24.0]) < 3 * shared["B"].sigma
@@ -183,20 +183,20 @@ def test_it_prints_as_an_aligned_table_with_units(campaign: Campaign) -> None:
     assert any(line.endswith("kPa") for line in rows)
 
 
-def test_the_yield_pressure_stays_within_what_the_sheet_says(campaign: Campaign) -> None:
+def test_the_yield_pressure_stays_within_its_stated_error(campaign: Campaign) -> None:
     found = [number for number in campaign[0].numbers if number.symbol == "P_y"]
     assert len(found) == 2
     assert all(number.sigma < 200 and abs(number.value - 3000) < 600 for number in found)
 
 
-def test_a_number_at_its_bound_is_said_in_words(depleting: Fit) -> None:
+def test_a_parameter_at_its_bound_gives_a_message(depleting: Fit) -> None:
     gamma = depleting["gamma"]
     assert gamma.bound == gamma.lower == 0.6
     assert (gamma.low, gamma.method) == (0.6, "profile")
     assert any("sits at its bound 0.6" in message for message in depleting.messages)
 
 
-def test_a_number_held_by_its_bound_is_not_credited_with_what_it_would_explain_beyond(campaign: Campaign) -> None:
+def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campaign) -> None:
     # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
     low = {"eversion_damping.n": N_TRUE - 0.06}
     plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
@@ -205,7 +205,7 @@ def test_a_number_held_by_its_bound_is_not_credited_with_what_it_would_explain_b
     assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
 
 
-def test_what_the_model_leaves_beyond_the_noise_is_said_in_words(depleting: Fit) -> None:
+def test_residuals_above_the_noise_give_a_message(depleting: Fit) -> None:
     assert depleting.chi2_per_dof > 2
     assert any("something is missing" in message for message in depleting.messages)
 
@@ -223,13 +223,13 @@ def test_a_ball_filmed_only_in_flight_gives_g_too() -> None:
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
-def test_g_is_held_unless_told_otherwise() -> None:
+def test_g_is_fixed_by_default() -> None:
     fit = vt.fit(vt.make_model(["gravity"]), [ball(4)], start={"gravity.g": 9.80665})
     assert fit.numbers == ()
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
-def test_a_number_that_moves_nothing_is_said_in_words() -> None:
+def test_a_parameter_without_influence_gives_a_message() -> None:
     pairs, _ = small_campaign(seed=5, replicates=1)
     level = [(replace(trial, growth_angle_rad=math.pi / 2), track) for trial, track in pairs[:4]]
     fit = vt.fit(vt.base_model(), level, free=("g",))
@@ -258,7 +258,7 @@ def test_missing_frames_begin_a_new_stretch_and_change_little(campaign: Campaign
     assert abs(again["n"].value - fit["n"].value) < fit["n"].sigma
 
 
-def test_points_flagged_unusable_are_not_looked_at(campaign: Campaign) -> None:
+def test_points_flagged_unusable_are_not_used(campaign: Campaign) -> None:
     fit, pairs, _ = campaign
     spoilt = []
     for trial, track in pairs:
@@ -269,7 +269,7 @@ def test_points_flagged_unusable_are_not_looked_at(campaign: Campaign) -> None:
     assert abs(again["n"].value - fit["n"].value) < 0.3 * fit["n"].sigma
 
 
-def test_what_lies_near_the_end_of_growth_is_left_out_and_what_lies_behind_it_kept() -> None:
+def test_points_near_the_end_of_growth_are_left_out_and_later_ones_kept() -> None:
     trial = vine_trial("end", 22)
     time_s = np.arange(400) / FPS
     position = grown_position(trial, time_s - 0.02, B_TRUE[24.0])
@@ -284,7 +284,7 @@ def test_what_lies_near_the_end_of_growth_is_left_out_and_what_lies_behind_it_ke
     assert np.count_nonzero(travel > 0.99 * trial.length_m) >= 5
 
 
-def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
+def test_a_measured_pressure_replaces_the_set_pressure() -> None:
     draw = np.random.default_rng(2)
     pairs = []
     for P in (14, 20, 28, 36):
@@ -297,7 +297,7 @@ def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
     assert fit["B"].value == pytest.approx(B_TRUE[24.0], rel=0.1)
 
 
-def test_too_few_trials_for_a_spread_are_said_in_words() -> None:
+def test_too_few_trials_for_a_between_trial_standard_deviation_give_a_message() -> None:
     trial = replace(vine_trial("one", 22), vine="v")
     fit = vt.fit(vt.base_model(), [(trial, filmed(trial, np.random.default_rng(4))[0])], fixed=("n",))
     assert not fit.spreads["B"].estimated
@@ -356,7 +356,7 @@ def test_an_experiment_folder_is_fitted_as_it_stands(campaign: Campaign, tmp_pat
     assert abs(again["n"].value - fit["n"].value) < 0.1 * fit["n"].sigma
 
 
-def test_two_yield_pressures_stated_for_one_vine_are_two_numbers() -> None:
+def test_two_yield_pressures_stated_for_one_vine_are_two_parameters() -> None:
     pairs, _ = small_campaign(seed=5, replicates=1)
     four = [(replace(t, vine="v", yield_pressure_Pa=3e3 if k < 2 else 3.1e3), x) for k, (t, x) in enumerate(pairs[:4])]
     fit = vt.fit(vt.base_model(), four, profile=False)
@@ -374,7 +374,7 @@ def test_an_unknown_attribute_of_the_package_is_an_attribute_error() -> None:
         vt.fitt  # noqa: B018
 
 
-def test_a_model_that_lacks_something_keeps_sense_and_is_put_right_by_what_it_lacks() -> None:
+def test_an_incomplete_model_gives_sensible_values_and_is_corrected_by_the_missing_effect() -> None:
     draw = np.random.default_rng(21)
     pairs = []
     for P in (14, 18, 24, 30):
@@ -405,7 +405,7 @@ def depleting_track(trial: Trial, gamma: float, draw: np.random.Generator) -> Tr
     return as_track(time_s[seen], position[seen] + NOISE_M * draw.standard_normal(int(seen.sum())))
 
 
-def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
+def test_watch_is_called_with_every_step_and_may_end_the_fit() -> None:
     pairs, _ = small_campaign(seed=31)
     pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
     steps: list[Step] = []
@@ -421,7 +421,7 @@ def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
         vt.refit(found, watch=enough)
 
 
-def test_a_refit_begun_afresh_ends_where_the_fit_was(campaign: Campaign) -> None:
+def test_a_refit_from_initial_values_converges_to_the_fit(campaign: Campaign) -> None:
     found = campaign[0]
     again = vt.refit(found, afresh=True)
     assert again.log_likelihood == pytest.approx(found.log_likelihood, abs=0.3)

@@ -1,4 +1,4 @@
-"""The noise of a gauge is taken out of a recorded pressure, its corners are not."""
+"""Gauge noise is removed from a recorded pressure, its corners are preserved."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def without_noise(pressure_Pa: np.ndarray, growth_m: np.ndarray | None = None) -
 
 
 @pytest.mark.parametrize("sigma_Pa", [30.0, 100.0, 300.0])
-def test_most_of_the_noise_goes(sigma_Pa: float):
+def test_most_of_the_noise_is_removed(sigma_Pa: float):
     # A line through 33 samples leaves 1/√33 = 0.17 of the noise in its middle; corners keep more.
     lefts = []
     for seed in range(10):
@@ -40,7 +40,7 @@ def test_most_of_the_noise_goes(sigma_Pa: float):
     assert np.max(np.abs(lefts)) < 5 * sigma_Pa
 
 
-def test_a_threshold_is_passed_where_the_pressure_passes_it():
+def test_a_threshold_is_crossed_when_the_true_pressure_crosses_it():
     # On 43 Pa a sample noise of 100 Pa shows the first passage a sample early or more.
     early, kept = [], []
     rise = TIMES_S > 0.25
@@ -53,7 +53,7 @@ def test_a_threshold_is_passed_where_the_pressure_passes_it():
     assert abs(np.mean(kept)) < 0.5e-3
 
 
-def test_a_pressure_that_hardly_changes_is_known_far_better_than_a_sample():
+def test_a_nearly_constant_pressure_is_known_far_better_than_a_sample():
     falls = 20e3 * (1 + TIMES_S / 0.4) ** -0.3
     left = [
         without_noise(falls + 100.0 * np.random.default_rng(seed).standard_normal(TIMES_S.size)) - falls
@@ -62,7 +62,7 @@ def test_a_pressure_that_hardly_changes_is_known_far_better_than_a_sample():
     assert np.sqrt(np.mean(np.square(left))) < 40.0
 
 
-def test_exact_pressures_stay_as_they_are():
+def test_exact_pressures_are_unchanged():
     np.testing.assert_array_equal(without_noise(LET_DOWN), LET_DOWN)
     fills = 16e3 * -np.expm1(-TIMES_S / 0.2)
     np.testing.assert_array_equal(without_noise(fills), fills)
@@ -79,7 +79,7 @@ def emptied(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("late_frames", [0, 12, -12])
-def test_the_growth_tells_where_a_chamber_begins_to_empty_whatever_the_gauges_clock(late_frames: int):
+def test_the_growth_shows_where_a_chamber_begins_to_empty_at_any_clock_offset(late_frames: int):
     # What moves a vine is the time integral of the pressure. That of the noise wanders by σ √n = 1.2 kPa samples
     # before the best curve is taken out; a corner rounded by 70 Pa over 40 samples is worth more than twice that.
     wanders, at_corner = [], []
@@ -94,7 +94,7 @@ def test_the_growth_tells_where_a_chamber_begins_to_empty_whatever_the_gauges_cl
 
 
 @pytest.mark.parametrize("offset", [0.0, 12.4, -7.8])
-def test_the_clock_of_a_gauge_is_the_same_in_every_trial_and_told_by_all_together(offset: float):
+def test_the_clock_offset_of_a_gauge_is_estimated_from_all_trials(offset: float):
     """Read every eighth frame; the sixth trial has a clock of its own, 20 frames on."""
     traces, growths = [], []
     for seed in range(12):
@@ -122,7 +122,7 @@ def test_the_clock_of_a_gauge_is_the_same_in_every_trial_and_told_by_all_togethe
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
-def test_a_chamber_empties_as_all_trials_together_tell(exponent: float):
+def test_the_exponent_of_a_chamber_is_estimated_from_all_trials(exponent: float):
     """Twenty traces with 5 Pa of noise: their mean is off by no more than a fifth of a pascal."""
     tracks, true_Pa = [], []
     for seed in range(20):
@@ -156,7 +156,7 @@ def test_a_corner_between_two_readings_is_where_the_growth_begins():
     assert np.max(np.abs(off_Pa)) < 0.5 * np.max(cut_Pa)
 
 
-def test_without_the_growth_such_a_corner_is_rounded():
+def test_without_the_growth_the_corner_is_rounded():
     left = [without_noise(noisy_Pa)[60] - pressure_Pa[60] for pressure_Pa, noisy_Pa, _ in map(emptied, range(20))]
     assert np.mean(left) < -25.0
 
@@ -173,7 +173,7 @@ def test_a_bend_that_few_of_many_steady_traces_show_by_chance_is_noise():
     assert bent <= 2
 
 
-def test_errors_that_are_stated_cover_those_that_are_made():
+def test_stated_errors_cover_the_actual_errors():
     """Of chambers that empty: what is left of the noise, along each error, is as large as stated."""
     made = [emptied(seed) for seed in range(40)]
     quiet = denoised_traces([as_track(TIMES_S, growth_m, noisy_Pa) for _, noisy_Pa, growth_m in made])
@@ -191,7 +191,7 @@ def test_errors_that_are_stated_cover_those_that_are_made():
 
 
 @pytest.mark.parametrize("per_reading", [3.4, 5.0, 18.0])
-def test_readings_between_which_a_trace_was_filled_up_are_told(per_reading: float):
+def test_readings_of_an_interpolated_trace_are_recovered(per_reading: float):
     draw = np.random.default_rng(3)
     read_at = np.arange(0.3, 400.0, per_reading)
     readings_Pa = 20e3 + 100.0 * draw.standard_normal(read_at.size)
@@ -208,7 +208,7 @@ def test_readings_between_which_a_trace_was_filled_up_are_told(per_reading: floa
     assert np.max(np.abs(held.places + frames[0] - read_at[: held.places.size])) <= 1.0
 
 
-def test_white_noise_and_exact_courses_are_not_filled_up():
+def test_white_noise_and_exact_curves_are_not_taken_for_interpolated():
     draw = np.random.default_rng(3)
     white_Pa = 20e3 + 100.0 * draw.standard_normal(200)
     traces = [white_Pa, 16e3 * -np.expm1(-TIMES_S / 0.2), np.full(50, 20e3)]
@@ -218,7 +218,7 @@ def test_white_noise_and_exact_courses_are_not_filled_up():
 
 @pytest.mark.parametrize("digit_Pa", [0.01, 1.0, 10.0])
 @pytest.mark.parametrize("per_reading", [5.0, 40.0])
-def test_readings_are_told_though_samples_were_rounded_afterwards(per_reading: float, digit_Pa: float):
+def test_readings_are_recovered_from_samples_rounded_after_interpolation(per_reading: float, digit_Pa: float):
     draw = np.random.default_rng(11)
     read_at = np.arange(0.3, 600.0, per_reading)
     readings_Pa = 20e3 + 100.0 * draw.standard_normal((8, read_at.size))
@@ -234,7 +234,7 @@ def test_readings_are_told_though_samples_were_rounded_afterwards(per_reading: f
 
 
 @pytest.mark.parametrize("per_reading", [5.3, 13.4])
-def test_readings_in_coarse_steps_are_told_though_many_are_alike(per_reading: float):
+def test_readings_in_coarse_steps_are_recovered_although_many_are_equal(per_reading: float):
     draw = np.random.default_rng(13)
     read_at = np.arange(0.3, 600.0, per_reading)
     readings_Pa = 100.0 * np.round((20e3 + 60.0 * draw.standard_normal(read_at.size)) / 100.0)
@@ -257,7 +257,7 @@ def test_readings_in_coarse_steps_are_told_though_many_are_alike(per_reading: fl
     assert rounded_Pa < noise_of_traces([joined], 0.0)[0].sigma_Pa < 1.6 * rounded_Pa
 
 
-def test_a_fall_told_in_steps_coarser_than_its_noise_is_smooth_and_known_to_a_part_of_a_step():
+def test_a_fall_in_steps_coarser_than_its_noise_is_smooth_to_a_fraction_of_a_step():
     draw = np.random.default_rng(14)
     tracks, true_Pa = [], []
     for _ in range(20):
@@ -276,7 +276,7 @@ def test_a_fall_told_in_steps_coarser_than_its_noise_is_smooth_and_known_to_a_pa
     assert np.sqrt(np.mean(np.square(off) / np.square(stated))) < 1.5
 
 
-def test_readings_that_are_all_alike_but_a_few_break_nothing():
+def test_readings_that_are_nearly_all_equal_are_handled():
     told_Pa = np.full(60, 20e3)
     told_Pa[30] = 20.1e3
     assert noise_correlation([told_Pa] * 4) == 0.0
@@ -296,7 +296,7 @@ def test_noise_of_about_a_digit_is_not_taken_for_readings(digit_Pa: float):
             assert told.all_noise or told.values_Pa.size == trace.size
 
 
-def test_noise_behind_a_filter_is_told_by_how_it_differs_over_four_readings():
+def test_noise_behind_a_filter_is_detected_as_correlated():
     draw = np.random.default_rng(5)
     for rho in (0.0, 0.5, 0.85):
         traces = []
@@ -313,7 +313,7 @@ def test_noise_behind_a_filter_is_told_by_how_it_differs_over_four_readings():
 
 
 @pytest.mark.parametrize("per_reading", [1, 6])
-def test_of_steady_pressures_hardly_any_course_is_left(per_reading: int):
+def test_steady_pressures_stay_nearly_constant(per_reading: int):
     """By a gauge that is read at every frame, or at every sixth and joined by lines."""
     draw = np.random.default_rng(6)
     tracks = []
@@ -330,7 +330,7 @@ def test_of_steady_pressures_hardly_any_course_is_left(per_reading: int):
     assert 0.7 < np.sqrt(np.mean((np.array([each.mean() for each in off]) / stated) ** 2)) < 1.4
 
 
-def test_a_pressure_goes_on_beyond_its_end_along_its_last_line_but_not_below_that_of_the_air():
+def test_a_pressure_is_extrapolated_linearly_but_not_below_ambient():
     times_s = np.linspace(0.0, 0.2, 201)
     falls = np.where(times_s < 0.1, 30e3, 30e3 - 50e3 * (times_s - 0.1))
     errors = np.column_stack([np.full(201, 20.0), 100 * times_s])
@@ -346,7 +346,7 @@ def test_a_pressure_goes_on_beyond_its_end_along_its_last_line_but_not_below_tha
     assert level.pressure_Pa[-1] == pytest.approx(2e4)
 
 
-def test_the_clock_of_a_gauge_that_is_late_is_found_though_the_last_pressures_were_not_recorded(tmp_path: Path):
+def test_a_late_gauge_clock_is_found_although_the_last_pressures_were_not_recorded(tmp_path: Path):
     """Held at its last value the pressure, which falls by 40 Pa a millisecond, gave 9 ms with an error of 1."""
     shot = campaign("trace_clock", 20611, (16, 16), weighed=False)
     write_experiment(shot, tmp_path / "laboratory")

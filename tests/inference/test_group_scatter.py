@@ -21,14 +21,14 @@ def trials(specimens: int, days: int = 0, count: int = 24) -> list[Trial]:
     ]
 
 
-def test_the_coarsest_groups_that_are_enough_are_taken() -> None:
+def test_the_coarsest_sufficient_groups_are_used() -> None:
     assert len(set(coarsest_groups(trials(8, days=12)))) == 8
     assert len(set(coarsest_groups(trials(3, days=12)))) == 12
     assert len(set(coarsest_groups(trials(0)))) == 24
     assert len(set(coarsest_groups(trials(2, days=3)))) == 24
 
 
-def test_errors_that_a_group_shares_are_seen() -> None:
+def test_errors_shared_by_a_group_enter_the_covariance() -> None:
     generator = np.random.default_rng(7)
     groups = [f"s{i % 12}" for i in range(48)]
     seen = []
@@ -47,7 +47,7 @@ def test_groups_of_one_are_single_trials() -> None:
     np.testing.assert_allclose(group_scatter(single, names, 3), single.T @ single * 10 / 7)
 
 
-def test_trials_of_one_day_that_err_alike_make_errors_larger() -> None:
+def test_correlated_errors_of_a_day_enlarge_the_standard_errors() -> None:
     """The same tracks, once with their days told: eight days of two trials, whose bends are those of the day."""
     pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
     bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)

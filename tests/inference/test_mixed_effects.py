@@ -1,4 +1,4 @@
-"""The statistics under the fit, held against dense matrices and textbook numbers."""
+"""The statistics of the fit, compared with dense matrices and textbook results."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarr
     return out
 
 
-def test_products_are_those_of_the_inverse_covariance() -> None:
+def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
     columns = np.random.default_rng(0).standard_normal((30, 4))
     first = np.zeros(30, dtype=bool)
     first[[0, 17]] = True
@@ -80,14 +80,14 @@ def test_products_are_those_of_the_inverse_covariance() -> None:
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
 
 
-def test_whitened_squares_are_the_products() -> None:
+def test_squares_of_whitened_columns_are_the_cross_products() -> None:
     residual = np.random.default_rng(1).standard_normal(40)
     first = np.arange(40) % 13 == 0
     white = whiten(residual, first, RHO)
     assert white @ white == pytest.approx(at_correlation(products(residual[:, None], first)[None], RHO)[0, 0, 0])
 
 
-def test_the_marginal_likelihood_is_that_of_the_dense_gaussian() -> None:
+def test_the_marginal_likelihood_agrees_with_the_dense_gaussian() -> None:
     n_trials, count, keys, spread, flat_sd = 3, 12, 2, 0.7, 50.0
     columns = columns_of(n_trials, count, keys, seed=2)
     first = [np.arange(count) == 0] * n_trials
@@ -107,7 +107,7 @@ def test_the_marginal_likelihood_is_that_of_the_dense_gaussian() -> None:
     assert found == pytest.approx(direct, rel=1e-8)
 
 
-def test_what_deviations_explain_so_far_is_put_back() -> None:
+def test_residuals_at_zero_deviations_are_restored() -> None:
     columns = columns_of(3, 15, 2, seed=8)
     first = [np.arange(15) == 0] * 3
     state = replace(state_of(3, 2, 0.5), trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
@@ -121,7 +121,7 @@ def test_what_deviations_explain_so_far_is_put_back() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_decrease_within_bounds_is_that_of_the_bounded_step(seed: int) -> None:
+def test_the_compiled_decrease_agrees_with_the_bounded_step(seed: int) -> None:
     draw, size = np.random.default_rng(seed), 6
     rows = draw.standard_normal((30, size)) * [1, 10, 0.1, 1e3, 1, 1]
     square, slope = rows.T @ rows, rows.T @ draw.standard_normal(30)
@@ -139,7 +139,7 @@ def test_the_decrease_within_bounds_is_that_of_the_bounded_step(seed: int) -> No
     assert log_det == pytest.approx(np.linalg.slogdet(square[np.ix_(k, k)])[1])
 
 
-def test_deviations_that_are_nearly_the_same_are_integrated_out_of_precise_positions() -> None:
+def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:
     """Squares of 1e12 times the noise, of which that of the noise is left: held against exact fractions.
 
     With the inverse of I + S Z S written out, 30 trials of 16 µm were credited with 250 in ln L.
@@ -171,7 +171,7 @@ def test_deviations_that_are_nearly_the_same_are_integrated_out_of_precise_posit
     assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
 
 
-def test_two_numbers_that_only_move_together_are_left_to_least_squares() -> None:
+def test_collinear_parameters_are_left_to_least_squares() -> None:
     draw = np.random.default_rng(10)
     rows = draw.standard_normal((30, 4))
     twice = np.column_stack([rows, rows[:, 1]])
@@ -191,7 +191,7 @@ def test_the_restricted_likelihood_adds_the_information() -> None:
 
 @pytest.mark.parametrize("restricted", [True, False])
 @pytest.mark.parametrize("bound", [np.inf, 1e-3])
-def test_the_likelihood_is_the_same_by_the_compiled_step_and_by_the_one_for_numbers_hardly_told_apart(
+def test_the_likelihood_is_the_same_by_the_compiled_and_the_least_squares_step(
     monkeypatch: pytest.MonkeyPatch, bound: float, *, restricted: bool
 ) -> None:
     columns = columns_of(4, 20, 2, seed=3)
@@ -228,14 +228,14 @@ def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Soluti
     return Solution(state, frame, cross_products, (), (False, True), True, 1), means
 
 
-def test_the_spread_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
+def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
     solution, means = one_way(12, 25, 0.05, seed=4)
     expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
     assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])
-def test_two_spreads_are_found_from_wherever_the_fit_stands(start: tuple[float, float]) -> None:
+def test_two_between_trial_standard_deviations_are_found_from_any_start(start: tuple[float, float]) -> None:
     # Pressure and B move a trial alike but for a tenth, so that one can stand for the other.
     n_trials, count, draw = 24, 40, np.random.default_rng(31)
     slope, bend = np.linspace(0, 1, count), np.linspace(-1, 1, count) ** 2
@@ -262,7 +262,7 @@ def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
     assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
 
-def test_a_step_ends_at_the_first_bound_and_goes_on_along_it() -> None:
+def test_a_step_ends_at_the_first_bound_and_continues_along_it() -> None:
     # ½xᵀHx − gᵀx in the unit square: its minimum (14/3, 7/3) lies outside; on the side x₁ = 1 it is at x₂ = ½.
     square, slope = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([7.0, 0.0])
     problem = replace(frame_of(1, 5, 2), lower=np.zeros(2), upper=np.ones(2))
@@ -272,7 +272,7 @@ def test_a_step_ends_at_the_first_bound_and_goes_on_along_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_a_bounded_step_lowers_the_sum_of_squares_even_where_two_numbers_are_hardly_told_apart(seed: int) -> None:
+def test_a_bounded_step_lowers_the_sum_of_squares_even_for_nearly_collinear_parameters(seed: int) -> None:
     draw = np.random.default_rng(seed)
     columns = draw.standard_normal((50, 6))
     columns[:, 5] = columns[:, 4] * (1 + 1e-7 * draw.standard_normal(50))
@@ -289,7 +289,7 @@ def test_a_bounded_step_lowers_the_sum_of_squares_even_where_two_numbers_are_har
     assert step @ (2 * slope - square @ step) > 0.8 * best
 
 
-def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:
+def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
     draw = np.random.default_rng(7)
     n_trials, count, rho = 300, 30, 0.4
     columns = []
@@ -308,7 +308,7 @@ def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:
 
 
 @pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
-def test_the_noise_of_short_trials_is_drawn_together_as_far_as_chance_explains_it(
+def test_the_noise_of_short_trials_is_shrunk_as_far_as_chance_explains_the_differences(
     louder: float, lowest: float, highest: float
 ) -> None:
     """Of twelve points σ² scatters by 41 % of itself; what half of the trials have 25 times over is no chance."""
@@ -324,14 +324,14 @@ def test_the_noise_of_short_trials_is_drawn_together_as_far_as_chance_explains_i
     assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
 
 
-def test_a_measured_pressure_scatters_by_the_error_of_its_gauge() -> None:
+def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge() -> None:
     frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
     assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
         np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
     )
 
 
-def test_one_step_solves_a_straight_problem() -> None:
+def test_one_step_solves_a_linear_problem() -> None:
     columns = columns_of(3, 25, 2, seed=8)
     truth = np.array([0.3, -0.7])
     for c in columns:
@@ -345,7 +345,7 @@ def test_one_step_solves_a_straight_problem() -> None:
     assert predicted_decrease > 0
 
 
-def test_a_number_at_its_bound_does_not_leave_it() -> None:
+def test_a_parameter_at_its_bound_does_not_leave_it() -> None:
     columns = columns_of(3, 25, 2, seed=9)
     for c in columns:
         c[:, -1] = c[:, 4:6] @ np.array([0.3, -0.7])
@@ -358,7 +358,7 @@ def test_a_number_at_its_bound_does_not_leave_it() -> None:
     assert step[0] > 0
 
 
-def test_two_numbers_that_move_the_trajectories_alike_are_found_out() -> None:
+def test_collinear_parameters_are_detected() -> None:
     columns = columns_of(4, 25, 3, seed=10)
     for c in columns:
         c[:, 6] = 2 * c[:, 5]
@@ -372,14 +372,14 @@ def test_two_numbers_that_move_the_trajectories_alike_are_found_out() -> None:
     assert np.isfinite(found.covariance[0, 0])
 
 
-def test_blocks_of_a_trial_go_to_the_numbers_it_feels() -> None:
+def test_blocks_of_a_trial_are_added_to_its_parameters() -> None:
     frame = frame_of(2, 5, 3)
     frame = MixedProblem(**{**frame.__dict__, "index": np.array([[0, 2], [1, -1]])})
     total = sum_matrix_blocks(np.ones((2, 2, 2)), frame)
     assert total.tolist() == [[1, 0, 1], [0, 1, 0], [1, 0, 1]]
 
 
-def test_a_distance_of_two_numbers_is_given_as_the_deviate_of_one() -> None:
+def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None:
     # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
     assert _deviate(np.array([math.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
     assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""The next trial of a rig lies within its 95 % band: with what trials differ by, and with what a model misses."""
+"""The next trial lies within its 95 % band, given between-trial scatter and model misfit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def next_of(pairs: list, model: vt.Model, place: int) -> TrialFit:
     return vt.predict(vt.fit(model, [*pairs[:place], *pairs[place + 1 :]], profile=False), [pairs[place]])[0]
 
 
-def test_the_next_of_drops_that_scatter_is_within_its_band() -> None:
+def test_the_next_of_scattering_drops_is_within_its_band() -> None:
     held = []
     for campaign in range(30):
         draw = np.random.default_rng([20600, campaign])
@@ -48,13 +48,13 @@ def test_the_band_of_drops_that_agree_is_their_noise() -> None:
     assert np.median(band_m) == pytest.approx(1.96 * 2e-3, rel=0.2)
 
 
-def test_the_band_of_one_drop_of_two_that_disagree_would_hold_both() -> None:
+def test_the_band_from_two_drops_that_disagree_contains_both() -> None:
     drops = [dropped("a", 20200, 0.574), dropped("b", 20201, 0.459)]
     third = vt.predict(vt.fit(FALL, drops), [dropped("c", 20202, 0.574)])[0]
     assert third.within_band == 1.0
 
 
-def test_what_a_model_misses_otherwise_in_each_trial_widens_the_band() -> None:
+def test_a_misfit_that_differs_between_trials_widens_the_band() -> None:
     drops = [dropped(f"t{i}", 20670 + i, 0.5) for i in range(6)]
     warped = [
         (trial, replace(track, lead_position_m=_bulged(track, 0.004 * i))) for i, (trial, track) in enumerate(drops)
@@ -72,7 +72,7 @@ def _bulged(track: Track, size_m: float) -> np.ndarray:
     return np.asarray(track.lead_position_m + size_m * np.sin(4 * np.pi * part))
 
 
-def test_a_trial_of_a_campaign_has_the_band_of_what_its_trials_scatter_by() -> None:
+def test_the_band_of_a_campaign_follows_its_between_trial_scatter() -> None:
     pairs, _ = small_campaign(67)
     trial = next_of(pairs, vt.base_model(), 5)
     assert trial.band_m is not None
@@ -81,7 +81,7 @@ def test_a_trial_of_a_campaign_has_the_band_of_what_its_trials_scatter_by() -> N
     assert 1e-3 < float(np.max(trial.band_m)) < 3e-2
 
 
-def test_a_model_that_moves_nothing_has_no_smooth_errors_of_position() -> None:
+def test_a_model_without_motion_has_no_smooth_errors_of_position() -> None:
     predictor = SimpleNamespace(data=[SimpleNamespace(position_systematic_m=1e-4)] * 2)
     shapes = position_shapes(predictor, [np.zeros(3), np.zeros(3)])  # type: ignore[arg-type]
     assert np.max(np.abs(shapes)) < 1e-15  # m; their size is 1e-4

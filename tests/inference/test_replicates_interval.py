@@ -1,4 +1,4 @@
-"""Errors and intervals of a fit where statistics say what they must be. Seeds 20640 and up, which tuned nothing."""
+"""Errors and intervals of a fit where statistics prescribe them. Seeds from 20640, which were not used for tuning."""
 
 from __future__ import annotations
 

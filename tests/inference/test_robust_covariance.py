@@ -1,4 +1,4 @@
-"""Errors of fitted numbers hold where the model of the noise does not know what went wrong."""
+"""Errors of fitted numbers are correct where the noise model is wrong."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ def deviations(make: Callable[[int], Pairs], seeds: Iterable[int]) -> tuple[floa
 
 
 @pytest.mark.parametrize(("make", "seeds"), [(misread, range(60, 65)), (bent, range(60, 72))])
-def test_errors_hold_where_those_of_the_noise_are_too_small(make: Callable[[int], Pairs], seeds: range) -> None:
+def test_robust_errors_are_correct_where_model_errors_are_too_small(make: Callable[[int], Pairs], seeds: range) -> None:
     by_noise, stated = deviations(make, seeds)
     assert by_noise > 1.4
     assert 0.5 < stated < 1.3
 
 
-def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_error_is_smaller_than_the_scatter_of_trials_implies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of bent pictures the first campaign's trials scatter 1.6 times as widely in one number as the noise says.
 
     What trials err by together, which here is more, is left aside.
@@ -87,7 +87,7 @@ def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows(monkeypatch: 
 
 
 @pytest.mark.parametrize("trials", [2, 4, 7])
-def test_of_few_trials_the_variance_of_their_mean_is_found_without_bias(trials: int) -> None:
+def test_the_variance_of_the_mean_of_few_trials_is_unbiased(trials: int) -> None:
     """Each pulls the mean towards itself by 1/N: what is left of them has the variance (1 − 1/N)σ², degrees N − 1."""
     draw = np.random.default_rng(20690)
     solution = SimpleNamespace(problem=SimpleNamespace(prior_precision=np.zeros(1)))
@@ -102,7 +102,7 @@ def test_of_few_trials_the_variance_of_their_mean_is_found_without_bias(trials: 
     assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)
 
 
-def test_trials_that_scatter_as_the_model_says_have_the_errors_of_the_model() -> None:
+def test_trials_that_scatter_as_modelled_have_the_model_errors() -> None:
     ratios = []
     for seed in range(60, 64):
         found = vt.fit(vt.base_model(), small_campaign(seed)[0], profile=False)
@@ -132,21 +132,21 @@ def test_the_error_of_two_drops_is_half_their_difference() -> None:
     assert both.sigma == pytest.approx(0.0575, rel=0.2)
 
 
-def test_the_interval_of_two_drops_that_disagree_holds_both() -> None:
+def test_the_interval_from_two_drops_that_disagree_contains_both() -> None:
     both = two_drops_that_disagree()
     assert both.dof == pytest.approx(1.0, abs=0.1)
     assert both.low < 0.459
     assert both.high > 0.574
 
 
-def test_drops_that_disagree_count_alike_however_noisy() -> None:
+def test_drops_that_disagree_have_equal_weights_at_any_noise() -> None:
     drops = [dropped("a", 20204, 0.574), dropped("b", 20205, 0.459, noise_m=1e-2)]
     both = vt.fit(vt.make_model(["gravity", "air_drag"]), drops)
     assert both["C_D"].value == pytest.approx(0.5165, abs=0.02)
     assert any("trials disagree by more than their noise, in C_D by ± 0.0" in said for said in both.messages)
 
 
-def test_drops_that_agree_weigh_by_their_noise() -> None:
+def test_drops_that_agree_are_weighted_by_their_noise() -> None:
     drops = [dropped("a", 20206, 0.5), dropped("b", 20207, 0.5, noise_m=1e-2)]
     model = vt.make_model(["gravity", "air_drag"])
     both, first = vt.fit(model, drops, profile=False)["C_D"], vt.fit(model, drops[:1], profile=False)["C_D"]
@@ -154,7 +154,7 @@ def test_drops_that_agree_weigh_by_their_noise() -> None:
     assert both.sigma == pytest.approx(first.sigma, rel=0.15)
 
 
-def test_intervals_of_few_drops_hold_the_drag_about_which_they_scatter() -> None:
+def test_intervals_from_few_drops_contain_the_true_drag() -> None:
     held = []
     for campaign in range(40):
         draw = np.random.default_rng([20300, campaign])

@@ -1,4 +1,4 @@
-"""Positions that were rounded: a rest of twenty equal values tells no more than one of them."""
+"""Rounded positions: a rest of twenty equal values carries the information of one."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def with_stop(pairs, frames: int):
     return longer
 
 
-def test_a_rest_that_shows_no_noise_counts_as_one_point():
+def test_a_rest_without_visible_noise_counts_as_one_point():
     data, _ = prepare(rounded(1)[0])
     assert len(data) > 12
     for each in data:
@@ -49,12 +49,12 @@ def test_a_rest_that_shows_no_noise_counts_as_one_point():
         assert each.noise_m >= 0.999 * STEP_M / np.sqrt(12)
 
 
-def test_a_rest_whose_noise_shows_in_spite_of_rounding_is_kept():
+def test_a_rest_with_visible_noise_is_kept_despite_rounding():
     assert all(each.n_rest > 5 and each.imprecise_rest is None for each in prepare(rounded(1, 1e-5)[0])[0])
 
 
-def test_origins_of_rounded_tracks_err_as_much_as_is_said():
-    """Taken for twenty independent values, equal ones at rest gave origins that erred by five of their errors."""
+def test_origins_of_rounded_tracks_have_the_stated_errors():
+    """Taken for independent values, twenty equal ones at rest gave origins that were off by five standard errors."""
     errors = []
     for seed in (2, 3):
         pairs, truth = rounded(seed)
@@ -74,7 +74,7 @@ def test_a_standstill_at_the_end_counts_as_one_point_too():
         assert more_s.size <= 1 + np.count_nonzero(np.diff(before.lead_position_m[-20:]) == 0)
 
 
-def test_clicked_millimetres_are_told_and_nothing_is_missing(tmp_path):
+def test_positions_clicked_in_millimetres_are_recognised_and_the_model_is_adequate(tmp_path):
     """One frame in four, on a grid of a millimetre: called dropped frames, and a tail that stretches."""
     write_experiment(campaign("clicked", 20736, (8, 12), weighed=False), tmp_path / "e")
     said = vt.diagnose(vt.read_experiment(tmp_path / "e"), ladder=False, advice=False)

@@ -1,4 +1,4 @@
-"""A model in which nothing moves, or nothing has mass, is refused in one sentence that says what to look at."""
+"""A model in which nothing moves, or nothing has mass, is refused with one sentence and a remedy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_pressures_below_those_of_the_yield() -> None:
         vt.fit(vt.base_model(), held)
 
 
-def test_what_is_free_in_a_trial_is_named_only_where_it_is(fallen: tuple[Trial, Track]) -> None:
+def test_free_trial_effects_are_named_only_where_they_exist(fallen: tuple[Trial, Track]) -> None:
     trial, track = fallen
     steep = replace(track, lead_position_m=2.0 * track.lead_position_m)
     messages = " ".join(vt.fit(vt.make_model(["gravity"]), [(trial, steep)]).messages)

@@ -1,4 +1,4 @@
-"""Fits to part of the trials, begun where a fit of all ended, against fits from scratch. Seed 21."""
+"""Fits to a subset of the trials, started from the fit of all, compared with fits from scratch. Seed 21."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def whole(pairs: Pairs) -> Fit:
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 
-def test_a_condition_left_out_gives_what_a_fit_from_scratch_gives(whole: Fit, pairs: Pairs) -> None:
+def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(whole: Fit, pairs: Pairs) -> None:
     gone = pairs[0][0].condition
     rest = [pair for pair in pairs if pair[0].condition != gone]
     warm = fit_subset(whole, [trial.name for trial, _ in rest])
@@ -41,7 +41,7 @@ def test_a_condition_left_out_gives_what_a_fit_from_scratch_gives(whole: Fit, pa
         assert one.sigma == pytest.approx(other.sigma, rel=0.05)
 
 
-def test_a_vine_that_is_gone_takes_its_numbers_along(whole: Fit, pairs: Pairs) -> None:
+def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(whole: Fit, pairs: Pairs) -> None:
     stays = pairs[0][0].vine
     alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
     assert {number.vine for number in alone.numbers} == {"", stays}
@@ -50,13 +50,13 @@ def test_a_vine_that_is_gone_takes_its_numbers_along(whole: Fit, pairs: Pairs) -
         vt.predict(alone, [other])
 
 
-def test_all_trials_kept_the_fit_stays_where_it_is(whole: Fit) -> None:
+def test_with_all_trials_the_fit_is_unchanged(whole: Fit) -> None:
     again = fit_subset(whole, [True] * len(whole.trials))
     for one, other in zip(again.numbers, whole.numbers, strict=True):
         assert abs(one.value - other.value) < 0.05 * other.sigma
 
 
-def test_a_number_that_is_held_stays(whole: Fit, pairs: Pairs) -> None:
+def test_a_fixed_parameter_stays(whole: Fit, pairs: Pairs) -> None:
     stays = pairs[0][0].vine
     names = [trial.name for trial in whole.trials if trial.trial.vine == stays]
     held = fit_subset(whole, names, held=["eversion_damping.n", f"yield_pressure.P_y[{stays}]"])
@@ -66,21 +66,21 @@ def test_a_number_that_is_held_stays(whole: Fit, pairs: Pairs) -> None:
     assert held[f"eversion_damping.B[{stays}]"].sigma < 0.8 * free[f"eversion_damping.B[{stays}]"].sigma
 
 
-def test_spreads_and_noise_can_stay(whole: Fit) -> None:
+def test_variance_components_can_be_fixed(whole: Fit) -> None:
     names = [trial.name for trial in whole.trials][:15]
     held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
     assert [held.spreads[k].value for k in ("pressure", "B")] == [whole.spreads[k].value for k in ("pressure", "B")]
     assert held.noise_correlation == whole.noise_correlation
 
 
-def test_noise_that_the_user_told_goes_along(pairs: Pairs) -> None:
+def test_noise_fixed_by_the_user_is_kept(pairs: Pairs) -> None:
     told = vt.fit(vt.base_model(), pairs, profile=False, noise=(2e-4, 0.3))
     part = fit_subset(told, [trial.name for trial, _ in pairs[:9]])
     assert part.noise_m == pytest.approx(2e-4)
     assert part.noise_correlation == 0.3
 
 
-def test_a_larger_model_goes_on_serving(pairs: Pairs) -> None:
+def test_a_host_model_continues_to_serve(pairs: Pairs) -> None:
     host = vt.base_model() + vt.effects.linear_damping
     hosted = vt.fit(vt.base_model(), pairs, profile=False, host=host)
     part = fit_subset(hosted, [trial.name for trial, _ in pairs[:9]])
@@ -96,7 +96,7 @@ def test_unknown_trials_and_none_at_all_are_refused(whole: Fit) -> None:
         fit_subset(whole, [True, False])
 
 
-def test_trials_laid_out_for_the_fit_are_predicted_as_if_read_again(whole: Fit, pairs: Pairs) -> None:
+def test_prepared_trials_are_predicted_as_if_read_again(whole: Fit, pairs: Pairs) -> None:
     again, anew = (
         predict_prepared(whole, whole.predictor.data, from_rest=True),
         predict_trials(whole, pairs, from_rest=True),
@@ -118,7 +118,7 @@ def test_a_part_is_fitted_with_a_quarter_of_the_trajectories_of_a_fit(
     assert sum(simulated) / len(conditions) < 0.25 * from_scratch
 
 
-def test_yield_pressures_that_the_sheet_knows_exactly_are_no_numbers(pairs: Pairs) -> None:
+def test_yield_pressures_without_error_are_no_parameters(pairs: Pairs) -> None:
     exact = [(replace(trial, yield_pressure_sigma_Pa=0.0), track) for trial, track in pairs[:12]]
     found = vt.fit(vt.base_model(), exact, profile=False)
     part = fit_subset(found, [trial.name for trial, _ in exact[:9]])

@@ -1,4 +1,4 @@
-"""What the noise of a gauge leaves wrong in a recorded pressure is found from the motion, and not taken for physics."""
+"""Errors that gauge noise leaves in a recorded pressure are estimated from the motion and not taken for physics."""
 
 from __future__ import annotations
 
@@ -44,9 +44,7 @@ def fit(laboratory: tuple[Path, float]) -> vt.Fit:
     return vt.fit(vt.base_model(), laboratory[0], profile=False)
 
 
-def test_what_is_left_is_the_noise_of_the_positions_and_each_error_is_of_the_size_that_was_stated(
-    fit: vt.Fit, laboratory: tuple[Path, float]
-):
+def test_residuals_are_position_noise_and_errors_have_their_stated_size(fit: vt.Fit, laboratory: tuple[Path, float]):
     assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
     assert fit.chi2_per_dof < 1.1
     told = np.concatenate([each.trace_error_sizes for each in fit.predictor.data if each.trace_error_sizes is not None])
@@ -55,7 +53,7 @@ def test_what_is_left_is_the_noise_of_the_positions_and_each_error_is_of_the_siz
     assert trace_error_penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
 
 
-def test_an_error_that_a_trace_has_is_found(fit: vt.Fit):
+def test_an_error_of_a_trace_is_estimated(fit: vt.Fit):
     """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
     shapes = recorded_pressures(fit.predictor, fit.solution)
     moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.columns]
@@ -75,19 +73,19 @@ def test_an_error_that_a_trace_has_is_found(fit: vt.Fit):
     assert np.max(np.abs(after.trace[1] - pressure_Pa)) < 0.3 * np.max(np.abs(2.0 * errors_Pa[:, 0]))
 
 
-def test_a_model_far_off_bends_no_pressure(laboratory: tuple[Path, float]):
+def test_a_poor_model_corrects_no_pressure(laboratory: tuple[Path, float]):
     held = vt.fit(vt.base_model(), laboratory[0], fixed=["n"], start={"eversion_damping.n": 0.9}, profile=False)
     assert held.chi2_per_dof > 3
     assert all(each.trace_error_sizes is None for each in held.predictor.data)
 
 
-def test_no_vine_is_given_an_exponent_of_its_own_by_them(fit: vt.Fit):
+def test_trace_errors_suggest_no_exponent_per_vine(fit: vt.Fit):
     """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
     apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
 
 
-def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
+def test_estimated_errors_enter_the_likelihood(fit: vt.Fit):
     data = [replace(each, trace_error_sizes=None) for each in fit.predictor.data]
     predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
     free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
@@ -95,7 +93,7 @@ def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
     assert trace_error_penalty(fit.predictor.data) > 1.0
 
 
-def test_what_was_recorded_is_kept(fit: vt.Fit):
+def test_the_recorded_pressure_is_kept(fit: vt.Fit):
     recorded, _ = prepare(fit.pairs)
     for told, before in zip(map(as_recorded, fit.predictor.data), recorded, strict=True):
         assert told.trace_error_sizes is None
@@ -114,8 +112,8 @@ def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
     assert np.sqrt(np.mean(off**2)) < 0.01 * np.sqrt(np.mean(moved**2))
 
 
-def test_left_out_trials_are_predicted_from_what_was_recorded(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
-    """Pressures that were mended by a trial's own motion would predict it too well."""
+def test_left_out_trials_are_predicted_from_the_recorded_pressure(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
+    """Pressures corrected by a trial's own motion would predict it too well."""
     given = []
 
     def seen(fitted: vt.Fit, data: list, **how: bool) -> list:
@@ -128,8 +126,8 @@ def test_left_out_trials_are_predicted_from_what_was_recorded(fit: vt.Fit, monke
     assert all(trial_data.trace_error_sizes is None for trial_data in given)
 
 
-def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
-    """An effect whose curve the errors had imitated would not be found beside them."""
+def test_another_model_starts_from_the_recorded_pressure(fit: vt.Fit):
+    """An effect whose curve the errors had absorbed would not be found otherwise."""
     begun: list = []
 
     def seen(_: object, data: list, **_more: object) -> None:
@@ -145,7 +143,7 @@ def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
     assert begun[1] is fit.predictor.data
 
 
-def test_errors_of_which_the_motion_tells_nothing_are_none(fit: vt.Fit):
+def test_errors_without_influence_on_the_motion_are_zero(fit: vt.Fit):
     state = fit.solution.state
     deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
     far = [
@@ -160,7 +158,7 @@ def test_errors_of_which_the_motion_tells_nothing_are_none(fit: vt.Fit):
         np.testing.assert_allclose(back[:felt], -3.0, atol=0.05)
 
 
-def test_errors_that_cannot_be_simulated_stay_as_they_were_told(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
+def test_errors_that_cannot_be_simulated_stay_unchanged(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
     def fails(*_: object, **__: object) -> None:
         raise SimulationError("the tube stands still")
 

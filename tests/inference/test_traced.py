@@ -1,4 +1,4 @@
-"""Trials whose pressure was recorded by a gauge with noise: what the noise leaves wrong is no missing physics."""
+"""Trials with a pressure recorded by a noisy gauge: the remaining error is not taken for missing physics."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def test_the_tracks_are_explained_to_their_noise(traced: Fit) -> None:
     assert abs(traced["n"].value - N_TRUE) < 3 * traced["n"].sigma
 
 
-def test_the_gauge_is_believed_as_far_as_its_noise_lets_it(traced: Fit) -> None:
+def test_pressure_deviations_are_limited_by_the_noise_of_the_gauge(traced: Fit) -> None:
     for trial, item in zip(traced.trials, traced.predictor.data, strict=True):
         samples = np.count_nonzero(item.time_s >= trial.release_s)
         assert item.gauge_error == pytest.approx(GAUGE_NOISE_PA / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
         assert abs(trial.pressure_deviation) < 4 * item.gauge_error
 
 
-def test_what_the_gauge_leaves_wrong_in_a_pressure_bends_its_own_trial_alone(traced: Fit) -> None:
+def test_an_error_of_a_recorded_pressure_affects_its_own_trial_alone(traced: Fit) -> None:
     """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
     predictor = traced.predictor
     trace = predictor.data[3].trace

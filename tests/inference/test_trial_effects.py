@@ -1,4 +1,4 @@
-"""Trials filmed only in motion: their releases have more than one likely place, and the likeliest is found."""
+"""Trials recorded only in motion: their release has several likelihood maxima, and the highest is found."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def only_in_motion() -> Fit:
     return fit(vt.base_model(), cut)
 
 
-def test_what_makes_the_vine_is_found_without_a_frame_at_rest(only_in_motion: Fit) -> None:
+def test_parameters_are_estimated_without_a_frame_at_rest(only_in_motion: Fit) -> None:
     assert only_in_motion.converged
     assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
     assert only_in_motion["n"].sigma < 0.02
 
 
 @pytest.mark.parametrize("early_frames", [5, 20, 45])
-def test_the_same_likelihood_is_reached_wherever_the_releases_begin(only_in_motion: Fit, early_frames: int) -> None:
+def test_the_same_likelihood_is_reached_from_any_initial_release(only_in_motion: Fit, early_frames: int) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     own = solution.state.trial_effects.copy()
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
@@ -63,9 +63,7 @@ def gauged_in_motion() -> Fit:
 
 
 @pytest.mark.parametrize("early_frames", [5, 45])
-def test_nor_does_it_matter_where_they_begin_with_a_gauge_on_the_chamber(
-    gauged_in_motion: Fit, early_frames: int
-) -> None:
+def test_the_same_likelihood_is_reached_with_a_gauge_on_the_chamber(gauged_in_motion: Fit, early_frames: int) -> None:
     solution, predictor = gauged_in_motion.solution, gauged_in_motion.predictor
     assert all(trial_data.trace is not None and not trial_data.shows_rest for trial_data in predictor.data)
     away = solution.state.trial_effects.copy()
@@ -93,10 +91,10 @@ def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho
         assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
 
 
-def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_missed(
+def test_a_release_that_returned_jumps_again_only_if_the_misfit_falls(
     only_in_motion: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else steps, which lower what is missed, and searches, which go by likelihood, go round in a circle."""
+    """Otherwise steps, which lower the misfit, and searches, which maximise the likelihood, cycle."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     columns = predictor.linearise(solution.state.theta, solution.state.trial_effects)
     there = solution.state.trial_effects.copy()
@@ -126,10 +124,8 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
     assert looked(-4.0) is not None
 
 
-def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_to(
-    only_in_motion: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such a search, one step later, forgot the jump: 3 of 400 trials went round eight times, 40 steps of them all."""
+def test_a_jump_is_remembered_by_later_searches(only_in_motion: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search one step later forgot the jump: 3 of 400 trials cycled eight times, in 40 steps of all trials."""
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     residuals = residuals_in(predictor.linearise(solution.state.theta, solution.state.trial_effects))
     there = solution.state.trial_effects.copy()
@@ -153,11 +149,11 @@ def test_a_jump_is_remembered_by_a_search_that_finds_the_trial_where_it_jumped_t
     ],
     ids=["it still falls", "it creeps", "a jump has just raised it", "too few steps"],
 )
-def test_a_fit_that_only_creeps_may_end(levels: list[float], *, ends: bool) -> None:
+def test_a_stagnating_fit_may_end(levels: list[float], *, ends: bool) -> None:
     assert _stagnates(levels, 1.0) == ends
 
 
-def test_residuals_of_several_ways_are_those_of_each(only_in_motion: Fit) -> None:
+def test_residuals_of_several_sets_are_those_of_each(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     there = solution.state.trial_effects.copy()
     there[:, 0] -= 0.004
@@ -168,7 +164,7 @@ def test_residuals_of_several_ways_are_those_of_each(only_in_motion: Fit) -> Non
         assert all(np.array_equal(a, b) for a, b in zip(left_m, alone, strict=True))
 
 
-def test_a_place_that_no_linear_answer_brings_low_enough_is_given_up_at_once(only_in_motion: Fit) -> None:
+def test_a_step_is_rejected_without_simulation_if_the_linear_model_predicts_no_decrease(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     off = solution.state.trial_effects.copy()
     off[:, 1] += 1e-3
@@ -182,7 +178,7 @@ def test_a_place_that_no_linear_answer_brings_low_enough_is_given_up_at_once(onl
     assert np.array_equal(followed.trial_effects, better.trial_effects)
 
 
-def test_where_releases_are_looked_for_the_other_trials_stay(only_in_motion: Fit) -> None:
+def test_a_release_search_leaves_the_other_trials_unchanged(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     off = solution.state.trial_effects.copy()
     off[[2, 5], 0] -= 0.02
@@ -197,7 +193,7 @@ def test_where_releases_are_looked_for_the_other_trials_stay(only_in_motion: Fit
     assert np.allclose(kept[[2, 5], 0], solution.state.trial_effects[[2, 5], 0], atol=1e-4)
 
 
-def test_a_fit_ends_where_the_steps_that_are_left_cannot_bring_it_far_enough(only_in_motion: Fit) -> None:
+def test_a_fit_ends_if_the_remaining_steps_cannot_reach_the_target(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     theta = solution.state.theta.copy()
     theta[0] += 0.3
@@ -210,13 +206,13 @@ def test_a_fit_ends_where_the_steps_that_are_left_cannot_bring_it_far_enough(onl
     assert given_up.iterations < led.iterations
 
 
-def test_a_search_goes_on_to_the_end_where_the_model_is_near_the_tracks(only_in_motion: Fit) -> None:
+def test_a_search_converges_if_the_model_is_close_to_the_tracks(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
     assert found.converged
 
 
-def test_deviations_that_a_straight_line_promises_without_end_are_stated_as_far_as_one_may_go(
+def test_unbounded_linear_deviations_are_reported_within_their_limit(
     only_in_motion: Fit,
 ) -> None:
     fitted = only_in_motion
@@ -231,7 +227,7 @@ def test_deviations_that_a_straight_line_promises_without_end_are_stated_as_far_
     assert {trial.damping_deviation for trial in others} == {0.0}
 
 
-def test_a_trajectory_beyond_what_numbers_hold_costs_without_end_and_says_nothing(only_in_motion: Fit) -> None:
+def test_an_overflowing_trajectory_has_infinite_cost_without_a_warning(only_in_motion: Fit) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
     assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()

@@ -32,7 +32,7 @@ def test_weighted_products_are_those_of_columns_divided_by_their_noise():
     )
 
 
-def test_whitening_weights_arrays_of_any_depth_alike():
+def test_whitening_weights_arrays_of_any_dimension_alike():
     columns, first, relative_sd = columns_and_gaps()
     flat = whiten(columns, first, RHO, relative_sd)
     deep = whiten(np.stack([columns, 2 * columns]), first, RHO, relative_sd)
@@ -100,6 +100,6 @@ def test_trials_of_equal_noise_are_not_weighted():
     assert all(item.relative_sd is None and item.mean_noise_m == item.noise_m for item in data)
 
 
-def test_points_count_alike_where_the_noise_is_stated():
+def test_points_have_equal_weights_if_the_noise_is_given():
     pairs, _ = fast_trials(6e-5)
     assert all(trial_data.relative_sd is None for trial_data in prepare(pairs, weighted=False)[0])

@@ -1,4 +1,4 @@
-"""A pressure that is let in while it is recorded: the trace alone says when growth starts."""
+"""A tube pressurised during the recording: the trace alone shows when growth starts."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def campaign() -> list[tuple[Trial, Track]]:
     return pairs
 
 
-def test_a_pressure_that_rises_from_nothing_was_let_in():
+def test_a_pressure_that_rises_from_zero_counts_as_pressurised_in_the_recording():
     assert prepare_trial(*campaign()[0]).pressurised_in_recording
     held = filmed(np.full(TIMES_S.size, 16e3), 1)
     assert not prepare_trial(vine(), held).pressurised_in_recording
 
 
-def test_the_threshold_is_found_instead_of_a_release():
+def test_the_yield_pressure_is_estimated_instead_of_a_release():
     # Released where it is seen to start, any lower yield pressure fits about as well; let in, only the true one does.
     fit = vt.fit(vt.base_model(), campaign(), profile=False)
     assert all(abs(trial.release_s) < 1e-3 for trial in fit.trials)
@@ -64,7 +64,7 @@ def test_the_threshold_is_found_instead_of_a_release():
     assert abs(fit["n"].value - N_TRUE) < max(4 * fit["n"].sigma, 0.01)
 
 
-def test_errors_count_from_where_the_vine_moves():
+def test_gauge_errors_are_averaged_over_the_motion():
     from vinetrack.diagnosis.replicates import first_that_counts
 
     fit = vt.fit(vt.base_model(), campaign(), profile=False)
