@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_let_in import campaign
+from test_pressurised_in_recording import campaign
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
