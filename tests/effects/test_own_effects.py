@@ -15,7 +15,7 @@ from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import Effect, EffectError, catalogue, load_effect
-from vinetrack.effects._catalogue import _same_anywhere
+from vinetrack.effects._catalogue import _is_independent_of_path
 from vinetrack.effects._own import UNCHANGED, behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
@@ -84,8 +84,8 @@ def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(
 )
 def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: str) -> None:
     """A table or a module beside a file may be another beside its copy."""
-    assert _same_anywhere(BRUSH.encode())
-    assert not _same_anywhere(f"{BRUSH}\n{line}\n".encode())
+    assert _is_independent_of_path(BRUSH.encode())
+    assert not _is_independent_of_path(f"{BRUSH}\n{line}\n".encode())
     if "brushes" not in line:
         one, other = copies(tmp_path, f"{BRUSH}\n{line}\n")
         assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
