@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0
-"""Significance from which a model is said to fail (with a Bonferroni correction for single conditions), and from which
-a condition then counts as failing."""
+"""Significance, in standard deviations, from which a model is said to fail (with a Bonferroni correction for single
+conditions), and from which a condition then counts as failing."""
 
 CONDITION_COLUMNS = (
     "vine",
