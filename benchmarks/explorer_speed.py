@@ -1,4 +1,4 @@
-"""How long the explorer's page takes to answer: a slider moved, a refit begun.
+"""Response time of the explorer's page: to a slider move, and to the start of a refit.
 
 Run as `python benchmarks/explorer_speed.py [RESULTS] [MOVES]` on a results folder, by default `results/demo`, with 60
 moves of the size of `reservoir_depletion`, each waited for; needs a Chromium. Prints the time from a move to the
@@ -36,20 +36,20 @@ def redraws_ms(visitor: Visitor, moves: int) -> list[float]:
 
 
 def computed_ms(results: Path) -> tuple[int, float]:
-    """Trials, and the median time in which the curves and errors of all follow."""
+    """Number of trials, and the median time to compute all curves and errors."""
     campaign = open_campaign(results)
     start = choice_in_use(campaign).with_effect("reservoir_depletion")
     curves, spent = None, []
     for k in range(22):
-        begun = time.perf_counter()
+        started = time.perf_counter()
         curves = simulate_curves(campaign, sized_model(campaign, start.with_size(SIZE[5:], 1.1 + 0.01 * k)), curves)
         errors_m(campaign, curves)
-        spent.append(1e3 * (time.perf_counter() - begun))
+        spent.append(1e3 * (time.perf_counter() - started))
     return len(campaign.trials), statistics.median(spent[2:])
 
 
 def progress_ms(visitor: Visitor) -> float:
-    """From the click on *Refit* to the bar of progress in the page, seen from within it."""
+    """Time from the click on *Refit* to the progress bar, measured within the page."""
     visitor.place("refit", "button")
     return float(
         visitor.chrome.run(

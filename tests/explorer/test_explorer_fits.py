@@ -90,57 +90,59 @@ def test_correlated_parameters_are_named(first: Fitted) -> None:
     assert correlated_pairs_text(tied)[0].endswith("+1.00")
 
 
-class Heard:
+class RecordedCallbacks:
     """Records the callbacks of a job."""
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
-        self.found: list[Fitted] = []
+        self.results: list[Fitted] = []
         self.reasons: list[str] = []
 
     def job(self, work: object) -> FitJob:
-        return FitJob(work, on_progress=self.steps.append, on_success=self.found.append, on_failure=self.reasons.append)  # type: ignore[arg-type]
+        return FitJob(
+            work, on_progress=self.steps.append, on_success=self.results.append, on_failure=self.reasons.append
+        )  # type: ignore[arg-type]
 
 
 def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
-    heard = Heard()
-    job = heard.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
+    recorded = RecordedCallbacks()
+    job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
     job.wait(60)
     assert not job.running
-    assert heard.steps
-    assert heard.found[0].fit.model.names == first.fit.model.names
+    assert recorded.steps
+    assert recorded.results[0].fit.model.names == first.fit.model.names
 
 
 def test_a_cancelled_job_calls_no_callback() -> None:
-    heard, begun = Heard(), threading.Event()
+    recorded, started = RecordedCallbacks(), threading.Event()
 
     def endless(watch: Watch) -> Fitted:
-        begun.set()
+        started.set()
         while True:
             watch(Step(1, {}, 1.0))
             time.sleep(0.01)
 
-    job = heard.job(endless)
-    begun.wait(10)
+    job = recorded.job(endless)
+    started.wait(10)
     job.cancel()
     assert not job.running
     job.wait(10)
-    count = len(heard.steps)
+    count = len(recorded.steps)
     time.sleep(0.05)
-    assert len(heard.steps) == count
-    assert not heard.found
-    assert not heard.reasons
+    assert len(recorded.steps) == count
+    assert not recorded.results
+    assert not recorded.reasons
 
 
 @pytest.mark.parametrize(("error", "said"), [(FitError("no start"), "no start"), (ZeroDivisionError(), FAULT)])
 def test_a_failed_job_gives_the_reason_in_a_sentence(error: Exception, said: str) -> None:
-    heard = Heard()
+    recorded = RecordedCallbacks()
 
     def fail(_: Watch) -> Fitted:
         raise error
 
-    heard.job(fail).wait(10)
-    assert heard.reasons == [said]
+    recorded.job(fail).wait(10)
+    assert recorded.reasons == [said]
 
 
 def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:

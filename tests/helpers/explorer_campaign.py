@@ -1,7 +1,7 @@
-"""Results folders for the explorer's tests: vines of the demonstration's kind, grown with a small chamber, as tracks.
+"""Results folders for the explorer's tests: simulated tracks of the demonstration's vines, with a small chamber.
 
-The truth is that of the demonstration: two vines, n 0.37, B 1.83 and 6.44, reservoir depletion (γ 1.4) that the model
-in use lacks. Seed 20 everywhere; nothing here scores a method.
+The truth is that of the demonstration: two vines, n 0.37, B 1.83 and 6.44, reservoir depletion (γ 1.4) that is
+missing from the model in use. Seed 20 everywhere; nothing here scores a method.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SETTINGS = "# what all trials share\ncapture_fps: 1069\nyield_pressure_kPa: 3   
 FEW_CANDIDATES = (
     "candidates: [reservoir_depletion, supply_refill, tail_friction, air_drag, length_scale, inlet_loss, trace_clock]\n"
 )
-"""For tests of what is made of a diagnosis; the last two these trials cannot show. What the whole catalogue does to a
-verdict, `tests/diagnosis` asks."""
+"""For tests that use a diagnosis; the last two cannot be tested with these trials. `tests/diagnosis` tests verdicts with
+the whole catalogue."""
 
 SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
 
@@ -46,14 +46,14 @@ def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = S
 
 
 def run(*arguments: object) -> str:
-    """A command of vinetrack that has to succeed; what it said."""
+    """Run a command of vinetrack that must succeed; return its output."""
     done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return done.output
 
 
 def make_results(experiment: Path, results: Path) -> Path:
-    """What snakemake makes of it, as far as the explorer reads it."""
+    """The results of the workflow, as far as the explorer reads them."""
     few = ("--settings", '{"damping": {"resamples": 100}}')
     run("tracks", experiment, results)
     run("gather", experiment, results)
@@ -64,7 +64,7 @@ def make_results(experiment: Path, results: Path) -> Path:
 
 
 def write_diagnosis(results: Path) -> Path:
-    """A diagnosis in the shape of `diagnosis.json`, with a tie and a next trial."""
+    """Write a `diagnosis.json` with a tie and a next trial."""
     ranking = [
         {"effect": "reservoir_depletion", "delta_chi2": 4000.0, "in_answer_set": True, "reason": ""},
         {"effect": "leak", "delta_chi2": 3995.0, "in_answer_set": True, "reason": ""},
@@ -104,9 +104,9 @@ def write_diagnosis(results: Path) -> Path:
 
 
 def film_of(experiment: Path, results: Path, trial: str) -> Path:
-    """Make one trial of a results folder one that was filmed: a bright bar whose right end is where the track has it.
+    """Give one trial of a results folder a recording: a bright bar whose right end follows the track.
 
-    4 px a millimetre, the axis along row 48 from column 20.
+    The scale is 4 px per millimetre, with the axis along row 48 from column 20.
     """
     track = pd.read_csv(results / "tracks" / f"{trial}.csv", keep_default_na=False, na_values=["", "NaN"])
     position_m = track["lead_position_m"].interpolate(limit_direction="both").to_numpy()
@@ -128,7 +128,7 @@ def film_of(experiment: Path, results: Path, trial: str) -> Path:
 
 
 def write_bars(path: Path, ends_px: np.ndarray, width: int = 960, height: int = 96) -> Path:
-    """A clip with a bright bar on dark grey in every frame, from the left to where it ends."""
+    """Write a clip with a bright bar on dark grey in every frame, from the left to the given end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "12"})

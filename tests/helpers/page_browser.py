@@ -1,4 +1,4 @@
-"""Stands for the browser in tests of the explorer's page that need none."""
+"""Replacement of the browser in tests of the explorer's page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vinetrack.explorer.page import Page
 
 
 class Browser:
-    """Stands for the browser: a document whose callbacks are run by hand."""
+    """A document whose callbacks are run by hand."""
 
     def __init__(self, background: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
         self.document = Document()
@@ -29,7 +29,7 @@ class Browser:
         return str(self.model(name).text)
 
     def turn(self) -> None:
-        """Run everything that is due once."""
+        """Run all pending callbacks once."""
         for callback in list(self.document.session_callbacks):
             if type(callback).__name__ != "PeriodicCallback":
                 self.document.callbacks.remove_session_callback(callback)

@@ -1,4 +1,4 @@
-"""A command that serves a page, in a process of its own; the explorer's page as a person meets it in a browser."""
+"""A command that serves a page, in a separate process; user actions on the explorer's page in a browser."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Served:
 
     @property
     def address(self) -> str:
-        """Where it says the page is."""
+        """The address of the page that it printed."""
 
         def found() -> str:
             assert self.process.poll() is None, self.lines
             return next((m.group() for line in self.lines if (m := re.search(r"http://\S+", line))), "")
 
-        return str(until(found, "the server to say where it is", 120))
+        return str(until(found, "the server to print its address", 120))
 
     def interrupt(self) -> int:
         """Ctrl-C; the exit status."""
@@ -73,7 +73,7 @@ class Served:
 
 
 class Visitor:
-    """What a person sees and does: widgets are found by their names, and used with the mouse."""
+    """User actions on the page: widgets are found by name, and used with the mouse."""
 
     def __init__(self, chrome: Chrome, address: str) -> None:
         self.chrome = chrome
@@ -83,15 +83,15 @@ class Visitor:
 
     @staticmethod
     def model(name: str) -> str:
-        """JavaScript of a widget or figure."""
+        """JavaScript expression of a widget or figure."""
         return f"Bokeh.documents[0].get_model_by_name({name!r})"
 
     def value(self, name: str, what: str) -> Any:
-        """A property of it."""
+        """A property of a widget."""
         return self.chrome.run(f"{self.model(name)}.{what}")
 
     def text(self, name: str) -> str:
-        """Its words."""
+        """The text of a widget."""
         return str(self.value(name, "text"))
 
     def until(self, script: str, what: str, seconds: float = 120) -> None:
@@ -99,7 +99,7 @@ class Visitor:
         self.chrome.wait(re.sub(r"\$(\w+)", lambda m: self.model(m.group(1)), script), what, seconds)
 
     def place(self, name: str, inside: str) -> list[float]:
-        """Middle of an element of a widget in the window, once it has been brought into sight; and its width."""
+        """Scroll an element of a widget into view; return its centre in the window and its width."""
         view = f"Bokeh.index.find_one({self.model(name)})"
         self.chrome.run(f"{view}.el.scrollIntoView({{block: 'center'}})")
         time.sleep(0.2)
@@ -110,14 +110,14 @@ class Visitor:
         return box
 
     def click(self, name: str, inside: str = "button") -> None:
-        """Click on it."""
+        """Click on an element of a widget."""
         x, y, _ = self.place(name, inside)
         self.chrome.click(x, y)
 
     def drag(self, name: str, path: list[float], after: Callable[[], None]) -> None:
-        """Drag the handle of a slider through parts of its whole width, to the right where positive.
+        """Drag the handle of a slider by fractions of its width, positive to the right.
 
-        `after` is called after every move, the button still down.
+        `after` is called after every move, with the button still pressed.
         """
         _, _, whole = self.place(name, ".noUi-target")
         x, y, _ = self.place(name, ".noUi-handle")
@@ -129,7 +129,7 @@ class Visitor:
         self.chrome.mouse("release", x + path[-1] * whole, y)
 
     def time_redraws(self, slider: str) -> None:
-        """From now on, note for every redraw the time from the first move it answers to the frame that shows it."""
+        """Start recording, for every redraw, the time from its first slider move to the frame that shows it."""
         self.chrome.run(
             f"""(() => {{
               window.redraws_ms = [];
@@ -144,12 +144,12 @@ class Visitor:
         )
 
     def redraws_ms(self) -> list[float]:
-        """What was noted."""
+        """The recorded times."""
         found: list[float] = self.chrome.run("redraws_ms")
         return found
 
     def one_redraw(self) -> None:
-        """Wait, within the page, until one more redraw was noted; for two seconds at most."""
+        """Wait, within the page, until one more redraw was recorded; for two seconds at most."""
         self.chrome.run(
             """(async () => {
               const count = window.redraws_seen ?? 0;
