@@ -25,8 +25,8 @@ SETTINGS = "# what all trials share\ncapture_fps: 1069\nyield_pressure_kPa: 3   
 FEW_CANDIDATES = (
     "candidates: [reservoir_depletion, supply_refill, tail_friction, air_drag, length_scale, inlet_loss, trace_clock]\n"
 )
-"""For tests that use a diagnosis; the last two cannot be tested with these trials. `tests/diagnosis` tests verdicts with
-the whole catalogue."""
+"""For tests that use a diagnosis; the last two cannot be tested with these trials. `tests/diagnosis` tests verdicts
+with the whole catalogue."""
 
 SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
 
