@@ -180,7 +180,7 @@ Pairs = Iterable[tuple[Trial, Track]]
 def prepare_trial(
     trial: Trial,
     track: Track,
-    quiet: DenoisedTrace | None = None,
+    denoised: DenoisedTrace | None = None,
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
 ) -> FitTrial:
@@ -190,7 +190,7 @@ def prepare_trial(
     ----------
     trial : row of the sheet.
     track : its positions.
-    quiet : DenoisedTrace, optional
+    denoised : DenoisedTrace, optional
         Its denoised pressure from `denoised_traces` of the whole campaign; by default from this track alone.
     smoothing : Smoothing, optional
         How its positions were smoothed; of the points that a window correlates, one is kept.
@@ -245,8 +245,8 @@ def prepare_trial(
             f"{moving} usable point{'s' * (moving != 1)} in motion, at least {FEWEST_MOVING} are needed: film faster,"
             " or see in its overlay what hides the edge"
         )
-    quiet = quiet or denoised_traces([track])[0]
-    extended = None if quiet is None else quiet.extended()
+    denoised = denoised or denoised_traces([track])[0]
+    extended = None if denoised is None else denoised.extended()
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
     return FitTrial(
@@ -258,7 +258,7 @@ def prepare_trial(
         noise_m=noise_m,
         correlation=correlation,
         trace=None if extended is None else (extended.time_s, extended.pressure_Pa),
-        gauge_error=0.0 if quiet is None else _gauge_error(quiet, time_s[max(n_rest - 1, 0) :]),
+        gauge_error=0.0 if denoised is None else _gauge_error(denoised, time_s[max(n_rest - 1, 0) :]),
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
         trace_is_curve=extended is not None and extended.is_curve,
         imprecise_rest=imprecise_rest,
@@ -289,14 +289,14 @@ def _position_systematic_m(trial: Trial) -> float:
     return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
-def _gauge_error(quiet: DenoisedTrace, moving_s: Floats) -> float:
+def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
     """Relative error of the denoised pressure that is constant over the motion."""
-    in_motion = (quiet.time_s >= moving_s[0]) & (quiet.time_s <= moving_s[-1])
-    typical_Pa = abs(float(np.median(quiet.pressure_Pa[in_motion]))) if in_motion.any() else math.nan
+    in_motion = (denoised.time_s >= moving_s[0]) & (denoised.time_s <= moving_s[-1])
+    typical_Pa = abs(float(np.median(denoised.pressure_Pa[in_motion]))) if in_motion.any() else math.nan
     if not typical_Pa > 0:
         return 0.0
     # The noise averages out over the samples during the motion only.
-    return quiet.mean_error_Pa * math.sqrt(in_motion.size / np.count_nonzero(in_motion)) / typical_Pa
+    return denoised.mean_error_Pa * math.sqrt(in_motion.size / np.count_nonzero(in_motion)) / typical_Pa
 
 
 def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:

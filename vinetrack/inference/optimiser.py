@@ -183,6 +183,7 @@ def solve(
     for iteration in range(1, most_iterations + 1):
         close = predicted_decrease < FAR_FROM_OPTIMUM or iteration > MOST_FIRST_ITERATIONS
         first_phase = first_phase and not (iteration > FIRST_ITERATIONS and close)
+        # Variance components of the model linearised about the current state, then a step of the parameters.
         before = state
         state = _update_variances(
             predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
@@ -192,24 +193,23 @@ def solve(
         if watch is not None:
             watch(_step_report(predictor, state, iteration, predicted_decrease))
         small_step = predicted_decrease < least_decrease
+        # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (
             small_step
             or (predicted_decrease < NEARLY_CONVERGED and not searched_in_vain)
             or iteration >= last_search + RELEASE_SEARCH_INTERVAL
         ):
             last_search, searched_in_vain = iteration, True
-            state_with_moved_releases = releases.likelier(state, residuals_in(columns))
-            if state_with_moved_releases is not None:
-                state, (columns, cross_products) = (
-                    state_with_moved_releases,
-                    _linearise(predictor, state_with_moved_releases),
-                )
+            relocated = releases.likelier(state, residuals_in(columns))
+            if relocated is not None:
+                state, (columns, cross_products) = relocated, _linearise(predictor, relocated)
                 searches_left, searched_in_vain = searches_left - 1, False
                 continue
             searches_left = 0 if small_step else searches_left
         if small_step and variances_moved < CONVERGED_VARIANCES and not first_phase:
             converged = True
             break
+        # A fit that is one of many candidates is stopped early where it cannot succeed.
         penalised_squares = cost(predictor, problem, state, residuals_in(columns))
         deviances.append(_deviance_of(problem, state, penalised_squares, fixed_terms))
         if search and _stagnates(deviances, STAGNATION_DECREASE * float(np.sum(problem.points))):
@@ -217,12 +217,13 @@ def solve(
             if is_poor_fit(predictor, reached):
                 break
         if shortfall is not None and iteration > FIRST_ITERATIONS:
-            expected_of_remaining_steps = (most_iterations - iteration) * _decrease_per_step(deviances)
+            expected_later = (most_iterations - iteration) * _decrease_per_step(deviances)
             if (
                 shortfall(cross_products, problem, state, penalised_squares)
-                > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_of_remaining_steps
+                > _largest_decrease(problem, penalised_squares, predicted_decrease) + expected_later
             ):
                 break
+        # Shorten or damp the step until it lowers the penalised sum of squares; linearise about the new state.
         accepted, damping = _accepted_step(
             predictor, problem, cross_products, state, step, effect_step, damping, penalised_squares
         )

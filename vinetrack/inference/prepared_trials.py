@@ -39,9 +39,9 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
     smoothing = detect_smoothing(pairs, rounding_m)
-    for (trial, track), quiet in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
+    for (trial, track), denoised in zip(pairs, denoised_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track, quiet, smoothing, rounding_m))
+            data.append(prepare_trial(trial, track, denoised, smoothing, rounding_m))
         except FitError as error:
             left_out[trial.name] = str(error)
     return _with_weighted_points(data) if weighted else data, left_out
