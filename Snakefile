@@ -1,7 +1,7 @@
-# From an experiment folder to its report: the rules are in vinetrack/pipeline/Snakefile.
+# From an experiment folder to its report. The rules are in vinetrack/pipeline/Snakefile.
 #
 #   snakemake --cores 2                               the shipped demonstration
-#   snakemake --cores 2 --config experiment=PATH      a folder of one's own
+#   snakemake --cores 2 --config experiment=PATH      your own experiment
 
 from pathlib import Path
 

@@ -55,7 +55,7 @@ def test_anyway_puts_the_verdict_above(tmp_path: Path) -> None:
 
 
 def test_a_last_model_that_is_not_stored_is_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(ResultsError, match="is not stored there: run it again"):
+    with pytest.raises(ResultsError, match="is not stored there: run the diagnosis again"):
         choose_fit(results(tmp_path, ("missing", "adequate"), ("air_drag",)))
 
 

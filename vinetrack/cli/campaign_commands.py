@@ -1,4 +1,4 @@
-"""The command `vinetrack campaign`: look after every few trials, stop when one name is left."""
+"""The command `vinetrack campaign`: sequential looks at a growing set of trials, with a stopping rule."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _campaign(
     risk: Annotated[
         float | None,
         typer.Option("--risk", min=1e-6, max=0.5, show_default=False,
-                     help="Of stopping with a wrong name, stated at the first look; 0.03 if not given."),
+                     help="Risk of stopping with a wrong effect, stated at the first look; default 0.03."),
     ] = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
@@ -37,7 +37,7 @@ def _campaign(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.",
                                              show_default=False)] = None,
 ) -> None:  # fmt: skip
-    """Look at a campaign that goes on: verdict, next trials, and whether one name is left at the stated risk."""
+    """Look at a running campaign: verdict, next trials, and whether it may stop at the stated risk."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):

@@ -1,4 +1,4 @@
-"""The commands about vines not yet built: `vinetrack predict` and `vinetrack design …`."""
+"""The commands about new vines: `vinetrack predict` and `vinetrack design …`."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ from vinetrack.cli.output import MORE, JsonFile, print_result
 def _predict(
     sheet: Annotated[
         Path | None,
-        typer.Argument(help="An experiment's folder or a sheet; else the options below.", metavar="SHEET",
+        typer.Argument(help="An experiment's folder or a sheet, instead of the options below.", metavar="SHEET",
                        show_default=False),
     ] = None,
     *,
     cells: dict[str, str],
     tail_slack: Annotated[
         str | None,
-        typer.Option("--tail-slack", metavar="taut|free", help="Whether a tail that would push goes slack.",
+        typer.Option("--tail-slack", metavar="taut|free", help="Whether a tail under compression goes slack.",
                      rich_help_panel=RIG, show_default=False),
     ] = None,
     results: Results = None,
@@ -73,17 +73,17 @@ def _predict(
     figure: FigurePath = None,
     csv: Annotated[
         Path | None,
-        typer.Option("--csv", help="Write the curves, to this file.", rich_help_panel=OUT, show_default=False),
+        typer.Option("--csv", help="Write the curves to this file.", rich_help_panel=OUT, show_default=False),
     ] = None,
     json: Annotated[
         Path | None,
-        typer.Option("--json", help="Write everything said, to this file, - for the terminal.",
+        typer.Option("--json", help="Write all numbers to this file, - for the terminal.",
                      rich_help_panel=OUT, show_default=False),
     ] = None,
     anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """What a vine not yet built will do: position, speed, tension, ejection speed, with their uncertainty."""
+    """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -133,12 +133,12 @@ def _vine(
     ] = "100:400",
     burst_share: Annotated[
         float,
-        typer.Option("--burst-fraction", min=0.05, max=1, help="Share of the burst stress that is dared.",
+        typer.Option("--burst-fraction", min=0.05, max=1, help="Allowed fraction of the burst stress.",
                      rich_help_panel=VINE),
     ] = 0.9,
     burst_stress: Annotated[
         float,
-        typer.Option("--burst-MPa", min=0.01, max=1000, help="Hoop stress at which the film bursts; a guess.",
+        typer.Option("--burst-MPa", min=0.01, max=1000, help="Burst stress of the film; default from one vine.",
                      rich_help_panel=VINE),
     ] = 7.8,
     *,
@@ -155,7 +155,7 @@ def _vine(
     anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """The fastest vine within burst pressure, diameter, length, and films to choose from."""
+    """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -197,8 +197,8 @@ def _vine(
     "growth_angle_deg",
     "inlet_mm",
     meanings={
-        "chamber_l": "A chamber to look at as well.",
-        "thickness_um": "Thickness of the wall: speeds are then told as well.",
+        "chamber_l": "A chamber to evaluate as well.",
+        "thickness_um": "Thickness of the wall; with it, speeds are predicted as well.",
         "yield_pressure_kPa": YIELD_MEANING,
     },
 )
@@ -207,12 +207,12 @@ def _reservoir(
     cells: dict[str, str],
     within: Annotated[
         float,
-        typer.Option("--within", min=0.01, max=90, help="Per cent of the gauge pressure that may be lost.",
+        typer.Option("--within", min=0.01, max=90, help="Allowed loss of gauge pressure, per cent.",
                      rich_help_panel=RIG),
     ] = 5.0,
     supply: Annotated[
         float | None,
-        typer.Option("--supply-s", min=1e-6, max=1e4, help="Time in which a supply closes the gap.",
+        typer.Option("--supply-s", min=1e-6, max=1e4, help="Time constant of a supply that refills it.",
                      rich_help_panel=RIG, show_default=False),
     ] = None,
     results: Results = None,
@@ -225,7 +225,7 @@ def _reservoir(
     anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """The chamber that keeps the gauge pressure within so many per cent, by the gas law in absolute pressure."""
+    """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -260,34 +260,34 @@ def _campaign(
                      rich_help_panel=VINE, show_default=False),
     ] = None,
     n_se: Annotated[
-        float, typer.Option("--n-se", min=1e-5, max=1, help="Standard error of n that is wanted.")
+        float, typer.Option("--n-se", min=1e-5, max=1, help="Wanted standard error of n.")
     ] = 0.01,
     B_se_percent: Annotated[
-        float, typer.Option("--B-se-percent", min=1e-3, max=100, help="Standard error of every B, per cent.")
+        float, typer.Option("--B-se-percent", min=1e-3, max=100, help="Wanted standard error of every B, per cent.")
     ] = 3.0,
     pressure: Annotated[
         str | None,
-        typer.Option("--pressure-kPa", metavar="LOW:HIGH", help="Range of pressures; else all that can be filmed.",
+        typer.Option("--pressure-kPa", metavar="LOW:HIGH", help="Range of pressures; default: all that can be filmed.",
                      rich_help_panel=RIG, show_default=False),
     ] = None,
     payloads: Annotated[
         str, typer.Option("--payload-g", metavar="GRAMS,…", help="Payloads to choose from.", rich_help_panel=RIG)
     ] = "0",
     pressures: Annotated[
-        str, typer.Option("--pressures", metavar="LEAST:MOST", help="Pressures a vine.", rich_help_panel=RIG)
+        str, typer.Option("--pressures", metavar="LEAST:MOST", help="Pressures per vine.", rich_help_panel=RIG)
     ] = "4:8",
     replicates: Annotated[
-        str, typer.Option("--replicates", metavar="LEAST:MOST", help="Trials of each condition.", rich_help_panel=RIG)
+        str, typer.Option("--replicates", metavar="LEAST:MOST", help="Trials per condition.", rich_help_panel=RIG)
     ] = "2:12",
-    most_trials: Annotated[int, typer.Option("--most-trials", min=2, max=2000, help="In all.")] = 200,
+    most_trials: Annotated[int, typer.Option("--most-trials", min=2, max=2000, help="Trials in total.")] = 200,
     capture_fps: Annotated[
-        float, typer.Option("--capture-fps", min=1, max=1e6, help="Frames a second.", rich_help_panel=RIG)
+        float, typer.Option("--capture-fps", min=1, max=1e6, help="Frames per second.", rich_help_panel=RIG)
     ] = 1069.0,
     noise: Annotated[
         float, typer.Option("--noise-mm", min=1e-5, max=50, help="Noise of a position.", rich_help_panel=RIG)
     ] = 0.1,
     correlation: Annotated[
-        float, typer.Option("--noise-correlation", min=-0.5, max=0.98, help="From frame to frame.", rich_help_panel=RIG)
+        float, typer.Option("--noise-correlation", min=-0.5, max=0.98, help="Of the noise.", rich_help_panel=RIG)
     ] = 0.0,
     longest: Annotated[
         float, typer.Option("--longest-s", min=0.01, max=60, help="Longest recording.", rich_help_panel=RIG)
@@ -295,29 +295,29 @@ def _campaign(
     *,
     cells: dict[str, str],
     burst_share: Annotated[
-        float, typer.Option("--burst-fraction", min=0.05, max=1, help="Share of the burst stress that is dared.")
+        float, typer.Option("--burst-fraction", min=0.05, max=1, help="Allowed fraction of the burst stress.")
     ] = 0.9,
     pressure_spread: Annotated[
         float | None,
-        typer.Option("--P-spread", min=0, max=4, help="Of pressure from trial to trial, per cent (1).",
+        typer.Option("--P-spread", min=0, max=4, help="Between-trial sd of pressure, per cent (1).",
                      rich_help_panel=INPUTS, show_default=False),
     ] = None,
     damping_spread: Annotated[
         float | None,
-        typer.Option("--B-spread", min=0, max=15, help="Of B from trial to trial, per cent (3).",
+        typer.Option("--B-spread", min=0, max=15, help="Between-trial sd of B, per cent (3).",
                      rich_help_panel=INPUTS, show_default=False),
     ] = None,
     results: Results = None,
     n: Exponent = None,
     effects: Effects = None,
-    check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Simulated campaigns that try it.")] = 20,
+    check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Simulated campaigns that test it.")] = 20,
     seed: Seed = 1,
     power: Annotated[
-        bool, typer.Option("--power", help="Say what the campaign could see of other effects, too.")
+        bool, typer.Option("--power", help="Also give the power of the campaign for other effects.")
     ] = False,
     sheet: Annotated[
         Path | None,
-        typer.Option("--sheet", help="Write a sheet to film by, to this file.", rich_help_panel=OUT,
+        typer.Option("--sheet", help="Write the trial sheet of the campaign to this file.", rich_help_panel=OUT,
                      show_default=False),
     ] = None,
     figure: FigurePath = None,
@@ -325,7 +325,7 @@ def _campaign(
     anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """Pressures, payloads and replicates that pin n and B to a wanted error, simulated before they are made."""
+    """Choose pressures, payloads and replicates that reach wanted standard errors of n and B, and simulate them."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -363,14 +363,14 @@ def _campaign(
 
 
 def _relative_spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
-    """Relative spreads from trial to trial, where either is given; the other as a batch of vines shows it."""
+    """Return the relative between-trial standard deviations if either is given; the other has its default."""
     if pressure is None and damping is None:
         return None
     return (1.0 if pressure is None else pressure) / 100, (3.0 if damping is None else damping) / 100
 
 
 def _count_range(text: str, name: str, least: int, most: int) -> tuple[int, int]:
-    """Two numbers of things from `low:high` or one number."""
+    """Read a range of counts from `low:high` or one number."""
     try:
         values = [int(part) for part in text.split(":")]
     except ValueError:
@@ -382,7 +382,7 @@ def _count_range(text: str, name: str, least: int, most: int) -> tuple[int, int]
 
 design_app = typer.Typer(
     name="design",
-    help="The fastest vine, the reservoir it needs, the campaign that pins n and B.",
+    help="Design the fastest vine, the reservoir it needs, or a campaign that measures n and B.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

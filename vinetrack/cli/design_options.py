@@ -1,4 +1,4 @@
-"""Options that the commands about vines not yet built share."""
+"""Options shared by the commands about new vines."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VINE, RIG, INPUTS, OUT = "The vine", "The rig", "Inputs of the model", "Output f
 _VINE_COLUMNS = frozenset(
     {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
 )
-"""Columns about the vine itself; the others are about the rig."""
+"""Columns about the vine itself; all others are about the rig."""
 
 RENAMED_OPTIONS = {
     "--fps": "--capture-fps",
@@ -30,38 +30,42 @@ RENAMED_OPTIONS = {
     "--B-within": "--B-se-percent",
     "--from": "--fit",
 }
-"""Options of version 0.1 and their names now; the old ones are read, with a warning, until the next release."""
+"""Former names of options in version 0.1 and their current names; the former are accepted with a warning until the next
+release."""
 
 
 class RenamedOptions(typer.core.TyperCommand):
-    """A command that also reads options by their former names."""
+    """A command that also accepts options by their former names."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Read the options, former names replaced, with a line to the terminal for each.
+        """Replace former names of options, with a warning for each, and parse the arguments.
 
         Parameters
         ----------
         ctx
             Context of the command.
         args : list of str
-            What stands on the command line.
+            Arguments on the command line.
 
         Returns
         -------
         list of str
-            Arguments that no option took.
+            Arguments that are not options.
         """
         current = []
         for argument in args:
             name, equals, value = argument.partition("=")
             if name in RENAMED_OPTIONS:
-                typer.echo(f"{name} is now {RENAMED_OPTIONS[name]}; the old name goes with the next release.", err=True)
+                typer.echo(
+                    f"{name} is now {RENAMED_OPTIONS[name]}; the old name will be removed in the next release.",
+                    err=True,
+                )
                 name = RENAMED_OPTIONS[name]
             current.append(name + equals + value)
         return super().parse_args(ctx, current)
 
 
-YIELD_MEANING = "Yield pressure; a scaling prior where it is not given."
+YIELD_MEANING = "Yield pressure; a scaling prior if not given."
 
 _Command = Callable[..., None]
 
@@ -69,22 +73,22 @@ _Command = Callable[..., None]
 def column_options(*columns: str, meanings: Mapping[str, str] | None = None) -> Callable[[_Command], _Command]:
     """Give a command an option for each of these columns of the trial sheet, in place of its argument `cells`.
 
-    The command is called with `cells`: the texts that were given, by column. They are judged as cells of a sheet are.
+    The command is called with `cells`, the given texts by column, which are checked like cells of a sheet.
 
     Parameters
     ----------
     columns : str
         Names of columns, in the order of the help.
     meanings : mapping, optional
-        What a column is for this command, where that is not its meaning in the sheet.
+        Help texts by column, for those whose meaning differs from that in the sheet.
 
     Returns
     -------
     callable
         Decorator.
     """
-    words = meanings or {}
-    options = [_column_option(COLUMNS[name], words.get(name)) for name in columns]
+    help_texts = meanings or {}
+    options = [_column_option(COLUMNS[name], help_texts.get(name)) for name in columns]
 
     def decorate(command: _Command) -> _Command:
         @functools.wraps(command)
@@ -106,7 +110,7 @@ def column_options(*columns: str, meanings: Mapping[str, str] | None = None) -> 
 
 
 def _column_option(column: Column, meaning: str | None) -> inspect.Parameter:
-    """The parameter of a command that Typer makes an option of."""
+    """Return the parameter of a command from which Typer makes the option of a column."""
     unset = "" if column.default in ("", "unknown") or column.default.startswith("required") else f" ({column.default})"
     info = typer.Option(
         option(column.name),
@@ -129,17 +133,19 @@ Results = Annotated[
 ]  # fmt: skip
 Damping = Annotated[
     float | None,
-    typer.Option("--B", min=1e-9, help="Damping coefficient, N·(s/m)ⁿ; guessed if not given.", rich_help_panel=INPUTS,
+    typer.Option("--B", min=1e-9, help="Damping coefficient, N·(s/m)ⁿ; a prior if not given.", rich_help_panel=INPUTS,
                  show_default=False),
 ]  # fmt: skip
 DampingError = Annotated[
-    float, typer.Option("--B-error", min=0, max=200, help="Its error, per cent.", rich_help_panel=INPUTS)
+    float, typer.Option("--B-error", min=0, max=200, help="Standard error of B, per cent.", rich_help_panel=INPUTS)
 ]
 Exponent = Annotated[
     float | None,
     typer.Option("--n", min=0, max=2, help="Damping exponent.", rich_help_panel=INPUTS, show_default=False),
 ]
-ExponentError = Annotated[float, typer.Option("--n-error", min=0, max=1, help="Its error.", rich_help_panel=INPUTS)]
+ExponentError = Annotated[
+    float, typer.Option("--n-error", min=0, max=1, help="Standard error of n.", rich_help_panel=INPUTS)
+]
 Effects = Annotated[
     list[str] | None,
     typer.Option(
@@ -147,23 +153,29 @@ Effects = Annotated[
         help="A further effect; its size as a number, or a range such as 1:1.4. May be repeated.",
     ),
 ]  # fmt: skip
-Samples = Annotated[int, typer.Option("--samples", min=50, max=100_000, help="Draws.", rich_help_panel=INPUTS)]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.", rich_help_panel=INPUTS)]
+Samples = Annotated[
+    int, typer.Option("--samples", min=50, max=100_000, help="Number of draws.", rich_help_panel=INPUTS)
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.", rich_help_panel=INPUTS)]
 AtFraction = Annotated[
     float,
     typer.Option(
-        "--final-at-fraction", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=INPUTS
+        "--final-at-fraction",
+        min=0.05,
+        max=0.99,
+        help="y/L at which final speeds are evaluated.",
+        rich_help_panel=INPUTS,
     ),
 ]
 Anyway = Annotated[
     bool,
     typer.Option(
-        "--anyway", help="Predict from a fit whose model its diagnosis refuted; the verdict stands above.",
+        "--anyway", help="Predict from a fit whose model the diagnosis refuted, too; the output states it.",
         rich_help_panel=INPUTS,
     ),
 ]  # fmt: skip
 FigurePath = Annotated[
-    Path | None, typer.Option("--figure", help="Draw it, to this file.", rich_help_panel=OUT, show_default=False)
+    Path | None, typer.Option("--figure", help="Draw a figure to this file.", rich_help_panel=OUT, show_default=False)
 ]
 LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", rich_help_panel=OUT)]
 

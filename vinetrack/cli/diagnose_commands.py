@@ -1,4 +1,4 @@
-"""Commands of the diagnosis: what is missing from the model, and what becomes of the errors once it is added."""
+"""Commands of the diagnosis: `diagnose`, `add` and `propose`, and the stage `diagnosis`."""
 
 from __future__ import annotations
 
@@ -40,14 +40,12 @@ def _diagnose(
     target: Annotated[Path, typer.Argument(help="A results folder, or an experiment.", metavar="TARGET")],
     json_file: Annotated[
         Path | None,
-        typer.Option(
-            "--json", help="Write the answer to this file, and no other; - for the terminal.", show_default=False
-        ),
+        typer.Option("--json", help="Write the diagnosis to this file only; - for the terminal.", show_default=False),
     ] = None,
     experiment: Moved = None,
     log: LogFile = None,
 ) -> None:
-    """What the model lacks: verdict, candidates with their sizes, errors before and after, what to do next."""
+    """Diagnose what the model lacks: verdict, candidates with sizes, errors before and after, next experiment."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -74,12 +72,12 @@ def _diagnose(
 def _add(
     effect: Annotated[str, typer.Argument(help="Name of the effect, or its file.", metavar="EFFECT")],
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
-    save: Annotated[bool, typer.Option("--save", help="Write it to `model:` of the experiment.")] = False,
+    save: Annotated[bool, typer.Option("--save", help="Write it to `model:` in experiment.yaml.")] = False,
     experiment: Moved = None,
     json_file: JsonFile = None,
     log: LogFile = None,
 ) -> None:
-    """Put an effect in the model, refit, and show the error before and after."""
+    """Add an effect to the model, refit, and show the error before and after."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -90,7 +88,7 @@ def _add(
         own_file = Path(effect) if effect.endswith(".py") else None
         if save and own_file is not None and own_file.resolve().parent != read.folder.resolve():
             raise UserError(
-                f"{effect}: to save it, put the file into {read.folder} first: an experiment is one folder."
+                f"{effect}: to save the model, move the file into {read.folder} first; an experiment is one folder."
             )
         with _progress_line() as report:
             lines = add_effect(read, results, effect, report)
@@ -99,7 +97,7 @@ def _add(
 
             name = effect if own_file is None else own_file.stem
             path = save_model(read.folder, [*read.settings.model, name], [] if own_file is None else [own_file.name])
-            lines.append(f"Saved to {path}; run vinetrack run, or snakemake, again to have everything with it.")
+            lines.append(f"Saved to {path}; run vinetrack run or snakemake again to update all results.")
         print_result(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
 
 
@@ -110,7 +108,7 @@ def _propose(
     json_file: JsonFile = None,
     log: LogFile = None,
 ) -> None:
-    """Where no known effect mends the model: the law of force that does best, as an effect file of your own."""
+    """Write the force law that explains best what no known effect explains, as an effect file of your own."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -131,7 +129,7 @@ def _diagnosis(
     ] = "{}",
     log: LogFile = None,
 ) -> None:
-    """What the model lacks, as diagnosis.json, ladder.csv and the folder diagnosis."""
+    """Diagnose what the model lacks: diagnosis.json, ladder.csv and the folder diagnosis."""
     from vinetrack.cli.main import _errors_as_sentences, _run_settings
 
     with _errors_as_sentences(log):
@@ -146,32 +144,32 @@ def _diagnosis(
 
 
 def _tracks_only(folder: Path) -> Experiment:
-    """An experiment whose trials are tracks; recordings must go through the workflow first."""
+    """Read an experiment whose trials are tracks; refuse recordings, which the workflow must track first."""
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.results.folder_layout import ResultsError
 
     experiment = read_experiment(folder)
     if experiment.trials and all(trial.track is None for trial in experiment.trials):
         raise ResultsError(
-            f"{folder}: its trials are recordings, which must be tracked first: vinetrack run {folder} does that, and "
-            f"diagnoses them; then vinetrack diagnose {folder.parent / 'results' / experiment.name}"
+            f"{folder}: its trials are recordings, which must be tracked first: vinetrack run {folder} tracks and "
+            f"diagnoses them; after that, vinetrack diagnose {folder.parent / 'results' / experiment.name}"
         )
     return experiment
 
 
 @contextmanager
 def _progress_line() -> Iterator[Callable[[str], None]]:
-    """Say on a terminal what is being done, on one line that is wiped at the end; nothing elsewhere."""
-    shown = sys.stderr.isatty()
+    """Show the current step on one line of a terminal, which is erased at the end; print nothing elsewhere."""
+    on_terminal = sys.stderr.isatty()
 
-    def report(what: str) -> None:
-        if shown:
-            sys.stderr.write(f"\r\x1b[K{what} …")
+    def report(step: str) -> None:
+        if on_terminal:
+            sys.stderr.write(f"\r\x1b[K{step} …")
             sys.stderr.flush()
 
     try:
         yield report
     finally:
-        if shown:
+        if on_terminal:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()

@@ -10,15 +10,15 @@ import typer
 from vinetrack.cli.output import START
 
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
-Names = Annotated[list[str] | None, typer.Option("--add", help="Put this effect in (may be given again).")]
-Drops = Annotated[list[str] | None, typer.Option("--drop", help="Take this effect out (may be given again).")]
+Names = Annotated[list[str] | None, typer.Option("--add", help="Add this effect (may be repeated).")]
+Drops = Annotated[list[str] | None, typer.Option("--drop", help="Remove this effect (may be repeated).")]
 Sizes = Annotated[
     list[str] | None,
-    typer.Option("--set", help="A size, NAME=VALUE in SI units, such as air_drag.C_D=0.8 (may be given again)."),
+    typer.Option("--set", help="A size, NAME=VALUE in SI units, such as air_drag.C_D=0.8 (may be repeated)."),
 ]
 Exports = Annotated[
     list[Path] | None,
-    typer.Option("--export", help="Write curves (.csv) or figure (.svg, .png, .pdf), and open no page."),
+    typer.Option("--export", help="Write curves (.csv) or figure (.svg, .png, .pdf) without opening a page."),
 ]
 
 
@@ -38,7 +38,7 @@ def _explore(
     add: Names = None,
     drop: Drops = None,
     sizes: Sizes = None,
-    refit: Annotated[bool, typer.Option("--refit", help="Fit it, print what was found, and open no page.")] = False,
+    refit: Annotated[bool, typer.Option("--refit", help="Fit, print the result, and open no page.")] = False,
     export: Exports = None,
     save: Annotated[bool, typer.Option("--save", help="Write the model to experiment.yaml; opens no page.")] = False,
     experiment: Annotated[
@@ -50,7 +50,7 @@ def _explore(
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")] = True,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """A local page to see where the model fails, try effects, refit, and watch the error fall."""
+    """Open a local page that shows where the model fails, to try effects, refit, and compare errors."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):

@@ -1,7 +1,7 @@
-"""The command line: thin, quick to start, and without tracebacks.
+"""The command line, which starts quickly and prints no tracebacks.
 
-What is wrong with the input is one sentence a problem; what is wrong with the program is one sentence that names the
-log, where the traceback is.
+A problem of the input is reported in one sentence; an internal error in one sentence that names the log with the
+traceback.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def main() -> None:
 
 
 def _exit_despite_threads(status: str | int | None) -> None:
-    """End at once where a page's fit or film is still at work in a thread.
+    """Exit immediately if a thread of a page is still fitting or tracking.
 
-    The interpreter takes such a thread down in the middle of compiled code, which then aborts the whole process
-    (status -6) now and then. Files are written whole or not at all, so nothing is lost by not waiting.
+    At a normal exit the interpreter may stop such a thread within compiled code, which sometimes aborts the process
+    (status -6). Files are written atomically, so nothing is lost by not waiting.
     """
     if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
         return
@@ -101,10 +101,10 @@ def _settings(
     json_file: JsonFile = None,
     page: Annotated[
         Path | None,
-        typer.Option("--page", metavar="FILE", help="Write them as a page of docs.", show_default=False),
+        typer.Option("--page", metavar="FILE", help="Write them as a page of the documentation.", show_default=False),
     ] = None,
 ) -> None:
-    """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
+    """List all columns of the sheet and all keys of the settings, with unit, default, bounds and meaning."""
     with _errors_as_sentences(None):
         from vinetrack.core.tables import write_text
         from vinetrack.experiment.reference import reference_content, reference_lines, reference_page
@@ -117,16 +117,16 @@ def _settings(
 
 @app.command("effects", rich_help_panel=MORE)
 def _effects(
-    name: Annotated[str | None, typer.Argument(help="Explain this one.", metavar="NAME", show_default=False)] = None,
+    name: Annotated[str | None, typer.Argument(help="Effect to explain.", metavar="NAME", show_default=False)] = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="Folder whose own effects to include.", show_default=False)
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option("--figure", help="Draw what NAME does, to this file.", show_default=False)
+        Path | None, typer.Option("--figure", help="Draw the influence of NAME to this file.", show_default=False)
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """The catalogue of effects, with formulas, parameters and units; or one explained."""
+    """List all effects with formulas, parameters and units, or explain one."""
     with _errors_as_sentences(None):
         from vinetrack.pipeline.effects_stage import describe_effects, effects_content
         from vinetrack.pipeline.run_folders import find_experiment
@@ -137,7 +137,7 @@ def _effects(
 
 @app.command("compare", rich_help_panel=MORE)
 def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
-    """The model against the measurement of every condition, beside what repeated trials differ by."""
+    """Compare model and measurement of every condition, with the scatter of replicates."""
     with _errors_as_sentences(None):
         from vinetrack.pipeline.model_stage import comparison_lines
         from vinetrack.results.folder_layout import Results, read_result
@@ -151,14 +151,14 @@ def _overlay(
     results: ResultsPath,
     trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
     experiment: Annotated[
-        Path | None, typer.Option("--experiment", help="The experiment, where it has moved.", show_default=False)
+        Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.5, help="About how long it plays.", show_default=False)
+        float | None, typer.Option("--seconds", min=0.5, help="Approximate duration of the clip.", show_default=False)
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """The recording of one trial, slowed down, with the tracked edge and the models' edges drawn."""
+    """Write a slowed-down clip of one trial with tracked and modelled edges."""
     with _errors_as_sentences(None):
         from vinetrack.pipeline.overlays_stage import overlay_one
 
@@ -175,7 +175,7 @@ def _overlays(
     threads: Threads = 1,
     log: LogPath = None,
 ) -> None:
-    """Clips of the recordings that the settings choose, with the tracked edge and the models' edges drawn."""
+    """Write clips of the recordings that the settings choose, with tracked and modelled edges."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.overlays_stage import draw_overlays
 
@@ -197,7 +197,7 @@ def _recording(
     settings: SettingsText = "{}",
     log: LogPath = None,
 ) -> None:
-    """One recording to its track, kinematics and strip."""
+    """Analyse one recording: track, kinematics and strip figure."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.recordings_stage import analyse_recording
 
@@ -218,7 +218,7 @@ def _tracks(
     threads: Threads = 1,
     log: LogPath = None,
 ) -> None:
-    """Positions measured elsewhere to tracks, kinematics and steady windows."""
+    """Analyse trials that are tracks: tracks, kinematics and steady windows."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import analyse_tracks
 
@@ -232,7 +232,7 @@ def _tracks(
 def _gather(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
-    """What every trial gave, as trials.csv, conditions.csv, steady.csv and damping_points.csv."""
+    """Gather the results of all trials in trials.csv, conditions.csv, steady.csv and damping_points.csv."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import gather as gather_trials
 
@@ -242,12 +242,12 @@ def _gather(
 
 @app.command("damping", rich_help_panel="Stages of the workflow")
 def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
-    """Steady points to the damping law, damping.json."""
+    """Fit the damping law to the steady points: damping.json."""
     with _errors_as_sentences(log):
         from vinetrack.narrative.law_text import headline
         from vinetrack.pipeline.damping_stage import fit_law
 
-        with _activity_sign("fitting the law and resampling its trials", log):
+        with _activity_sign("fitting the damping law, with bootstrap", log):
             law = fit_law(results, _run_settings(settings).damping)
         typer.echo(headline(law))
 
@@ -256,7 +256,7 @@ def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath =
 def _model(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
-    """The model in use fitted to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
+    """Fit the model in use to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.model_stage import comparison_lines, fit_model
 
@@ -295,12 +295,12 @@ def _figures(
 def _paper(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
-    """Set the paper's published numbers and figures beside ours: paper.csv."""
+    """Compare with the published numbers and figures of the paper: paper.csv."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.paper_stage import compare_with_paper, draw_paper
         from vinetrack.report.paper_section import tally
 
-        typer.echo(f"Beside the paper: {tally(compare_with_paper(_read(experiment), results))}")
+        typer.echo(f"Comparison with the paper: {tally(compare_with_paper(_read(experiment), results))}")
         draw_paper(results, _run_settings(settings).figures)
 
 
@@ -308,7 +308,7 @@ def _paper(
 def _report(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
-    """Put everything in report.html, and what it was made with in provenance.json."""
+    """Write report.html and provenance.json."""
     with _errors_as_sentences(log):
         from vinetrack.pipeline.report_stage import write_report
 
@@ -322,7 +322,7 @@ def _report(
 
 
 def _activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
-    """A sign of life while a stage runs; none in the workflow, where each has a log and Snakemake tells how it goes."""
+    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log."""
     from vinetrack.core.terminal import waiting
 
     return waiting(what) if log is None else nullcontext()
@@ -367,7 +367,7 @@ def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
 
 @contextmanager
 def _errors_as_sentences(log: Path | None) -> Iterator[None]:
-    """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
+    """Report every exception in a sentence and exit with status 1; tracebacks go to the log."""
     from vinetrack.core.files import is_disk_full
     from vinetrack.core.problems import ExperimentError, UserError, format_problems
 
@@ -381,7 +381,7 @@ def _errors_as_sentences(log: Path | None) -> Iterator[None]:
     except KeyboardInterrupt:
         _exit_with("Stopped; finished results are kept.")
     except BrokenPipeError:
-        # Whoever reads (`| head`) has seen enough; Python would complain once more when it closes the pipe.
+        # The reader (such as `| head`) has closed the pipe; redirect it, or Python reports the error again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except Exception as error:
@@ -390,7 +390,7 @@ def _errors_as_sentences(log: Path | None) -> Iterator[None]:
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
             _exit_with(str(error))
-        place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
+        place = f"; the traceback is in {log}" if log else "; run it again with --log FILE for the traceback"
         _exit_with(
             f"An internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}."
         )
@@ -404,7 +404,7 @@ def _exit_with(message: str) -> None:
 
 
 def _log_to(path: Path | None) -> None:
-    """Send messages of every module to a file alone; the terminal shows sentences, never logs."""
+    """Send log messages of all modules to a file only, never to the terminal."""
     handler: logging.Handler = logging.NullHandler()
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What commands print: lines for a person, or with `--json` the same for a program."""
+"""Output of commands: lines for the user, or with `--json` the same content for a program."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 START, MORE = "Start here", "More"
-"""Panels of the help: the commands that one needs stand first."""
+"""Panels of the help; the first lists the commands that a new user needs."""
 
 JsonFile = Annotated[
     Path | None,
@@ -19,11 +19,11 @@ JsonFile = Annotated[
 
 
 def json_to_terminal(json_file: Path | None) -> bool:
-    """Whether JSON goes to the terminal in place of lines.
+    """Whether JSON is printed to the terminal instead of lines.
 
     Parameters
     ----------
-    json_file : of the option `--json`.
+    json_file : value of the option `--json`.
 
     Returns
     -------
@@ -35,13 +35,13 @@ def json_to_terminal(json_file: Path | None) -> bool:
 
 
 def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
-    """Print lines, or `content` as JSON; into a file beside the lines, or in their place on the terminal.
+    """Print lines, and write `content` as JSON to a file; or print it instead of the lines.
 
     Parameters
     ----------
-    lines : for a person.
-    content : the same for a program: mappings, lists, numbers, text and paths.
-    json_file : of the option `--json`; None for lines alone.
+    lines : lines for the user.
+    content : the same content for a program: mappings, lists, numbers, text and paths.
+    json_file : value of the option `--json`; None for lines only.
     """
     from vinetrack.core.tables import write_json
     from vinetrack.core.terminal import severity_first

@@ -1,4 +1,4 @@
-"""The command `vinetrack power`: what trials can see, before they are filmed and after."""
+"""The command `vinetrack power`: statistical power of trials, planned or measured."""
 
 from __future__ import annotations
 
@@ -33,37 +33,37 @@ def _power(
     effects: Annotated[
         list[str] | None,
         typer.Option("--effect", metavar="NAME[=SIZE]", show_default=False,
-                     help="Tell of this effect alone; with --simulate at this size. May be repeated."),
+                     help="Only this effect; with --simulate, at this size. May be repeated."),
     ] = None,
     noise: Annotated[
         float | None,
         typer.Option("--noise-mm", min=1e-5, max=50, rich_help_panel=INPUTS, show_default=False,
-                     help="Noise of a position; from the fit, or 0.1 without one."),
+                     help="Noise of a position; default: from the fit, or 0.1 without one."),
     ] = None,
     correlation: Annotated[
         float | None,
         typer.Option("--noise-correlation", min=-0.5, max=0.98, rich_help_panel=INPUTS, show_default=False,
-                     help="Of the noise, from frame to frame."),
+                     help="Correlation of the noise of successive frames."),
     ] = None,
     scatter_B: Annotated[
         float | None,
         typer.Option("--scatter-B", min=0, max=50, rich_help_panel=INPUTS, show_default=False,
-                     help="Of B from trial to trial, per cent; from the fit, or 3 without one."),
+                     help="Between-trial sd of B, per cent; default: from the fit, or 3 without one."),
     ] = None,
     scatter_P: Annotated[
         float | None,
         typer.Option("--scatter-P", min=0, max=20, rich_help_panel=INPUTS, show_default=False,
-                     help="Of pressure from trial to trial, per cent; from the fit, or 1 without one."),
+                     help="Between-trial sd of pressure, per cent; default: from the fit, or 1 without one."),
     ] = None,
     capture_fps: Annotated[
         float | None,
         typer.Option("--capture-fps", min=1, max=1e6, rich_help_panel=INPUTS, show_default=False,
-                     help="Frames a second, of a sheet without recordings."),
+                     help="Frames per second, for a sheet without recordings."),
     ] = None,
     B: Annotated[
         float | None,
         typer.Option("--B", min=1e-9, rich_help_panel=INPUTS, show_default=False,
-                     help="Damping coefficient of a sheet without recordings, N·(s/m)ⁿ; guessed if not given."),
+                     help="Damping coefficient for a sheet without recordings, N·(s/m)ⁿ; default: scaling prior."),
     ] = None,
     n: Annotated[
         float | None,
@@ -72,31 +72,31 @@ def _power(
     simulate: Annotated[
         int,
         typer.Option("--simulate", min=0, max=100_000, rich_help_panel=SIMULATION,
-                     help="Campaigns to simulate and diagnose: with nothing missing, and with every --effect."),
+                     help="Campaigns to simulate and diagnose: without any effect, and with each --effect."),
     ] = 0,
     calibrate: Annotated[
         int,
         typer.Option("--calibrate", min=0, max=100_000, rich_help_panel=SIMULATION,
-                     help="Campaigns with nothing missing that the thresholds of a verdict are held against."),
+                     help="Simulated null campaigns with which the tests of a verdict are calibrated."),
     ] = 0,
     jobs: Annotated[int, typer.Option("--jobs", min=1, rich_help_panel=SIMULATION, help="Processes.")] = 2,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, rich_help_panel=SIMULATION, help="Of the first simulated campaign.")
+        int, typer.Option("--seed", min=0, rich_help_panel=SIMULATION, help="Seed of the first simulated campaign.")
     ] = 1,
     answers: Annotated[
         Path | None,
         typer.Option("--answers", metavar="FILE", rich_help_panel=SIMULATION, show_default=False,
-                     help="CSV that keeps the answers; what it has is not simulated again."),
+                     help="CSV file of the answers; those it contains are not simulated again."),
     ] = None,
     reach: Annotated[
         float | None,
         typer.Option("--reach", min=0.5, max=0.98, metavar="PROBABILITY", rich_help_panel=FURTHER, show_default=False,
-                     help="Look for the fewest further trials that find each --effect NAME=SIZE so often."),
+                     help="Find the fewest further trials that detect each --effect NAME=SIZE with this probability."),
     ] = None,
     sheet: Annotated[
         Path | None,
         typer.Option("--sheet", metavar="FILE", rich_help_panel=FURTHER, show_default=False,
-                     help="Write their rows of the sheet to this file, with --reach."),
+                     help="With --reach, write the rows of these trials to this file."),
     ] = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
@@ -109,7 +109,7 @@ def _power(
     ] = None,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """What these trials can see: detectable sizes of every effect, what each is taken for, false alarms."""
+    """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):

@@ -1,4 +1,4 @@
-"""The commands that a new user needs first: check an experiment, run it."""
+"""The commands `vinetrack check` and `vinetrack run`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _check(
     experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
     json_file: JsonFile = None,
 ) -> None:
-    """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
+    """Check sheet, settings, effects, tracks and recordings in seconds; list facts about each recording."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(None):
@@ -64,7 +64,7 @@ def _run(
         from vinetrack.results.folder_layout import Results, read_json
 
         def say(line: str) -> None:
-            """A line of progress: to the terminal, or beside it where JSON goes there."""
+            """Print a line of progress; to standard error if JSON goes to standard output."""
             typer.echo(line, err=json_to_terminal(json_file))
 
         paths = run_paths(folder, results)

@@ -1,4 +1,4 @@
-"""The commands that begin with recordings alone: `vinetrack setup` and `vinetrack track`."""
+"""The commands that start from recordings: `vinetrack setup` and `vinetrack track`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 def _setup(
     folder: Annotated[Path, typer.Argument(help="A folder of recordings.", metavar="FOLDER")],
     page: Annotated[
-        bool, typer.Option("--page/--no-page", help="Open a page, or write both files with blanks to fill.")
+        bool, typer.Option("--page/--no-page", help="Open a page, or write both files with blanks to fill in.")
     ] = True,
     port: Annotated[
         int | None, typer.Option("--port", min=0, max=65535, help="Port to serve on; 0 for any that is free.")
@@ -32,7 +32,7 @@ def _setup(
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")] = True,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """A local page that makes trials.csv and experiment.yaml of a folder of recordings, or both with blanks to fill."""
+    """Create trials.csv and experiment.yaml from a folder of recordings, on a local page or with blanks to fill in."""
     from vinetrack.cli.main import _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -49,7 +49,7 @@ def _setup(
 def _track(
     recording: Annotated[Path, typer.Argument(help="A film, a stack, or a folder of pictures.", metavar="RECORDING")],
     fps: Annotated[
-        float | None, typer.Option("--fps", min=1e-6, help="Frames a second at capture.", show_default=False)
+        float | None, typer.Option("--fps", min=1e-6, help="Capture rate, frames per second.", show_default=False)
     ] = None,
     exposure_us: Annotated[
         float | None, typer.Option("--exposure-us", min=0, help="Exposure of a frame, µs.", show_default=False)
@@ -63,19 +63,21 @@ def _track(
     ] = None,
     axis: Annotated[
         str | None,
-        typer.Option("--axis", metavar="x,y:x,y", help="Points of the growth axis, px; more than two for a bend."),
+        typer.Option(
+            "--axis", metavar="x,y:x,y", help="Points of the growth axis, px; more than two for a curved one."
+        ),
     ] = None,
     frames: Annotated[
         str | None, typer.Option("--frames", metavar="FROM:TO", help="First and last frame to use, from 0.")
     ] = None,
-    body: Annotated[bool, typer.Option("--body", help="What moves does so as a whole, such as a ball.")] = False,
+    body: Annotated[bool, typer.Option("--body", help="The object moves as a whole, such as a ball.")] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default RECORDING_track.")
+        Path | None, typer.Option("--out", metavar="DIR", help="Output folder; default RECORDING_track.")
     ] = None,
     json_file: JsonFile = None,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """The leading edge of one recording, without an experiment: a table, a strip and a clip."""
+    """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     from vinetrack.cli.main import _activity_sign, _errors_as_sentences
 
     with _errors_as_sentences(log):
@@ -101,7 +103,7 @@ def _say(line: str) -> None:
 
 
 def _cell(column: str, text: str | None, option: str) -> Any:
-    """The value of an option that is written as a cell of that column; None where it is not given."""
+    """Read an option that is written like a cell of a column; None if it is not given."""
     from vinetrack.experiment.cells import CellError, read_cell
     from vinetrack.experiment.schema import COLUMNS
 

@@ -1,1 +1,1 @@
-"""What a user calls from Python: load, fit, diagnose and compare, from any source of trials."""
+"""The Python interface: load, fit, diagnose and compare, for trials from any source."""

@@ -1,4 +1,4 @@
-"""`vt.fit`, `vt.diagnose` and `vt.compare`: the functions of the rooms below, from any source of trials."""
+"""`vt.fit`, `vt.diagnose`, `vt.power` and `vt.compare` for trials from any source."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     model : a sum of effects.
     source : loaded results, a results folder, an experiment or its folder, a frame of tracks (see
         `tracks_from_frame`), or pairs of trial and track.
-    options : of `vinetrack.inference.fit.fit`, such as `fixed`, `free`, `start` and `tracks`.
+    options : options of `vinetrack.inference.fit.fit`, such as `fixed`, `free`, `start` and `tracks`.
 
     Returns
     -------
@@ -39,7 +39,7 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     Raises
     ------
     FitError
-        If there is nothing to fit, or the model cannot be followed.
+        If there is nothing to fit, or the model cannot be simulated.
     ExperimentError, ResultsError
         If the source cannot be read.
 
@@ -66,13 +66,13 @@ def _with_left_out(fitted: Fit, given: TrialSource) -> Fit:
 
 
 def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
-    """Ask what a model lacks: verdict, candidates with sizes, errors before and after, what to do next.
+    """Diagnose what a model lacks: verdict, candidates with sizes, errors before and after, next experiment.
 
     Parameters
     ----------
-    source : a fit, whose model is questioned, or any source of trials as in `fit`; then the model is the one that the
-        experiment names, else the base model.
-    options : of `vinetrack.diagnosis.diagnose.diagnose`, such as `model`, `candidates`, `ladder` and `advice`.
+    source : a fit, whose model is diagnosed, or any source of trials as in `fit`; the model is then that of the
+        experiment, else the base model.
+    options : options of `vinetrack.diagnosis.diagnose.diagnose`, such as `model`, `candidates`, `ladder` and `advice`.
 
     Returns
     -------
@@ -103,18 +103,18 @@ def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
 
 
 def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
-    """Ask what trials can see: detectable sizes of every effect, what each is taken for, the rate of false alarms.
+    """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate.
 
     Parameters
     ----------
     source : a fit; or a results folder, an experiment's folder, a sheet without recordings, loaded results, a frame of
         tracks, or pairs of trial and track.
-    *effects : names, or `name=size` in the unit of the parameter; all where none is given.
+    *effects : names, or `name=size` in the unit of the parameter; all by default.
     **options
-        Of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and `spread_B`
-        (relative), `capture_fps`, `B`, `n`; and `simulate`, `jobs`, `first_seed`, `answers` for complete diagnoses of
-        simulated campaigns; `calibrate`, how many null campaigns a verdict's tests are held against; `reach`, a
-        probability, for the fewest further trials that find `name=size` so often.
+        Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
+        `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed`, `answers` for complete
+        diagnoses of simulated campaigns; `calibrate`, the number of simulated null campaigns for calibrating the tests
+        of a verdict; `reach`, the probability with which further trials shall detect `name=size`.
 
     Returns
     -------
@@ -147,14 +147,13 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
 
 
 def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:
-    """Hold a fitted model against the trials, condition by condition, beside what replicates differ by.
+    """Compare a fitted model with the trials, condition by condition, and with the scatter of replicates.
 
     Parameters
     ----------
-    fitted : a fit; or any source of trials, to which the model that the experiment names (else the base model) is
-        fitted first.
+    fitted : a fit; or any source of trials, to which the model of the experiment (else the base model) is first fitted.
     source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
-    options : of `vinetrack.diagnosis.compare.compare`, such as `final_at_fraction` and `tracks`.
+    options : options of `vinetrack.diagnosis.compare.compare`, such as `final_at_fraction` and `tracks`.
 
     Returns
     -------
@@ -163,7 +162,7 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     Raises
     ------
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     ExperimentError, ResultsError
         If the source cannot be read.
 
@@ -182,18 +181,18 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
         return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
     if source is None:
         if not fitted.pairs:
-            raise FitError("The fit does not carry its tracks: name the trials to compare with.")
+            raise FitError("The fit does not contain its tracks: pass the trials to compare with.")
         return compare_pairs(fitted, fitted.pairs, **options)
     given = read_source(source)
     return compare_pairs(fitted, given.pairs, **{"kinematics": given.kinematics, **options})
 
 
 def named_model(given: TrialSource) -> Model:
-    """Return the model that the experiment of a source names, with the user's own effects at hand.
+    """Return the model that the experiment of a source names, including the user's own effects.
 
     Parameters
     ----------
-    given : with an experiment.
+    given : trials with their experiment; without one, the base model is returned.
 
     Returns
     -------
@@ -208,7 +207,7 @@ def named_model(given: TrialSource) -> Model:
 
 
 def example_tracks() -> pd.DataFrame:
-    """Return eight trials of one vine from the virtual laboratory, fed from a chamber of 2 L that empties.
+    """Return eight trials of one vine from the virtual laboratory, supplied by a chamber of 2 L that depletes.
 
     Returns
     -------

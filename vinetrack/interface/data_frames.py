@@ -1,4 +1,4 @@
-"""Trials and tracks from one frame of pandas, a row a point."""
+"""Trials and tracks from one pandas DataFrame with one row per point."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ ERROR_COLUMNS = ("lead_position_sigma_m", "lead_position_systematic_m")
 
 
 def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
-    """Return trials and tracks from one frame, a row a point.
+    """Return trials and tracks from a frame with one row per point.
 
     Parameters
     ----------
-    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); where known `lead_position_sigma_m`,
-        `lead_position_systematic_m` and `flag`; and the columns of a trial sheet, the same in every row of a trial:
+    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); if known, `lead_position_sigma_m`,
+        `lead_position_systematic_m` and `flag`; and the columns of a trial sheet, constant within a trial:
         `diameter_mm, thickness_um, length_mm, pressure_kPa, yield_pressure_kPa, …`, or in other units. A
-        `pressure_kPa` that changes along a trial is a measured trace; its first value is then the set pressure.
+        `pressure_kPa` that changes within a trial is a measured trace, and its first value the set pressure.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
 
 
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
-    """What the sheet would say of a trial: its columns other than those of the track, as text."""
+    """Return the cells that a trial sheet would have for a trial: all columns but those of the track, as text."""
     cells = {"trial": name}
     of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
     for column in part.columns:
@@ -72,8 +72,8 @@ def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
         if column in of_track or _is_blank(first):
             continue
         if column != "pressure_kPa" and not _is_constant(part[column]):
-            message = f"changes along the trial {name}"
-            raise ExperimentError([Problem(message=message, file="the frame", column=str(column))])
+            message, remedy = f"changes within the trial {name}", "give it one value in all rows of the trial"
+            raise ExperimentError([Problem(message=message, file="the frame", column=str(column), remedy=remedy)])
         cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
     return cells
 
@@ -104,7 +104,7 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
         check_pressures(row)
         problems += [replace(problem, file="the frame", line=0) for problem in row.problems]
         if not row.failed:
-            # A track that somebody measured elsewhere: what is assumed of its smooth errors follows from that.
+            # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
             row.values["track"] = row.name  # noqa: PD011
             trials.append(replace(make_trial(row, Path(), settings), track=None))
     if any(problem.severity == "error" for problem in problems):
@@ -115,7 +115,7 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
 def _track(part: pd.DataFrame, position: str) -> Track:
     count = len(part)
     unknown = np.full(count, math.nan)
-    sigma_m, slow_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
+    sigma_m, systematic_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(count, "", dtype=str)
     traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
     return Track(
@@ -125,5 +125,5 @@ def _track(part: pd.DataFrame, position: str) -> Track:
         flag=flag,
         edge_px=unknown,
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
-        lead_position_systematic_m=slow_m,
+        lead_position_systematic_m=systematic_m,
     )

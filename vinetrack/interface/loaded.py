@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 
 class LoadedResults:
-    """What a results folder holds, read when it is first asked for.
+    """A results folder, whose files are read on first access.
 
-    Tables are pandas frames whose columns carry their units, as in the files (`docs/results.md`).
+    Tables are pandas DataFrames whose columns carry their units, as in the files (`docs/results.md`).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -45,34 +45,34 @@ class LoadedResults:
 
     @cached_property
     def experiment(self) -> Experiment:
-        """The experiment that the results were made from; ResultsError where it has moved."""
+        """The experiment that the results were made from; raises a ResultsError if it has moved."""
         from vinetrack.pipeline.source_experiment import read_source_experiment
 
         return read_source_experiment(self.folder)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
-        """`trials.csv`: a row a trial of the sheet."""
+        """`trials.csv`: one row per trial of the sheet."""
         return read_result(self._results.trials)
 
     @cached_property
     def tracks(self) -> pd.DataFrame:
-        """Positions of all trials, a row a frame: `trial, frame, time_s, edge_px, lead_position_m, …, flag`."""
-        return self._together(self._results.track)
+        """Positions of all trials, one row per frame: `trial, frame, time_s, edge_px, lead_position_m, …, flag`."""
+        return self._concatenated(self._results.track)
 
     @cached_property
     def kinematics(self) -> pd.DataFrame:
-        """Speeds of all trials, a row a usable point: `trial, time_s, lead_position_m, lead_velocity_m_s, …`."""
-        return self._together(self._results.kinematics)
+        """Speeds of all trials, one row per usable point: `trial, time_s, lead_position_m, lead_velocity_m_s, …`."""
+        return self._concatenated(self._results.kinematics)
 
     @cached_property
     def fit(self) -> FitSummary:
-        """The model in use as it was fitted: `fit.json`."""
+        """The fit of the model in use: `fit.json`."""
         return read_fit(self._results)
 
     @cached_property
     def diagnosis(self) -> Diagnosis | None:
-        """What the model in use lacks: `diagnosis.json`; None where it was not asked."""
+        """The diagnosis of the model in use: `diagnosis.json`; None if there is none."""
         return read_diagnosis(self._results)
 
     @cached_property
@@ -82,17 +82,17 @@ class LoadedResults:
 
     @cached_property
     def scaling(self) -> Mapping[str, Any]:
-        """How B, speed and efficiency go with size: `scaling.json`."""
+        """Scaling of B, speed and efficiency with size: `scaling.json`."""
         return read_json(self._results.scaling)
 
     @cached_property
     def ladder(self) -> pd.DataFrame:
-        """`ladder.csv`: the errors of the initial model and of every one after it."""
+        """`ladder.csv`: errors of the initial model and of each later model."""
         return read_result(self._results.ladder)
 
     @cached_property
     def tables(self) -> Mapping[str, pd.DataFrame]:
-        """Every table of the folder by the name of its file without `.csv`, those of the diagnosis as `diagnosis/…`."""
+        """All tables of the folder by file name without `.csv`; those of the diagnosis as `diagnosis/…`."""
         paths = [*sorted(self.folder.glob("*.csv")), *sorted((self.folder / "diagnosis").glob("*.csv"))]
         return {path.relative_to(self.folder).with_suffix("").as_posix(): read_result(path) for path in paths}
 
@@ -103,7 +103,7 @@ class LoadedResults:
 
     @cached_property
     def final_model(self) -> Model:
-        """The model that the diagnosis ended with, with its fitted values; the initial one where nothing was added."""
+        """The final model of the diagnosis with its fitted values; the initial one if no effect was added."""
         diagnosis = self.diagnosis
         if diagnosis is None or not diagnosis.effects:
             return self.initial_model
@@ -115,13 +115,13 @@ class LoadedResults:
         from vinetrack.interface.calls import named_model
         from vinetrack.interface.sources import TrialSource
 
-        known: Mapping[str, Any] = {}
+        user_effects: Mapping[str, Any] = {}
         if not set(names) <= set(catalogue()):
-            known = named_model(TrialSource([], self.experiment)).user_effects
-        model = make_model(names, known)
+            user_effects = named_model(TrialSource([], self.experiment)).user_effects
+        model = make_model(names, user_effects)
         return model.with_values({key: value for key, value in values.items() if key in model.parameter_names})
 
-    def _together(self, path_of: Any) -> pd.DataFrame:
+    def _concatenated(self, path_of: Any) -> pd.DataFrame:
         paths = {name: path_of(name) for name in self.trials["trial"]}
         parts = [read_result(path).assign(trial=name) for name, path in paths.items() if path.exists()]
         if not parts:
@@ -134,8 +134,8 @@ class LoadedResults:
 
         Parameters
         ----------
-        name : as in `figures/`, such as `damping_law`, `ladder`, `model_comparison`, `candidates`; `trial_motion` takes
-            `trial=`. Blank: the ladder of errors where there is one, else the damping law.
+        name : name of the figure as in `figures/`, such as `damping_law`, `ladder`, `model_comparison`, `candidates`;
+            `trial_motion` takes `trial=`. Blank: the ladder of errors if there is one, else the damping law.
         options : `trial`, the name of a trial.
 
         Returns
@@ -145,7 +145,7 @@ class LoadedResults:
         Raises
         ------
         ResultsError
-            If there is no such figure, or nothing to draw in it.
+            If there is no such figure, or it has no content.
         """
         return plot(self, name, **options)
 
@@ -171,7 +171,7 @@ def load(folder: Path | str) -> LoadedResults:
 
     Parameters
     ----------
-    folder : as `snakemake` or `vinetrack run` made it, such as `results/demo`.
+    folder : results folder made by `snakemake` or `vinetrack run`, such as `results/demo`.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def load(folder: Path | str) -> LoadedResults:
     Raises
     ------
     ResultsError
-        If it is no results folder.
+        If it is not a results folder.
 
     Examples
     --------

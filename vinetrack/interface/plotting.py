@@ -1,4 +1,4 @@
-"""Figures of the report for objects in memory and for results folders, by their names in the registry."""
+"""Figures of the report for objects in memory and for results folders, by name in the registry."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ MODEL_FIGURES = ("model_comparison", "model_residuals")
 
 
 def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
-    """Draw an object of the Python interface as the report draws it.
+    """Draw an object of the Python interface as in the report.
 
     Parameters
     ----------
     shown : loaded results, a fit, a comparison, a diagnosis or a power.
-    name : of the figure; blank for the one that says most about the object.
-    trial : for figures of one trial.
+    name : name of the figure; blank for the main figure of the object.
+    trial : name of the trial, for figures of one trial.
 
     Returns
     -------
@@ -64,8 +64,8 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
 
 def _draw_figure(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
     if name not in inputs:
-        known = ", ".join(inputs) or "none"
-        raise ResultsError(f"There is nothing to draw as {name!r}; the figures with content are {known}.")
+        available = ", ".join(inputs) or "none"
+        raise ResultsError(f"There is no figure {name!r} with content; those with content are {available}.")
     return draw(name, *inputs[name])
 
 
@@ -93,7 +93,7 @@ def _condition_labels(trials: list[Trial]) -> Any:
 
 
 def _diagnosis_inputs(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
-    """Inputs of the figures that the diagnosis has something for; one that was read back knows no trajectories."""
+    """Return the data of the figures of a diagnosis; one read from a file has no trajectories."""
     from vinetrack.pipeline.figures_stage import figure_inputs
 
     return figure_inputs(_tables_in_memory(shown)) if shown.rounds else {}
@@ -111,11 +111,11 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
         return assemble_tables(shown, _condition_labels([]), curves, nothing, nothing, nothing)
     before, after = shown.fits[0], shown.fits[-1]
-    later = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
+    final = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
     parts = []
     for motion in in_sample(before).trials:
-        last = later[motion.name].predicted_position_m if later else np.full(motion.time_s.size, math.nan)
-        positions = (motion.lead_position_m, motion.predicted_position_m, last)
+        final_m = final[motion.name].predicted_position_m if final else np.full(motion.time_s.size, math.nan)
+        positions = (motion.lead_position_m, motion.predicted_position_m, final_m)
         columns = (
             motion.name,
             motion.trial.condition,
@@ -126,7 +126,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
     located, drifting = nothing, nothing
     if shown.failure is not None:
         located = shown.failure.along_position
-        drifting = drift_groups(shown.failure.drift, after if later else None)
+        drifting = drift_groups(shown.failure.drift, after if final else None)
     force = nothing if shown.force_table is None else shown.force_table
     conditions = _condition_labels([fitted.trial for fitted in before.trials])
     trials = pd.concat(parts, ignore_index=True)
@@ -136,19 +136,17 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
     from vinetrack.pipeline.figures_stage import campaign_inputs, draw_trial
 
-    known: tuple[Trial, ...] = ()
+    trials: tuple[Trial, ...] = ()
     try:
-        known = shown.experiment.trials
-    except Exception as error:  # the figures do without the sheet, with plainer labels
+        trials = shown.experiment.trials
+    except Exception as error:  # without the sheet, the figures have simpler labels
         if name == "trial_motion":
             raise ResultsError(f"{error}") from None
     if name == "trial_motion":
         names = list(shown.trials["trial"])
         if trial not in names:
             raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        return draw_trial(
-            shown.folder, next((known_trial for known_trial in known if known_trial.name == trial), None), trial
-        )
-    inputs = campaign_inputs(shown.folder, known)
+        return draw_trial(shown.folder, next((row for row in trials if row.name == trial), None), trial)
+    inputs = campaign_inputs(shown.folder, trials)
     chosen = name or ("ladder" if "ladder" in inputs else "damping_law")
     return _draw_figure(inputs, chosen)

@@ -1,4 +1,4 @@
-"""Trials with their tracks from whatever a user has: a results folder, an experiment, a frame of tracks, or pairs."""
+"""Trials with their tracks from any source: a results folder, an experiment, a frame of tracks, or pairs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
 
 @dataclass(frozen=True)
 class TrialSource:
-    """Trials with their tracks, the experiment that they belong to, and why others are missing.
+    """Trials with their tracks, their experiment, and the reasons why trials were left out.
 
     `experiment` is None for a frame and for pairs; `kinematics` are those of a results folder, by name of trial.
     """
@@ -42,7 +42,7 @@ def read_source(source: Source) -> TrialSource:
 
     Parameters
     ----------
-    source : see `Source`; the columns of a frame are those of `tracks_from_frame`.
+    source : see `Source`; for the columns of a frame see `tracks_from_frame`.
 
     Returns
     -------

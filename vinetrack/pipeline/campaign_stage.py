@@ -1,4 +1,4 @@
-"""The command `vinetrack design campaign`: pressures, payloads and replicates that pin n and B, tried before made."""
+"""The command `vinetrack design campaign`: a design that reaches given standard errors of n and B, with simulations."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 _VINE = re.compile(r"\s*([^x×]+)[x×]([^x×]+)[x×]([^x×]+)\s*")
 PLACEHOLDER_KPA = "100"
-"""A vine needs some pressure to be read; those of the campaign take its place."""
+"""Placeholder that lets a vine be read before the pressures of the campaign are chosen."""
 
 
 @dataclass(frozen=True)
 class CampaignRequest:
-    """What the command asks of a campaign; errors are standard errors, that of B relative.
+    """Options of the command: wanted standard errors (that of B relative), and constraints on the campaign.
 
-    `power` asks what the campaign could see of effects beside those of its model.
+    `power` requests the power for effects that are not in the model.
     """
 
     vines: tuple[str, ...]
@@ -65,7 +65,7 @@ class CampaignRequest:
 
 
 def _read_vine(text: str) -> dict[str, str]:
-    """Cells of a vine from `diameter×wall×length` in mm, µm, mm.
+    """Read a vine from `diameter×wall×length` in mm, µm, mm; return its cells by column.
 
     >>> _read_vine("24x200x280")
     {'diameter_mm': '24', 'thickness_um': '200', 'length_mm': '280'}
@@ -73,7 +73,7 @@ def _read_vine(text: str) -> dict[str, str]:
     Raises
     ------
     ExperimentError
-        If it is none.
+        If the text is not of that form.
     """
     match = _VINE.fullmatch(text)
     if match is None:
@@ -87,27 +87,28 @@ def _read_vine(text: str) -> dict[str, str]:
 def design_campaign(
     asked: PredictionRequest, wanted: CampaignRequest, *, sheet: Path | None = None, figure: Path | None = None
 ) -> list[str]:
-    """Lines for the terminal about the campaign; a sheet to film it by and a figure are written where asked for.
+    """Design a campaign; write its sheet and figure if requested.
 
     Parameters
     ----------
     asked
-        Numbers, sheet, fit and effects of the command line.
+        Inputs of the prediction.
     wanted
-        What the campaign must reach and may consist of.
+        Goals of and constraints on the campaign.
     sheet : Path, optional
-        Where the trial sheet of the campaign is written.
+        Output file for the trial sheet of the campaign.
     figure : Path, optional
-        Where its figure is written; the ending names the format.
+        Output file for its figure; the suffix names the format.
 
     Returns
     -------
     list of str
+        Lines for the terminal.
 
     Raises
     ------
     ExperimentError, ResultsError, EffectError
-        If something asked for will not do.
+        If an option is not allowed, or the vines cannot be simulated.
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.dynamics.simulate import SimulationError
@@ -121,7 +122,7 @@ def design_campaign(
     scope = _scope(wanted)
     camera = FilmingPlan(wanted.capture_fps, wanted.noise_mm / 1e3, wanted.correlation, wanted.longest_s)
     try:
-        with waiting("weighing conditions"):
+        with waiting("choosing conditions"):
             planned = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
         simulated = _simulated_campaigns(planned, vine_inputs, camera, wanted)
     except EffectError as error:
@@ -136,7 +137,7 @@ def design_campaign(
         lines += _power_lines(planned.candidates, shown, vine_inputs, camera)
     if sheet is not None:
         write_csv(sheet, _film_sheet(planned.candidates, shown, wanted))
-        lines.append(f"Sheet, in an order drawn at random: {sheet}")
+        lines.append(f"Sheet, in random order: {sheet}")
     if figure is not None:
         write_figure(_picture(planned.candidates, shown, wanted.longest_s), figure)
         lines.append(f"Figure: {figure}")
@@ -144,7 +145,7 @@ def design_campaign(
 
 
 def _vine_inputs(asked: PredictionRequest, wanted: CampaignRequest) -> list[PredictiveInputs]:
-    """One for each vine."""
+    """Return the predictive inputs of each vine."""
     if not wanted.vines:
         raise ExperimentError(
             [Problem(message="is missing", column="--vine", remedy="name one or more, such as 24x200x280")]
@@ -173,7 +174,7 @@ def _scope(wanted: CampaignRequest) -> Scope:
 def _simulated_campaigns(
     planned: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: CampaignRequest
 ) -> SimulatedCampaigns | None:
-    """The campaign made so many times and fitted; None where there is none to make."""
+    """Simulate and fit the campaign repeatedly; None if no design reaches the goal, or no simulation is requested."""
     from vinetrack.core.terminal import Progress, progress
     from vinetrack.planning.campaign_design import trials_of
     from vinetrack.planning.simulated_campaigns import simulate_campaign
@@ -197,7 +198,7 @@ def _simulated_campaigns(
 def _power_lines(
     shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan
 ) -> list[str]:
-    """What the campaign could see of effects that are not in its model."""
+    """Return lines about the power of the campaign for effects that are not in its model."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.campaign_power import CampaignDesign, design_power
     from vinetrack.inference.fit_data import FitError
@@ -215,14 +216,14 @@ def _power_lines(
         has_trace=(False,) * count,
     )
     try:
-        with waiting("working out what the campaign can see"):
+        with waiting("calculating the power of the campaign"):
             return ["", *seen_lines(design_power(campaign))]
     except FitError as error:
         raise ResultsError(str(error)) from None
 
 
 def _film_sheet(shown: Candidates, design: Plan, wanted: CampaignRequest) -> pd.DataFrame:
-    """A trial sheet to film the campaign by, in an order drawn at random: what drifts must not look like pressure."""
+    """Return the trial sheet of the campaign in random order, so that a drift is not confounded with pressure."""
     import pandas as pd
 
     from vinetrack.planning.campaign_design import trials_of

@@ -1,4 +1,4 @@
-"""The command `vinetrack check`: what was understood of an experiment, and what is wrong with it, before any work."""
+"""The command `vinetrack check`: facts about the recordings of an experiment, and all problems, before any analysis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Problems of an experiment; `recordings` what was understood of each; `notes` what a blank cell stands for."""
+    """Result of a check: `problems`, facts about each recording (`recordings`, also as lines), and `notes`."""
 
     problems: tuple[Problem, ...]
     recordings: tuple[dict[str, Any], ...]
@@ -22,16 +22,16 @@ class CheckReport:
 
     @property
     def failed(self) -> bool:
-        """Whether any problem is an error."""
+        """Whether there is an error."""
         return any(problem.severity == "error" for problem in self.problems)
 
     def lines(self) -> list[str]:
-        """What was understood, then the problems in at most 20 lines."""
-        understood = [*self.recording_lines, *self.notes]
-        return [*understood, *format_problems(self.problems, 20 - len(self.notes))]
+        """Return facts and notes, then the problems in at most 20 lines, notes included."""
+        facts = [*self.recording_lines, *self.notes]
+        return [*facts, *format_problems(self.problems, 20 - len(self.notes))]
 
     def to_json(self) -> dict[str, Any]:
-        """The same for a program."""
+        """Return the report for a program."""
         problems = [{key: value for key, value in vars(problem).items() if value} for problem in self.problems]
         return {"recordings": list(self.recordings), "notes": list(self.notes), "problems": problems}
 
@@ -41,7 +41,7 @@ def check_folder(folder: Path) -> CheckReport:
 
     Parameters
     ----------
-    folder : folder of the experiment.
+    folder : experiment folder.
 
     Returns
     -------
@@ -63,31 +63,32 @@ def check_folder(folder: Path) -> CheckReport:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
         return CheckReport(tuple(problems), (), (), ())
-    facts = {trial.name: known for trial, known in surveyor.facts.items()}
+    facts = {trial.name: recording_facts for trial, recording_facts in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
-    handed_in = []
+    tracks = []
     for trial in experiment.trials:
         if trial.track is not None:
             with contextlib.suppress(TrackError):
-                handed_in.append((trial, load_track(trial)))
-    speeds += [(trial, track_speed(track)) for trial, track in handed_in]
-    # Sizes that are wrong make the damping wrong that speeds imply.
+                tracks.append((trial, load_track(trial)))
+    speeds += [(trial, track_speed(track)) for trial, track in tracks]
+    # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
     if not any(problem.severity == "error" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
         problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
-    seen = [facts[trial.name] for trial in trials]
-    lines = facts_rows(seen, trials) if seen else []
-    if 0 < len(surveyor.looked_into) < len(seen):
-        lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
-    notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank), *axis_notes(seen, trials)]
-    rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in handed_in])
-    smoothing = detect_smoothing(handed_in, rounding_m)
+    entries = [facts[trial.name] for trial in trials]
+    lines = facts_rows(entries, trials) if entries else []
+    if 0 < len(surveyor.looked_into) < len(entries):
+        lines.append(f"{len(surveyor.looked_into)} of {len(entries)} recordings were examined, one of each condition")
+    notes = list(experiment.blank_notes)
+    notes += [*direction_notes(entries, trials, experiment.angle_blank), *axis_notes(entries, trials)]
+    rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in tracks])
+    smoothing = detect_smoothing(tracks, rounding_m)
     if smoothing is not None:
         notes.append(smoothing.note)
     if rounding_m > 0:
         notes.append(
             f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"
-            " hand them in with all digits that were measured."
+            " export them with all measured digits."
         )
-    return CheckReport(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))
+    return CheckReport(tuple(problems), tuple(map(facts_entry, entries)), tuple(lines), tuple(notes))

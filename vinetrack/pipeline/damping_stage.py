@@ -1,4 +1,4 @@
-"""From the points of the trials to the damping law and how it grows with size."""
+"""Fit of the damping law and of its scaling with the size of the vine."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ log = logging.getLogger(__name__)
 
 
 def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
-    """Fit the damping law to `damping_points.csv` and write `damping.json`, and `scaling.json` with `conditions.csv`.
+    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`.
 
     Parameters
     ----------
     folder : results folder.
-    settings : resamples of the bootstrap and their seed.
+    settings : number of bootstrap resamples, and their seed.
 
     Returns
     -------

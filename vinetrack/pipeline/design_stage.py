@@ -1,4 +1,4 @@
-"""The commands `vinetrack design vine` and `design reservoir`: what was asked is read, designed, told and drawn."""
+"""The commands `vinetrack design vine` and `vinetrack design reservoir`."""
 
 from __future__ import annotations
 
@@ -31,20 +31,21 @@ if TYPE_CHECKING:
     from vinetrack.planning.reservoir_design import Chamber
 
 MAX_FILMS = 12
-"""Chosen for time: each film takes a search of its own. Half still covers what a shop sells; twice doubles the wait."""
+"""Largest number of films. Chosen: each film takes a search of its own. Half still covers the films that a shop sells;
+twice doubles the time."""
 
 FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
-    """Two ends of a range, SI, from `low:high` or one number, each judged as a cell of the column.
+    """Read a range from `low:high` or one number, each checked like a cell of the column.
 
     Parameters
     ----------
     column : str
         Column of the sheet.
     text : str
-        As the user wrote it.
+        Text given by the user.
 
     Returns
     -------
@@ -53,7 +54,7 @@ def read_range(column: str, text: str) -> tuple[float, float]:
     Raises
     ------
     ExperimentError
-        If it is none.
+        If it is not a range.
 
     Examples
     --------
@@ -69,7 +70,7 @@ def read_range(column: str, text: str) -> tuple[float, float]:
 
 
 def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
-    """Values, SI, from numbers joined by commas; see `read_range`. `name` is the option's, if not the column's.
+    """Read a list of numbers joined by commas, each checked like a cell of the column.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
     text : str
         Numbers joined by commas.
     name : str
-        Option named in messages; that of the column where blank.
+        Option named in messages; blank for that of the column.
 
     Returns
     -------
@@ -88,13 +89,13 @@ def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
     Raises
     ------
     ExperimentError
-        If a number is none.
+        If an element is not an allowed number.
     """
     return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
 def _cell(column: str, text: str, name: str = "") -> float:
-    """One number of a column, in SI."""
+    """Read one number of a column; return it in SI."""
     from vinetrack.experiment.cells import CellError, read_cell
     from vinetrack.experiment.schema import COLUMNS
 
@@ -124,35 +125,36 @@ def design_vine(
     at_fraction: float,
     figure: Path | None = None,
 ) -> list[str]:
-    """Lines for the terminal about the best vine of every film; its figure is written where asked for.
+    """Find the fastest vine of every film; draw the choice if requested.
 
     Parameters
     ----------
     asked
-        Numbers, fit and effects of the command line.
+        Inputs of the prediction.
     films : str
         Wall thicknesses, µm, joined by commas.
     diameter, length : str
         `low:high`, mm.
     burst_share : float
-        Share of the burst stress that the wall may carry.
+        Fraction of the burst stress that the wall may carry.
     burst_stress_MPa : float
         Burst stress of the film.
     samples, seed : int
-        Draws, and the seed of the random numbers.
+        Number of draws, and seed of the random numbers.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken.
+        y/L at which a bare vine's final speed is evaluated.
     figure : Path, optional
-        Where the figure is written; the ending names the format.
+        Output file for the figure; the suffix names the format.
 
     Returns
     -------
     list of str
+        Lines for the terminal.
 
     Raises
     ------
     ExperimentError, ResultsError, EffectError
-        If something asked for will not do.
+        If an option is not allowed, or the vines cannot be simulated.
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.dynamics.simulate import SimulationError
@@ -188,17 +190,17 @@ def design_vine(
 
 
 def _check_films(room: Room, films: str, diameter: str) -> None:
-    """Refuse films that no tube of the smallest diameter can have, and none or too many of them."""
+    """Refuse an empty or too long list of films, and films too thick for the smallest diameter."""
     if not 0 < len(room.films_m) <= MAX_FILMS:
-        words = f"names {len(room.films_m)} films"
-        raise _refusal("thickness_um", films, words, f"name 1 to {MAX_FILMS}", name=FILMS)
+        message = f"names {len(room.films_m)} films"
+        raise _refusal("thickness_um", films, message, f"name 1 to {MAX_FILMS}", name=FILMS)
     if max(room.films_m) > room.diameter_m[0] / 4:
-        words = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
-        raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")
+        message = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
+        raise _refusal("diameter_mm", diameter, message, f"begin at {4e3 * max(room.films_m):g} mm or more")
 
 
 def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
-    """There is no fastest of vines that do not move, at the medians of the predictive inputs."""
+    """Refuse a design in which no vine reaches its end at the medians of the predictive inputs."""
     if choices[0].prediction.final.median > 0:
         return
     highest_Pa = max(choice.prediction.inputs.trial.pressure_Pa for choice in choices)
@@ -206,7 +208,7 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
     remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
     if highest_Pa < 0.995 * room.pressure_Pa:
-        message += f": their walls are trusted with {highest_Pa / 1e3:.3g} kPa at most"
+        message += f": their walls may carry at most {highest_Pa / 1e3:.3g} kPa"
         remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
     raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
@@ -240,22 +242,22 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
                 ", ".join(choice.limits),
             )
         )
-    head = ("film", "diameter", "length", "pressure", "PD/2t", "speed", "90 % band", "fastest", "held back by")
+    head = ("film", "diameter", "length", "pressure", "PD/2t", "speed", "90 % band", "fastest", "limited by")
     yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
     yield ""
     if choices[0].odds < 0.8 and len(choices) > 1:
         yield (
-            f"the choice of film is open: {1e6 * choices[0].thickness_m:g} µm is the fastest in {choices[0].odds:.0%} "
-            "of the draws only; measuring B and P_y of the first two would decide it"
+            f"the choice of film is uncertain: {1e6 * choices[0].thickness_m:g} µm is the fastest in only "
+            f"{choices[0].odds:.0%} of the draws; measuring B and P_y of the first two films would decide it"
         )
-    yield f"uncertainties of the fastest, {describe_trial(best.inputs.trial)}: final speed by each alone"
+    yield f"uncertainty budget of the fastest, {describe_trial(best.inputs.trial)}: final speed by each input alone"
     rows_of = [
         (f"  {share.name}", f"{display_value(share.low, 'm/s')} to {display_value(share.high, 'm/s')} m/s", share.words)
         for share in best.shares
     ]
     yield from table(rows_of)
-    yield "  not included: the burst stress, a guess from one vine, and what the model leaves out (`vinetrack predict`)"
-    yield from (f"! {words}" for words in design_checks(best))
+    yield "  not included: the burst stress, a guess from one vine, and effects not in the model (`vinetrack predict`)"
+    yield from (f"! {warning}" for warning in design_checks(best))
 
 
 def _vine_picture(choices: Sequence[Choice]) -> Figure:
@@ -286,31 +288,32 @@ def design_reservoir(
     at_fraction: float,
     figure: Path | None = None,
 ) -> list[str]:
-    """Lines for the terminal about the chambers worth looking at; the figure is written where asked for.
+    """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested.
 
-    Speeds are told where the wall is given, so that there is a vine to simulate.
+    Speeds are predicted if the wall thickness is given.
 
     Parameters
     ----------
     asked
-        Numbers, fit and effects of the command line.
+        Inputs of the prediction.
     within_percent : float
-        Share of the gauge pressure that may be lost, %.
+        Allowed loss of gauge pressure, %.
     supply_s : float, optional
         Time constant of a supply that refills the chamber, s.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken.
+        y/L at which a bare vine's final speed is evaluated.
     figure : Path, optional
-        Where the figure is written; the ending names the format.
+        Output file for the figure; the suffix names the format.
 
     Returns
     -------
     list of str
+        Lines for the terminal.
 
     Raises
     ------
     ExperimentError, ResultsError, EffectError
-        If something asked for will not do.
+        If an option is not allowed, or the vine cannot be simulated.
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.effects import EffectError
@@ -328,7 +331,7 @@ def design_reservoir(
     except EffectError as error:
         raise name_missing_option(error) from None
     if supply_s is not None and inputs is None:
-        lines.append("! how fast the vine draws gas depends on its wall: give --thickness-um to use --supply-s")
+        lines.append("! --supply-s needs --thickness-um: how fast the vine takes up gas depends on its wall")
     if figure is not None:
         write_figure(_reservoir_picture(trial, loss), figure)
         lines.append(f"Figure: {figure}")
@@ -339,12 +342,12 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     from vinetrack.core.terminal import table
     from vinetrack.planning.reservoir_design import GAMMAS, chambers, swept_m3
 
-    words = (
+    description = (
         describe_trial(trial)
         if inputs is not None
         else (f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa")
     )
-    yield f"{words}: it sweeps {format_volume(swept_m3(trial))}"
+    yield f"{description}: it sweeps {format_volume(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""
     listed = chambers(trial, loss)
@@ -357,7 +360,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
         steady = _final(inputs, math.inf, 1.0, at_fraction)
         place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
         yield f"speed: final speed at the medians{place}; {display_value(steady, 'm/s')} m/s at constant pressure"
-    yield ("slow: γ = 1, the gas stays at room temperature; fast: γ = 1.4, it takes up no heat, as within milliseconds")
+    yield "slow: γ = 1, isothermal; fast: γ = 1.4, adiabatic, as within milliseconds"
 
 
 def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
@@ -385,8 +388,8 @@ def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> l
     from vinetrack.planning.reservoir_design import GAMMAS, supplied_chamber
 
     volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
-    words = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
-    return [f"with a supply that closes the gap in {1e3 * supply_s:g} ms, at the medians: {words}"]
+    needed = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
+    return [f"with a supply that refills the chamber in {1e3 * supply_s:g} ms, at the medians: {needed}"]
 
 
 def _reservoir_picture(trial: Trial, loss: float) -> Figure:

@@ -1,6 +1,6 @@
-"""The diagnosis of a results folder: what the model lacks, added while it is one effect, with the errors it saves.
+"""Diagnosis of a results folder: which effects the model lacks, and how much they reduce its errors.
 
-A diagnosis that cannot be made never stops the run: `diagnosis.json` then has no verdict and says why.
+A diagnosis that fails does not stop the run: `diagnosis.json` then has no verdict and states the reason.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-CONTRADICTION_WARNING = "But what was seen contradicts the sheet in"
+CONTRADICTION_WARNING = "But the measurements contradict the sheet in"
 _BETWEEN_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
@@ -50,21 +50,21 @@ def _quiet(_: str) -> None:
 def diagnose_results(
     experiment: Experiment, folder: Path, report: Report = _quiet, settings: RunSettings | None = None
 ) -> dict[str, Any]:
-    """Diagnose what a results folder holds; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
+    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
 
     Parameters
     ----------
     experiment : sheet and settings.
     folder : results folder.
     report : callable
-        Called with a sentence at each step.
+        Called with a description of each step.
     settings : optional
-        Of the run, for steady windows; defaults where None.
+        Settings of the run, for steady windows; None for the defaults.
 
     Returns
     -------
     dict
-        `diagnosis.json` as written; `refused` is None or the reason why there is no verdict.
+        `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
 
     Raises
     ------
@@ -79,20 +79,20 @@ def diagnose_results(
         return _write_refusal(results, experiment, _reason(error))
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
     content = write_diagnosis(results, diagnosis)
-    report("the damping law with the pressure of every model")
+    report("fitting the damping law under every model")
     _write_laws(results, diagnosis, pairs, settings)
     return content
 
 
 def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
-    """Diagnose trials with their tracks by what the experiment says of model, candidates, own effects and limits.
+    """Diagnose trials with the model, candidates, user effects and limits that the experiment states.
 
     Parameters
     ----------
     experiment : sheet and settings.
     pairs : sequence of (Trial, Track)
     report : callable
-        Called with a sentence at each step.
+        Called with a description of each step.
 
     Returns
     -------
@@ -104,35 +104,35 @@ def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report 
 
 
 def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
-    """The verdict with what was seen that contradicts the sheet: a wrong scale or unit passes for physics.
+    """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics.
 
     Parameters
     ----------
-    diagnosis : as made from the trials.
-    results, pairs : as of `sheet_contradictions`.
+    diagnosis : diagnosis of the trials.
+    results, pairs : see `sheet_contradictions`.
 
     Returns
     -------
     Diagnosis
     """
-    contradicted = sheet_contradictions(results, pairs)
-    if not contradicted:
+    contradictions = sheet_contradictions(results, pairs)
+    if not contradictions:
         return diagnosis
-    columns = joined(list(contradicted))
-    caveat = f"{CONTRADICTION_WARNING} {columns}: put that right before you believe this verdict."
+    columns = joined(list(contradictions))
+    warning = f"{CONTRADICTION_WARNING} {columns}: correct that before relying on this verdict."
     return replace(
         diagnosis,
-        explanation=f"{diagnosis.explanation} {caveat}",
-        notes=(*diagnosis.notes, *contradicted.values()),
+        explanation=f"{diagnosis.explanation} {warning}",
+        notes=(*diagnosis.notes, *contradictions.values()),
     )
 
 
 def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
-    """What recordings and speeds contradict in the sheet, in a sentence for each column.
+    """Return a sentence for each column of the sheet that recordings or speeds contradict.
 
     Parameters
     ----------
-    results : results folder, with what the tracker noted of each trial.
+    results : results folder, which contains the contradictions found while tracking.
     pairs : sequence of (Trial, Track)
 
     Returns
@@ -156,7 +156,7 @@ def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]])
 
 
 def _reason(error: Exception) -> str:
-    """Why there is no verdict, in a sentence; the traceback of what nobody foresaw goes to the log."""
+    """Return the reason why there is no verdict; the traceback of an unexpected exception goes to the log."""
     if isinstance(error, model_errors()):
         return str(error)
     log.exception("no diagnosis could be made")
@@ -167,8 +167,8 @@ def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dic
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS
     from vinetrack.diagnosis.result import Diagnosis
 
-    words = f"No diagnosis could be made: {reason}"
-    refusal = Diagnosis(rounds=(), effects=(), explanation=words, refused=reason)
+    explanation = f"No diagnosis could be made: {reason}"
+    refusal = Diagnosis(rounds=(), effects=(), explanation=explanation, refused=reason)
     content = {**refusal.to_json(), "model": list(experiment.settings.model)}
     _emptied_folder(results)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS))
@@ -185,12 +185,12 @@ def _emptied_folder(results: Results) -> Path:
 
 
 def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; return the first.
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
 
     Parameters
     ----------
-    results : results folder; its folder `diagnosis` is written anew.
-    diagnosis : what is written.
+    results : results folder; its subfolder `diagnosis` is replaced.
+    diagnosis : the diagnosis to write.
 
     Returns
     -------
@@ -202,9 +202,10 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
     folder = _emptied_folder(results)
     for name, table in _tables_of(diagnosis).items():
         write_csv(folder / name, table)
-    numbers = moved(diagnosis.fits, ("", *diagnosis.effects)) if len(diagnosis.fits) > 1 else empty_table(MOVED_COLUMNS)
-    write_csv(folder / "moved.csv", numbers)
-    if len(diagnosis.fits) > 1:
+    has_added = len(diagnosis.fits) > 1
+    parameter_changes = moved(diagnosis.fits, ("", *diagnosis.effects)) if has_added else empty_table(MOVED_COLUMNS)
+    write_csv(folder / "moved.csv", parameter_changes)
+    if has_added:
         from vinetrack.inference.summary_of_fit import summary_of
 
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
@@ -221,7 +222,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
 def _write_laws(
     results: Results, diagnosis: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
 ) -> None:
-    """The damping law redone with the pressure that every model of the ladder gives: how n and B come home."""
+    """Refit the damping law with the pressure predicted by each model of the ladder, to show how n and B change."""
     from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 
     path = results.folder / "diagnosis" / "damping_laws.csv"
@@ -237,7 +238,7 @@ def _write_laws(
 
 
 def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
-    """Tables of where the first model fails, and the force that is missing, by name of file."""
+    """Return the tables of the initial model's misfit and of the missing force, by file name."""
     from vinetrack.diagnosis.drift import drift_groups
 
     tables: dict[str, pd.DataFrame] = {}
@@ -258,15 +259,15 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
 
 
 def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
-    """What the first and the last model say of every trial, by its name.
+    """Predict every trial with the initial and the final model.
 
-    As in `comparison.csv` and the ladder: a release and an origin of the trial's own, and nothing else.
-    `model_after_m` is NaN where nothing was added.
+    As in `comparison.csv` and the ladder, only release and origin are fitted per trial. `model_after_m` is NaN if no
+    effect was added.
 
     Parameters
     ----------
-    before : fit of the first model.
-    after : fit of the last model; the same object where nothing was added.
+    before : fit of the initial model.
+    after : fit of the final model; the same object if no effect was added.
 
     Returns
     -------
@@ -288,7 +289,7 @@ def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
 
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
-    """Put an effect in the model, refit, and say what became of errors and numbers; the ladder keeps the history.
+    """Add an effect to the model and refit; the errors are appended to `ladder.csv`.
 
     Parameters
     ----------
@@ -297,21 +298,21 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     name : str
         Name of the effect.
     report : callable
-        Called with a sentence at each step.
+        Called with a description of each step.
 
     Returns
     -------
     list of str
-        Lines for the terminal.
+        Lines for the terminal: errors and parameters before and after.
 
     Raises
     ------
     ResultsError
         If a stage before this one has not run.
     EffectError
-        If there is no such effect, it is in the model already, or a trial lacks what it needs.
+        If there is no such effect, it is in the model already, or a trial lacks an input that it requires.
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
     import pandas as pd
 
@@ -324,16 +325,16 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
     history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
     rows = table if not len(history) else table.iloc[1:]
-    kept = settled_rows(history)
-    known = set(zip(kept["model"], kept["added"].fillna(""), strict=True))
-    new = rows[[(model, added) not in known for model, added in zip(rows["model"], rows["added"], strict=True)]]
+    settled = settled_rows(history)
+    recorded = set(zip(settled["model"], settled["added"].fillna(""), strict=True))
+    new = rows[[(model, added) not in recorded for model, added in zip(rows["model"], rows["added"], strict=True)]]
     if len(new):
         write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
     return added_in_words(before, after, table, moved((before, after), ("", name)))
 
 
 def diagnosis_lines(folder: Path) -> list[str]:
-    """What `diagnosis.json` of a results folder says: the verdict in a line, then its reasons, a line a sentence.
+    """Return the verdict of a results folder in one line, then its reasons, one sentence per line.
 
     Parameters
     ----------
@@ -353,17 +354,16 @@ def diagnosis_lines(folder: Path) -> list[str]:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
     if not diagnosis.verdict:
         return [diagnosis.explanation]
-    beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    reasons, _, contradicted = diagnosis.explanation.partition(CONTRADICTION_WARNING)
+    power = power_brief(diagnosis.power) if diagnosis.power is not None else ""
+    reasons, _, contradicted_columns = diagnosis.explanation.partition(CONTRADICTION_WARNING)
     sizes = [
         fact.answer for fact in summary_facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))
     ]
-    told = f" ({'; '.join(sizes)})" if sizes else ""
-    headline = f"{verdict_line(diagnosis)}{told}"
+    headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if sizes else "")
     return [
-        f"{headline}. {CONTRADICTION_WARNING}{contradicted}" if contradicted else headline,
+        f"{headline}. {CONTRADICTION_WARNING}{contradicted_columns}" if contradicted_columns else headline,
         *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
-        *([f"{beside[0].upper()}{beside[1:]}"] if beside and beside not in headline else []),
+        *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),
         *filter(None, [to_go_on(diagnosis)]),
@@ -371,7 +371,7 @@ def diagnosis_lines(folder: Path) -> list[str]:
 
 
 def _damping_line(diagnosis: Diagnosis) -> list[str]:
-    """The damping law of the model in the end, F = B·ẋⁿ, in a line; none where that model has no such law."""
+    """Return the damping law of the final model, F = B·ẋⁿ, as a line; empty if that model has none."""
     numbers = [number for number in diagnosis.parameters if number.key in ("eversion_damping.B", "eversion_damping.n")]
     if not numbers:
         return []

@@ -1,6 +1,6 @@
-"""What the diagnosis of a results folder left there, as tidy tables for pictures and page.
+"""Tables of a stored diagnosis for figures and report.
 
-Every part may be missing: a folder without a diagnosis, one that was refused, a verdict that added nothing.
+Any part may be missing: there may be no diagnosis, it may have failed, or it may have added no effect.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
 N_SECTIONS = 8
-"""Parts of the growth in which misfits are averaged where the diagnosis did not say. Chosen: as many as a page shows
-side by side. At half a misfit at the start alone is averaged away, at twice each mean rests on few frames."""
+"""Sections of the growth in which misfits are averaged if the diagnosis contains no such averages. Chosen: as many as a
+page shows side by side. At half a misfit confined to the start is averaged out; at twice each mean has few frames."""
 
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
 @dataclass(frozen=True)
 class DiagnosisTables:
-    """Tables behind the pictures, each empty where there is nothing to draw.
+    """Data of the figures; a table is empty if there is nothing to draw.
 
-    `rounds` are (question, ranking) pairs, `worst` names the condition that `before_after` shows, `cosines` are names
-    and matrix, `added` the effects that were added, in words.
+    `rounds` are (heading, ranking) pairs, `worst` is the condition that `before_after` shows, `cosines` are names and
+    matrix, `added` the added effects in words, `labels` the labels of conditions by name.
     """
 
     ladder: pd.DataFrame
@@ -58,7 +58,7 @@ class DiagnosisTables:
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
-    """Tables of a results folder; None where it has not been diagnosed, or that was refused.
+    """Read the tables of a results folder; None if it has no diagnosis, or that failed.
 
     Parameters
     ----------
@@ -88,18 +88,18 @@ def assemble_tables(
     force: pd.DataFrame,
     learned: pd.DataFrame | None = None,
 ) -> DiagnosisTables:
-    """Put the tables behind the pictures together.
+    """Assemble the data of the figures.
 
     Parameters
     ----------
     diagnosis : with a verdict.
     conditions : DataFrame
-        As of `read_diagnosis_tables`.
+        See `read_diagnosis_tables`.
     trials : DataFrame
         Columns `CURVE_COLUMNS`.
     located, drifting, force, learned : DataFrame
-        Misfit along the growth, values of groups of trials, the missing force, and the same as learned inside the fit;
-        empty where there is none.
+        Misfit along the growth, drift between groups of trials, missing force, and missing force as learned within the
+        fit; empty if there is none.
 
     Returns
     -------
@@ -130,12 +130,12 @@ def assemble_tables(
 
 
 def read_diagnosis_section(results: Results, experiment: Experiment) -> DiagnosisResult | None:
-    """What the page says of the diagnosis; None where there is none.
+    """Return the content of the report's section on the diagnosis; None if there is no diagnosis.
 
     Parameters
     ----------
     results : results folder.
-    experiment : names the files of the user's effects.
+    experiment : experiment, whose settings name the files of the user's effects.
 
     Returns
     -------
@@ -148,20 +148,20 @@ def read_diagnosis_section(results: Results, experiment: Experiment) -> Diagnosi
         return None
     paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
     moved, laws = (table if len(table := _table(path)) else None for path in paths)
-    named = [*diagnosis.effects, *diagnosis.answer_set]
-    effects = _effects([*named, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)], experiment)
+    reported = [*diagnosis.effects, *diagnosis.answer_set]
+    effects = _effects([*reported, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)], experiment)
     return DiagnosisResult(
         diagnosis,
         diagnosis.ladder,
         moved,
         laws,
-        {name: effects[name].summary for name in named if name in effects},
+        {name: effects[name].summary for name in reported if name in effects},
         {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
     )
 
 
 def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
-    """Effects by name; without those whose file has gone."""
+    """Return effects by name, without those whose file no longer exists."""
     from vinetrack.effects import EffectError, find_effect, own_effects
 
     try:
@@ -176,11 +176,11 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
 
 
 def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
-    """The table behind each picture that has something in it, by name of the picture.
+    """Return the data table of each figure with content, by name of the figure.
 
     Parameters
     ----------
-    diagnosed : from `read_diagnosis_tables`.
+    diagnosed : tables from `read_diagnosis_tables`.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def _table(path: Any) -> pd.DataFrame:
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Every trial with predictions, columns `CURVE_COLUMNS`: time since release, positions from the origin.
+    """Return measured and predicted positions of all trials, relative to release and origin.
 
     Parameters
     ----------
@@ -222,6 +222,7 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
     Returns
     -------
     DataFrame
+        Columns `CURVE_COLUMNS`; only trials with predictions.
     """
     import pandas as pd
 
@@ -233,8 +234,8 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
         if table is None or not len(table):
             continue
         if condition not in compared:
-            there = bool(condition) and results.trajectories(condition).exists()
-            compared[condition] = read_result(results.trajectories(condition)) if there else pd.DataFrame()
+            exists = bool(condition) and results.trajectories(condition).exists()
+            compared[condition] = read_result(results.trajectories(condition)) if exists else pd.DataFrame()
         release_s, origin_m = _start(trial, table, compared[condition])
         positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
         time_s = table["time_s"] - release_s
@@ -243,11 +244,11 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
 
 
 def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
-    """Release and origin of a trial: as the comparison has them, which begins with the same point; else as seen."""
-    same = compared[compared["trial"] == trial] if len(compared) else compared
+    """Return release and origin of a trial: those of the comparison, which starts at the same point, else estimates."""
+    of_trial = compared[compared["trial"] == trial] if len(compared) else compared
     time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
-    if len(same) == len(table):
-        return time_s - float(same["time_s"].iloc[0]), position_m - float(same["lead_position_m"].iloc[0])
+    if len(of_trial) == len(table):
+        return time_s - float(of_trial["time_s"].iloc[0]), position_m - float(of_trial["lead_position_m"].iloc[0])
     origin_m = float(np.nanmin(table["lead_position_m"]))
     return _first_moving_s(table, origin_m), origin_m
 
@@ -258,7 +259,7 @@ def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
-    """The condition where the model that the user came with is farthest off; blank without predictions.
+    """Return the condition with the largest RMS error of the initial model; blank without predictions.
 
     Parameters
     ----------
@@ -273,25 +274,25 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
     if not len(trials):
         return ""
-    off = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
-    usable = {name: value for name, value in off.items() if math.isfinite(value)}
-    return str(max(usable, key=usable.__getitem__)) if usable else ""
+    errors_m = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
+    finite_m = {name: value for name, value in errors_m.items() if math.isfinite(value)}
+    return str(max(finite_m, key=finite_m.__getitem__)) if finite_m else ""
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Mean misfit of every condition in stretches of its growth, as `misfit_figures.draw_where` draws it.
+    """Return the mean misfit of every condition in sections of its growth, for `misfit_figures.draw_where`.
 
-    Where the diagnosis found the misfit of the first model itself, with its error, that is taken.
+    The misfit of the initial model and its error are taken from the diagnosis if it contains them.
     """
     import pandas as pd
 
     rows: list[dict[str, Any]] = []
-    known_rows = located[located["condition"] != ""] if len(located) else located
+    by_condition = located[located["condition"] != ""] if len(located) else located
     for condition in labels:
         members = trials[trials["condition"] == condition]
         if not len(members):
             continue
-        of_condition = known_rows[known_rows["condition"] == condition] if len(known_rows) else known_rows
+        of_condition = by_condition[by_condition["condition"] == condition] if len(by_condition) else by_condition
         rows += [
             {"condition": condition, "condition_label": labels[condition], **row}
             for row in (
@@ -302,10 +303,11 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
 
 
 def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the sections of the diagnosis, with the misfit of the final model added."""
     vine = str(of_condition["vine"].iloc[0])
     whole_m = float(located.loc[located["vine"] == vine, "to_m"].max())
     if not whole_m > 0:
-        return []  # Nothing grew: there is no place along the growth.
+        return []  # There was no growth to divide into sections.
     rows = []
     for row in iter_rows(of_condition):
         after = _mean_misfits(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
@@ -323,7 +325,7 @@ def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame, members
 
 
 def _measured_sections(members: pd.DataFrame) -> list[dict[str, Any]]:
-    """Stretches of what was measured; chance is what trials differ by, less their own mean over the growth."""
+    """Return equal sections of the measured growth; the scatter is the standard error of the mean over trials."""
     whole_m = float(members["lead_position_m"].max())
     if not whole_m > 0:
         return []
@@ -350,7 +352,7 @@ def _measured_sections(members: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
-    """Mean misfit of each trial, by model, where `along` lies from `low` to `high`; NaN for one that never does."""
+    """Return the mean misfit of each trial, by model, where `low <= along < high`; NaN for a trial without points."""
     chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
     means: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
     for trial in dict.fromkeys(members["trial"]):
@@ -363,13 +365,13 @@ def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) ->
 
 
 def round_heading(index: int, rounds: Sequence[Round]) -> str:
-    """What a round asks, in words.
+    """Return the heading of a round of the diagnosis, as a question.
 
     Parameters
     ----------
     index : int
-        Number of the round, from 0.
-    rounds : of the diagnosis.
+        Index of the round, from 0.
+    rounds : all rounds of the diagnosis.
 
     Returns
     -------
@@ -382,7 +384,7 @@ def round_heading(index: int, rounds: Sequence[Round]) -> str:
 
 
 def ranking_table(ranked: Round) -> pd.DataFrame:
-    """The ranking of a round as a table; Δχ² of those not testable is NaN.
+    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN.
 
     Parameters
     ----------
@@ -391,7 +393,7 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        A row a candidate.
+        One row per candidate.
     """
     import pandas as pd
 
@@ -404,11 +406,11 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
 
 
 def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
-    """Names and matrix of the cosines of a round with the answer first, then as it ranks its candidates.
+    """Return the cosines of a round, ordered by rank, with the answer set first.
 
     Parameters
     ----------
-    ranked : the first round of the diagnosis.
+    ranked : one round of the diagnosis.
 
     Returns
     -------
@@ -416,13 +418,13 @@ def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
     matrix : list of lists of float
     """
     names, matrix = ranked.cosine_names, ranked.cosines
-    places = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
-    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(ranked.ranking))))
+    ranks = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: ranks.get(names[i], (True, len(ranked.ranking))))
     return [names[i] for i in order], [[matrix[i][j] for j in order] for i in order]
 
 
 def _cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
-    """The matrix of cosines as rows of pairs, each once."""
+    """Return the matrix of cosines as a table with one row per pair."""
     import pandas as pd
 
     rows = [(names[i], names[j], matrix[i][j]) for i in range(len(matrix)) for j in range(i)]

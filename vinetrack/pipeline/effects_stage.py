@@ -1,4 +1,4 @@
-"""The command `vinetrack effects`: the catalogue, with a user's own, in words and pictures."""
+"""The command `vinetrack effects`: description of the catalogue and of the user's own effects."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def describe_effects(name: str | None, experiment: Path | None, figure: Path | None) -> list[str]:
-    """Lines for the terminal: all effects, or the one named; with `figure`, its picture is written there.
+    """List all effects, or explain one and draw it.
 
     Parameters
     ----------
     name : str or None
-        Name of an effect.
+        Name of an effect; None for all.
     experiment : Path or None
-        Folder whose own effects are listed too.
+        Experiment folder whose own effects are included.
     figure : Path or None
-        Where the picture of the effect is written.
+        Output file for the figure of the effect.
 
     Returns
     -------
     list of str
+        Lines for the terminal.
 
     Raises
     ------
     ExperimentError
-        If the experiment, its settings or the place of the figure will not do.
+        If the settings of the experiment cannot be read, or the figure has no name of an effect or no known format.
     EffectError
-        If there is no such effect, or one of the user's own is none.
+        If there is no such effect, or a file of the user's is not an effect.
     """
     from vinetrack.effects import catalogue, explanation, find_effect, listing
 
@@ -58,7 +59,7 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
 
 
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
-    """The user's own effects of an experiment, read from the files its settings name, and tried out.
+    """Load and test the user's own effects of an experiment.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
     ExperimentError
         If the settings cannot be read, or a file lies outside the folder.
     EffectError
-        If a file is no effect.
+        If a file is not an effect.
     """
     from vinetrack.core.tables import TableError, safe_join
     from vinetrack.effects import own_effects
@@ -89,9 +90,9 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
 
 
 def model_problems(experiment: Path) -> list[Problem]:
-    """What is wrong with the effects that an experiment names, in its model, its candidates or as files of its own.
+    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`.
 
-    Nothing where it keeps to the base model, or cannot be read, which the check of the sheet says.
+    Returns nothing for the base model, nor if the experiment cannot be read, which `check_experiment` reports.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def model_problems(experiment: Path) -> list[Problem]:
 
 
 def _write_picture(effect: Effect, path: Path) -> None:
-    """Draw what an effect does to the reference vine; the file's ending says in which form."""
+    """Draw the influence of an effect on the reference vine; the suffix of the file names the format."""
     from vinetrack.core.tables import write_bytes
     from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
     from vinetrack.figures.prediction_figures import draw_effect
@@ -154,18 +155,18 @@ def _write_picture(effect: Effect, path: Path) -> None:
 
 
 def effects_content(name: str | None, experiment: Path | None) -> list[dict[str, Any]]:
-    """All effects, or the one named, for a program; see `describe_effects`.
+    """Describe all effects, or one, for a program; see `describe_effects`.
 
     Parameters
     ----------
     name : str or None
-        Name of an effect.
+        Name of an effect; None for all.
     experiment : Path or None
-        Folder whose own effects are listed too.
+        Experiment folder whose own effects are included.
 
     Returns
     -------
-    list of dict, one an effect
+    list of dict, one per effect
     """
     from vinetrack.effects import catalogue, find_effect
 

@@ -1,4 +1,4 @@
-"""Tables of a results folder drawn: one figure a trial in a few processes, and those of the whole experiment."""
+"""Figures of a results folder: one per trial, and those of the whole experiment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _TrialPicture:
-    """What one trial's figure needs besides its own files."""
+    """Inputs of the figure of one trial, besides its own files."""
 
     name: str
     title: str
@@ -45,7 +45,7 @@ def draw_trials(
     n_workers: int = 1,
     only: Collection[str] | None = None,
 ) -> int:
-    """Draw `figures/trial_<trial>` for every trial that is not left out; return how many.
+    """Draw `figures/trial_<trial>` for every trial that is not left out; return the number of figures.
 
     Parameters
     ----------
@@ -66,14 +66,14 @@ def draw_trials(
     """
     results = Results(folder)
     by_trial = dict(iter(read_result(results.steady).groupby("trial", sort=False)))
-    nothing = read_result(results.steady).iloc[:0]
-    known = {trial.name: trial for trial in experiment.trials}
+    no_windows = read_result(results.steady).iloc[:0]
+    trials = {trial.name: trial for trial in experiment.trials}
     pictures = [
         _TrialPicture(
             name,
-            _describe_trial(known[name]) if name in known else name,
-            known[name].travel_ratio if name in known else 2.0,
-            by_trial.get(name, nothing),
+            _describe_trial(trials[name]) if name in trials else name,
+            trials[name].travel_ratio if name in trials else 2.0,
+            by_trial.get(name, no_windows),
         )
         for name in experiment.names
         if name not in experiment.left_out and (only is None or name in only)
@@ -94,13 +94,13 @@ def _trial_figure(picture: _TrialPicture, results: Results) -> Figure:
 
 
 def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
-    """Draw position, speed and steady stretches of one trial of a results folder.
+    """Draw position, speed and steady windows of one trial of a results folder.
 
     Parameters
     ----------
-    folder : of the results.
-    trial : from the sheet; None where it is not known.
-    name : of the trial.
+    folder : results folder.
+    trial : row of the sheet; None if it could not be read.
+    name : name of the trial.
 
     Returns
     -------
@@ -113,7 +113,7 @@ def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
 
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
-    """Draw the figures of the whole experiment that have content; those of an earlier run go.
+    """Draw the figures of the whole experiment that have content; remove those of an earlier run.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     Returns
     -------
     list of str
-        Names of the figures drawn, as `figures/campaign.json` holds them: Snakemake cannot know them beforehand.
+        Names of the figures drawn, also written to `figures/campaign.json`, since Snakemake cannot know them in
+        advance.
     """
     from vinetrack.figures.registry import CAMPAIGN_FIGURES, draw
 
@@ -144,17 +145,17 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
 
 
 def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[Any, ...]]:
-    """Read what every figure of a whole experiment is drawn from.
+    """Read the data of all figures of a whole experiment.
 
     Parameters
     ----------
-    folder : of the results.
+    folder : results folder.
     known : trials of the sheet, for labels.
 
     Returns
     -------
     dict
-        Arguments of the drawing function by name of figure; figures without content are left out.
+        Arguments of the drawing function by name of the figure, for figures with content.
     """
     from vinetrack.figures.pixel_places import MIN_EDGES, subpixel_positions
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
@@ -202,7 +203,7 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
 
 
 def _describe_trial(trial: Trial) -> str:
-    """A trial in a line: name, vine, pressure and payload."""
+    """Return a title for a trial: name, vine, pressure and payload."""
     return f"{trial.name} · {' · '.join(_features(trial))}"
 
 
@@ -219,7 +220,7 @@ def _features(trial: Trial) -> list[str]:
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
-    """`trials.csv` with the pressure and a short label of each trial's condition, for the panels of the overview.
+    """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview.
 
     Parameters
     ----------
@@ -248,7 +249,7 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
 
 
 def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
-    """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising.
+    """Add vine and label of each condition to `comparison.csv`, sorted by vine and then pressure.
 
     Parameters
     ----------
@@ -263,20 +264,20 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
     """
     first = described.drop_duplicates("condition").set_index("condition")
     vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
-    known = comparison[comparison["condition"].isin(first.index)]
-    of = first.loc[known["condition"]]
-    table = known.assign(vine=of["vine"].to_numpy(), condition_label=of["condition_label"].to_numpy())
-    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], of["pressure_kPa"].iloc[i]))
+    labelled = comparison[comparison["condition"].isin(first.index)]
+    labels = first.loc[labelled["condition"]]
+    table = labelled.assign(vine=labels["vine"].to_numpy(), condition_label=labels["condition_label"].to_numpy())
+    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], labels["pressure_kPa"].iloc[i]))
     return table.iloc[order].reset_index(drop=True)
 
 
 def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
-    """Return what each figure of a diagnosis is drawn from, by name; those without content are left out.
+    """Return the data of the figures of a diagnosis that have content, by name.
 
     Parameters
     ----------
     tables
-        From `read_diagnosis_tables`.
+        Tables from `read_diagnosis_tables`.
 
     Returns
     -------
@@ -296,35 +297,35 @@ def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
         "cosines": tables.cosines,
         "drift": (tables.drift, tables.added),
     }
-    there = figure_tables(tables)
-    return {name: inputs[name] for name in DIAGNOSIS_FIGURES if name in there}
+    with_content = figure_tables(tables)
+    return {name: inputs[name] for name in DIAGNOSIS_FIGURES if name in with_content}
 
 
 def with_final_model(
     trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
 ) -> dict[str, pd.DataFrame]:
-    """Trajectories by condition with what the last model says of them, where effects were added.
+    """Add the predictions of the final model to trajectories, if effects were added.
 
     Parameters
     ----------
     trajectories : dict of DataFrame
-        By condition, as `comparison/` holds them.
+        Tables of `comparison/` by condition.
     diagnosed
-        From `read_diagnosis_tables`.
+        Tables from `read_diagnosis_tables`.
 
     Returns
     -------
     dict of DataFrame
-        With a column `model_after_m`, m, where the table has as many rows as the prediction.
+        With a column `model_after_m`, m, if the table has as many rows as the prediction.
     """
     if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
         return dict(trajectories)
-    later = {
+    final_m = {
         str(trial): part["model_after_m"].to_numpy() for trial, part in diagnosed.trials.groupby("trial", sort=False)
     }
-    whole = {}
+    extended = {}
     for condition, table in trajectories.items():
-        parts = [later.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
+        parts = [final_m.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
         after_m = np.concatenate(parts)
-        whole[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
-    return whole
+        extended[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
+    return extended

@@ -1,7 +1,7 @@
-"""Which fit of a results folder predictions are made from: never silently one whose model its diagnosis refuted.
+"""Choice of the fit from which predictions are made; a model that the diagnosis refuted is not used silently.
 
-A diagnosis that ends with `adequate` hands on the model that it ended with: the one in use, or the one with every
-added effect. After any other verdict there is no model to predict from, unless the person insists.
+If the diagnosis ended with `adequate`, its final model is used: the one in use, or the one with all added effects.
+After any other verdict there is no prediction, unless the user insists with `--anyway`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vinetrack.results.stored_diagnosis import read_diagnosis
 
 @dataclass(frozen=True)
 class ChosenFit:
-    """What a fit file holds, and the lines that must stand above everything predicted from it."""
+    """Content of a fit file, and the heading for everything predicted from it."""
 
     content: Mapping[str, Any]
     heading: tuple[str, ...]
@@ -30,12 +30,12 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
     Parameters
     ----------
     folder : results folder.
-    anyway : whether a refuted model will do.
+    anyway : accept a refuted model.
 
     Returns
     -------
     ChosenFit
-        `heading` names the verdict where it is not `adequate` on the model in use.
+        `heading` states the verdict unless the model in use is `adequate`.
 
     Raises
     ------
@@ -47,21 +47,21 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
     diagnosis = read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return ChosenFit(
-            in_use, (f"! {folder} has no diagnosis: whether this model describes the trials is not known",)
+            in_use, (f"! {folder} has no diagnosis: it is unknown whether this model describes the trials",)
         )
     if diagnosis.verdict == ADEQUATE:
         return ChosenFit(in_use, ())
     final = read_json(results.final_fit) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
     if diagnosis.final_verdict == ADEQUATE and final is not None:
-        return ChosenFit(final, (f"by the model that the diagnosis ended with, {added} added",))
+        return ChosenFit(final, (f"predicted from the final model of the diagnosis, with {added} added",))
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
-        why = (
-            f"the model with {added} is not stored there: run it again"
+        reason = (
+            f"because the fit with {added} is not stored there: run the diagnosis again"
             if diagnosis.final_verdict == ADEQUATE
-            else "the diagnosis refuted the model and ended with none that describes the trials"
+            else "because the diagnosis refuted the model and found none that describes the trials"
         )
-        raise ResultsError(f"{folder}: no prediction, {why}; or predict from it with --anyway. {verdict}")
-    which = f"the model with {added} added" if final is not None else "the model in use"
-    return ChosenFit(final or in_use, (f"! {verdict}", f"! what follows is by {which} all the same"))
+        raise ResultsError(f"{folder}: no prediction, {reason}; or predict from it with --anyway. {verdict}")
+    model = f"the model with {added} added" if final is not None else "the model in use"
+    return ChosenFit(final or in_use, (f"! {verdict}", f"! the following is nevertheless predicted from {model}"))

@@ -1,7 +1,7 @@
-"""The model in use fitted to the tracks of a results folder, held against them, and audited for what it leaves out.
+"""Fit of the model in use to the tracks of a results folder, comparison with them, and audit of neglected effects.
 
-Recordings and tracks go one way: both are read back as `tracks/` holds them. A model that cannot be fitted never stops
-the run: its tables have headers alone, and `fit.json` says why.
+Recordings and tracks are treated alike: both are read from `tracks/`. A model that cannot be fitted does not stop the
+run: its tables have headers only, and `fit.json` states the reason.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ log = logging.getLogger(__name__)
 
 
 def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
-    """Fit the model in use; write `comparison.csv`, `comparison/`, `model_check.csv`, `audit.csv` and `fit.json`.
+    """Fit the model in use to all trials.
 
-    `payload_model.csv` too: final speed against payload as the model has it.
+    Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv`, `audit.csv` and `payload_model.csv`, the
+    modelled final speed against payload.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     folder
         Results folder.
     settings
-        Of the run.
+        Settings of the run.
 
     Returns
     -------
@@ -74,14 +75,18 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     trajectories: dict[str, pd.DataFrame] = {}
     try:
         fit, comparison = _fit_and_compare(experiment, pairs, kinematics, settings)
-        checked, check_message = _damping_check(fit, damping)
-        weighed = _audit(fit, comparison, pairs, kinematics)
+        damping_check, check_message = _damping_check(fit, damping)
+        audited = _audit(fit, comparison, pairs, kinematics)
         curves = payload_curves(fit, settings.final_at_fraction)
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
     else:
-        content = summary_of(fit, weighed.warnings, (check_message,) if check_message else ()).to_json()
-        written = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
+        content = summary_of(fit, audited.warnings, (check_message,) if check_message else ()).to_json()
+        written = {
+            results.comparison: comparison.table,
+            results.model_check: damping_check,
+            results.audit: audited.table,
+        }
         written[results.payload_model] = curves
         trajectories = dict(comparison.trajectories)
     for path, columns in tables.items():
@@ -95,7 +100,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
 def measured_trials(
     experiment: Experiment, results: Results
 ) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
-    """Trials with the tracks and kinematics that the results folder holds; those that failed have none.
+    """Read the tracks and kinematics of all trials that did not fail from a results folder.
 
     Parameters
     ----------
@@ -129,21 +134,21 @@ def measured_trials(
 
 
 def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
-    """A track as `tracks/<trial>.csv` holds it, with the pressure that was measured along with it.
+    """Make a track of `tracks/<trial>.csv`, with the measured pressure.
 
-    The pressure stands with what the user brought: in the track itself, or in a trace beside it.
+    The results do not contain the pressure: it is read from the user's track or pressure trace.
 
     Parameters
     ----------
     trial
-        Names the file of its pressure, if there is one.
+        Row of the sheet, which names those files.
     table : DataFrame
         `tracks/<trial>.csv`.
 
     Returns
     -------
     Track
-        With `pressure_Pa` where it was measured.
+        With `pressure_Pa` if it was measured.
 
     Raises
     ------
@@ -152,28 +157,28 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """
     from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
 
-    slow_m = table.get("lead_position_systematic_m")  # results of 0.1.0 have no such column
+    systematic_m = table.get("lead_position_systematic_m")  # results of 0.1.0 have no such column
     track = Track(
         time_s=table["time_s"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
         lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
         flag=table["flag"].to_numpy(dtype=str),
         edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_systematic_m=None if slow_m is None else slow_m.to_numpy(dtype=float),
+        lead_position_systematic_m=None if systematic_m is None else systematic_m.to_numpy(dtype=float),
     )
     try:
         if trial.pressure_trace is not None:
             return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
-        brought = load_track(trial) if trial.track is not None else None
+        source_track = load_track(trial) if trial.track is not None else None
     except TrackError as error:
         raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
-    if brought is None or brought.pressure_Pa is None:
+    if source_track is None or source_track.pressure_Pa is None:
         return track
-    return replace(track, pressure_Pa=np.interp(track.time_s, brought.time_s, brought.pressure_Pa))
+    return replace(track, pressure_Pa=np.interp(track.time_s, source_track.time_s, source_track.pressure_Pa))
 
 
 def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
-    """Motion as `kinematics/<trial>.csv` holds it; the file does not keep widths and noise."""
+    """Make kinematics of `kinematics/<trial>.csv`, which does not store smoothing windows and noise."""
     names = ("time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "lead_acceleration_m_s2")
     columns = {name: table[name].to_numpy(dtype=float) for name in names}
     return Kinematics(
@@ -197,14 +202,14 @@ def _fit_and_compare(
 
     model = model_of(experiment)
     candidates = candidates_of(model, experiment.settings.candidates, model.user_effects)
-    # A falling body has nothing else to find: its g tries the whole chain, from the recording to the fit.
+    # A model of gravity alone describes a falling body, whose fitted g tests the whole chain from recording to fit.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     fit = initial_fit(model, pairs, candidates, free=free)
     return fit, compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
 
 
 def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
-    """`model_check.csv`, and why it is empty where it is."""
+    """Return the table `model_check.csv`, and the reason if it is empty."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.inference.model_check import CHECK_COLUMNS, check_damping
     from vinetrack.results.folder_layout import empty_table
@@ -231,7 +236,7 @@ def _audit(
 
 
 def model_errors() -> tuple[type[Exception], ...]:
-    """Errors of a model that cannot be fitted to these trials, each a sentence for a person."""
+    """Return the exceptions of a model that cannot be fitted, whose messages are meant for the user."""
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError
     from vinetrack.inference.fit_data import FitError
@@ -240,7 +245,7 @@ def model_errors() -> tuple[type[Exception], ...]:
 
 
 def _reason(error: Exception) -> str:
-    """Why there is no fit, in a sentence; the traceback of what nobody foresaw goes to the log."""
+    """Return the reason why there is no fit; the traceback of an unexpected exception goes to the log."""
     if isinstance(error, model_errors()):
         return str(error)
     log.exception("the model could not be fitted")
@@ -248,7 +253,7 @@ def _reason(error: Exception) -> str:
 
 
 def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame]) -> None:
-    """A file a condition; those of an earlier run go, or a condition that is no more would still be drawn."""
+    """Write one file per condition, after removing those of an earlier run, whose conditions may no longer exist."""
     folder = results.folder / "comparison"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -257,7 +262,7 @@ def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame])
 
 
 def comparison_lines(folder: Path) -> list[str]:
-    """`comparison.csv` as lines for the terminal, aligned, with units; or why there is nothing in it.
+    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty.
 
     Parameters
     ----------

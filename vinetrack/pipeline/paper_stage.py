@@ -1,4 +1,4 @@
-"""Published numbers and figures set beside those of a results folder: `paper.csv`, figures, the tables behind them."""
+"""Comparison of a results folder with the published numbers and figures: `paper.csv`, figures, and their tables."""
 
 from __future__ import annotations
 
@@ -23,25 +23,27 @@ log = logging.getLogger(__name__)
 TABLES_FOR_FIGURES = ("paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures")
 SPEED_TABLES = ("paper_speeds", "paper_speed_curves")
 
-FIG5_NOTE = "B of this vine and the payloads other than 35.6 g are not printed; the paper's points are drawn only"
+FIG5_NOTE = (
+    "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"
+)
 FIG7_VIRTUAL = (
-    "Of the 12 mm vines only that of 100 µm has a printed B. Virtual vines of other walls were grown with B in "
-    "proportion to the wall: their straight line is what was put in"
+    "Of the 12 mm vines only that of 100 µm has a printed B. Virtual vines with other walls were simulated with B "
+    "proportional to the wall: their straight line is an input"
 )
 FIG8_NOTE = (
-    "Alvarez et al. (2025): linear, R² = 0.935, from which p = 0.033 (printed: 0.32). The printed B of Fig. 6 do not "
-    "give speeds that rise evenly"
+    "Alvarez et al. (2025): linear, R² = 0.935, from which p = 0.033 (printed: 0.32). The B printed in Fig. 6 do not "
+    "give linearly increasing speeds"
 )
-FIG8_VIRTUAL = ": virtual vines grown with them test neither figure on the other"
-FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are drawn only"
+FIG8_VIRTUAL = ": virtual vines simulated with them cannot test one figure against the other"
+FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are only plotted"
 
 
 def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
-    """Write `paper.csv` and the tables behind the figures; return `paper.csv` as written.
+    """Write `paper.csv` and the tables of the figures; return `paper.csv` as written.
 
     Parameters
     ----------
-    experiment : its setting `published` asks for the comparison.
+    experiment : experiment whose setting `published` requests the comparison.
     folder : results folder.
 
     Returns
@@ -51,7 +53,7 @@ def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     Raises
     ------
     ResultsError
-        If the experiment does not ask for it, or a stage before this one has not run.
+        If the experiment does not request it, or a stage before this one has not run.
     """
     from vinetrack.paper.arithmetic import computed_rows
     from vinetrack.paper.protocol import protocol_rows
@@ -61,7 +63,7 @@ def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
 
     kind = experiment.settings.published
     if kind is None:
-        raise ResultsError("experiment.yaml has no `published`: write `simulated` or `measured` to ask for it")
+        raise ResultsError("experiment.yaml has no key `published`: set it to `simulated` or `measured`")
     results = Results(folder)
     mark = SIMULATED if kind == "simulated" else MEASURED
     tables = _tables(experiment, results)
@@ -82,7 +84,7 @@ def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
 
 
 def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
-    """Every table behind a figure, by the name of its file."""
+    """Return the tables of all figures, by file name."""
     from vinetrack.paper import comparison
     from vinetrack.paper.departures import departure_table, motion_table, pressure_table
 
@@ -95,11 +97,11 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
     rests = {name: start for name, start in starts.items() if math.isfinite(start.release_s + start.origin_m)}
     kinematics = {
         trial.name: read_result(results.kinematics(trial.name))
-        for of_one in (*positions.values(), *speeds.values())
-        for trial in of_one
+        for replicates in (*positions.values(), *speeds.values())
+        for trial in replicates
         if trial.name in rests
     }
-    payloads_g = sorted({round(1e3 * of_one[0].payload_kg, 6) for of_one in speeds.values()})
+    payloads_g = sorted({round(1e3 * replicates[0].payload_kg, 6) for replicates in speeds.values()})
     return {
         "paper_departures": departure_table(payloads_g),
         "paper_motions": motion_table(),
@@ -112,7 +114,7 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures that stand beside the paper's, from the tables of `compare_with_paper`.
+    """Draw the figures of the comparison from the tables of `compare_with_paper`.
 
     Parameters
     ----------
@@ -128,7 +130,7 @@ def draw_paper(folder: Path, settings: FigureSettings) -> None:
 
 
 def _figure_inputs(results: Results) -> dict[str, tuple[Any, ...]]:
-    """What each figure beside the paper is drawn from, by its name in the registry."""
+    """Return the data of each figure of the comparison, by its name in the registry."""
     from vinetrack.core import published
     from vinetrack.paper.rows import SIMULATED
 
@@ -146,7 +148,7 @@ def _figure_inputs(results: Results) -> dict[str, tuple[Any, ...]]:
             tables["paper_speeds"],
             tables["paper_speed_curves"],
             FIG5_NOTE,
-            "Eq. (2), B in proportion to the wall",
+            "Eq. (2), B proportional to the wall",
         ),
         "paper_fig6": (read_result(results.points), damping, published.DAMPING_B, published.EXPONENT),
         "paper_fig7": (scaling, printed_B, fig7),
@@ -162,7 +164,7 @@ def _near(families: list[dict[str, Any]], pressure_kPa: float) -> list[dict[str,
 
 
 def _printed_B(damping: dict[str, Any]) -> dict[str, float]:
-    """The printed B of those of our vines that are in Table I, by our names."""
+    """Return the printed B of those vines that are in Table I, by the name of the vine here."""
     from vinetrack.core import published
 
     printed = {}

@@ -1,4 +1,4 @@
-"""The command `vinetrack power`: what the trials of a sheet, an experiment or a results folder can see."""
+"""The command `vinetrack power`: statistical power of the trials of a sheet, an experiment or a results folder."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
 DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0
-"""Noise of a position and frame rate where nothing states them. Chosen: the defaults of `vinetrack design campaign`; at
-half the noise, effects that noise hides are seen at half the size, those that scatter hides are not."""
+"""Default noise of a position, and default frame rate. Chosen: those of `vinetrack design campaign`. At half the noise,
+effects limited by noise are detected at half the size; those limited by between-trial scatter are not."""
 
 
 @dataclass(frozen=True)
 class PowerRequest:
-    """What stands on the command line; NaN and None where nothing is said. Spreads are relative.
+    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
 
-    `effects` are names, or `name=size` in the unit of the parameter; with `simulate`, campaigns are made with them.
-    With `reach`, a probability, the fewest further trials are looked for that find each of them so often.
-    `calibrate` null campaigns hold the thresholds of the first model's tests to account.
+    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
+    with each. `reach` is the probability with which further trials shall detect each effect; the fewest such trials are
+    determined. `calibrate` is the number of simulated null campaigns against which the tests of the first model are
+    calibrated.
     """
 
     target: Path
@@ -60,7 +61,7 @@ class PowerRequest:
 
 @dataclass(frozen=True)
 class _Campaign:
-    """The power of a campaign by linear theory, the design to simulate it from, and what further trials could be."""
+    """The power of a campaign by linear theory, its design for simulations, and constraints on further trials."""
 
     power: Power
     design: CampaignDesign
@@ -68,11 +69,11 @@ class _Campaign:
 
 
 def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Power:
-    """Work out what the trials can see, by linear theory and, where asked for, by complete diagnoses.
+    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns.
 
     Parameters
     ----------
-    asked : what stands on the command line.
+    asked : options of the command.
     given : optional
         A fit, or pairs of trial and track, in place of the target.
 
@@ -87,7 +88,7 @@ def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Po
     """
     from vinetrack.core.terminal import waiting
 
-    with waiting("working out what the trials can see"):
+    with waiting("calculating the power of the trials"):
         campaign = _campaign(asked) if given is None else _campaign_in_memory(asked, given)
     names = [text.partition("=")[0] for text in asked.effects]
     power = campaign.power
@@ -104,32 +105,32 @@ def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Po
 
 
 def _further_trials(asked: PowerRequest, campaign: _Campaign) -> Iterator[FurtherTrials]:
-    """The fewest further trials for every effect that has a size."""
+    """Determine the fewest further trials that detect each requested effect of given size."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.further_trials import further_trials
 
     for text in asked.effects:
         name, _, size = text.partition("=")
         if not size or name in campaign.power.not_testable:
-            remedy = "write the size to be found, such as leak=0.5" if not size else campaign.power.not_testable[name]
-            words = "needs a size" if not size else "cannot be seen with the columns of these trials"
-            raise ExperimentError([Problem(message=words, column="--effect", value=text, remedy=remedy)])
+            remedy = "write the size to detect, such as leak=0.5" if not size else campaign.power.not_testable[name]
+            message = "needs a size" if not size else "cannot be tested with the columns of these trials"
+            raise ExperimentError([Problem(message=message, column="--effect", value=text, remedy=remedy)])
         value = _size_of(text, campaign.power[name])
-        with waiting(f"looking for trials that show {name}"):
+        with waiting(f"searching for trials that detect {name}"):
             yield further_trials(campaign.design, campaign.power[name], value, asked.reach, campaign.limits)
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:
-    """Return the rows of the sheet for the further trials, as cells by column.
+    """Return the rows of the sheet for the further trials.
 
     Parameters
     ----------
-    power : with further trials.
+    power : power with further trials.
 
     Returns
     -------
     list of dict
-        One a trial; of several effects, one after the other.
+        Cells by column, one row per trial; several effects in sequence.
     """
     return [
         {"trial": f"{plan.effect}_{k}" if len(power.further) > 1 else added.trial.name, **sheet_cells(added.trial)}
@@ -139,20 +140,20 @@ def sheet_rows(power: Power) -> list[dict[str, object]]:
 
 
 def _refuse_effect(name: str, power: Power) -> None:
-    """Say that no such effect was asked about."""
+    """Raise an ExperimentError: the effect is in the model already, or is not a candidate."""
     import difflib
 
-    known = [*(entry.effect for entry in power.effects), *power.not_testable]
-    close = difflib.get_close_matches(name, known, 1, 0.6)
-    remedy = f"did you mean {close[0]}?" if close else f"there are {', '.join(sorted(known))}"
+    candidates = [*(entry.effect for entry in power.effects), *power.not_testable]
+    close = difflib.get_close_matches(name, candidates, 1, 0.6)
+    remedy = f"did you mean {close[0]}?" if close else f"the candidates are {', '.join(sorted(candidates))}"
     in_model = name in power.model
-    words = "is in the model already" if in_model else "is not a candidate for these trials"
-    raise ExperimentError([Problem(message=words, column="--effect", value=name, remedy=remedy)])
+    message = "is in the model already" if in_model else "is not a candidate for these trials"
+    raise ExperimentError([Problem(message=message, column="--effect", value=name, remedy=remedy)])
 
 
 @dataclass(frozen=True)
 class _MeasuredTrials:
-    """Trials that were measured; `names` are the effects of the model, `added` those that a diagnosis put into it."""
+    """Measured trials; `names` are the effects of the model, `added` those of them that a diagnosis added."""
 
     pairs: Sequence[tuple[Trial, Track]]
     names: tuple[str, ...]
@@ -163,7 +164,7 @@ class _MeasuredTrials:
 
 
 def _campaign(asked: PowerRequest) -> _Campaign:
-    """Of trials that were measured, where there are any; else of the sheet."""
+    """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
     from vinetrack.experiment.planned import planned_sheet
 
     measured = _measured_trials(asked)
@@ -173,7 +174,7 @@ def _campaign(asked: PowerRequest) -> _Campaign:
 
 
 def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
-    """The trials of a results folder or of an experiment with tracks; None of a sheet that nobody has filmed."""
+    """Read the trials of a results folder or of an experiment with tracks; None for a target without measurements."""
     from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
@@ -185,7 +186,7 @@ def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
     try:
         read = read_experiment(asked.target)
     except ExperimentError:
-        return None  # a sheet whose recordings do not exist yet is judged as a plan
+        return None  # recordings that do not exist yet: a plan
     if all(trial.track is None for trial in read.trials):
         return None
     settings = read.settings
@@ -195,7 +196,7 @@ def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
 
 
 def _campaign_in_memory(asked: PowerRequest, given: Fit | Pairs) -> _Campaign:
-    """Of trials in memory: as they were fitted, or fitted with the base model."""
+    """Return the campaign of a fit, or of trials in memory with the base model."""
     from vinetrack.inference.fit_result import Fit
 
     if isinstance(given, Fit):
@@ -215,15 +216,15 @@ def _trials_of_results(asked: PowerRequest) -> _MeasuredTrials:
     experiment = read_source_experiment(asked.target, asked.experiment)
     settings = experiment.settings
     diagnosis = read_diagnosis(results)
-    named = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
-    added = tuple(name for name in named if name not in settings.model)
+    accepted = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+    added = tuple(name for name in accepted if name not in settings.model)
     user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
     pairs = measured_trials(experiment, results)[0]
     return _MeasuredTrials(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
 
 
 def _measured_campaign(asked: PowerRequest, measured: _MeasuredTrials) -> _Campaign:
-    """Trials that were measured: noise and scatter from the fit, but for what is stated."""
+    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit import fit
@@ -273,7 +274,7 @@ def _input_rows(
 
 
 def _planned_campaign(asked: PowerRequest, planned: PlannedTrials) -> _Campaign:
-    """Trials that nobody has filmed: B, n and the yield pressure stated, printed or from scaling laws."""
+    """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     from vinetrack.effects import own_effects
     from vinetrack.inference.parameters import DAMPING, EXPONENT
     from vinetrack.planning.input_sources import StatedValues, predictive_inputs
@@ -324,17 +325,17 @@ def _fps_origin(asked: PowerRequest, trials: Sequence[Trial]) -> str:
 
 
 def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
-    """The trial with the yield pressure that its vine is taken to have, and the usual error of one."""
-    from vinetrack.experiment.schema import COLUMNS
+    """Return the trial with the assumed yield pressure of its vine and the default error, if it states none."""
+    from vinetrack.experiment.sheet import YIELD_SIGMA_KPA
 
     if math.isfinite(trial.yield_pressure_Pa):
         return trial
-    usual_Pa = 1e3 * float(COLUMNS["yield_pressure_sigma_kPa"].default)
-    return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=usual_Pa)
+    default_Pa = 1e3 * YIELD_SIGMA_KPA
+    return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=default_Pa)
 
 
 def _simulated_sizes(asked: PowerRequest, campaign: _Campaign) -> list[tuple[str, float, float]]:
-    """Effect, value in SI and promised rate of every kind of campaign that is simulated, the one with nothing first."""
+    """Return effect, size in SI and predicted rate of every kind of campaign to simulate, the null campaign first."""
     power = campaign.power
     wanted = [("", math.nan, power.false_alarm_rate)]
     for text in asked.effects:
@@ -348,7 +349,7 @@ def _simulated_sizes(asked: PowerRequest, campaign: _Campaign) -> list[tuple[str
 
 
 def _size_of(text: str, entry: EffectPower) -> float:
-    """The size in `name=size`, SI."""
+    """Read the size in `name=size`; return it in SI."""
     from vinetrack.core.units import display_unit
 
     unit, factor = display_unit(entry.unit)
@@ -361,19 +362,19 @@ def _size_of(text: str, entry: EffectPower) -> float:
 
 
 def _simulated_rates(asked: PowerRequest, campaign: _Campaign) -> Iterator[SimulatedRates]:
-    """Rates of complete diagnoses; those kept by an earlier run are not made again."""
+    """Simulate and diagnose campaigns; yield the rate of each kind. Answers of an earlier run are reused."""
     wanted = _simulated_sizes(asked, campaign)
     how = Simulation(asked.simulate, asked.first_seed, asked.jobs, asked.answers or _answers_file(asked.target))
     design = replace(
         campaign.design, other_values={entry.effect: entry.other_values for entry in campaign.power.effects}
     )
     answers = simulate_answers(design, [(effect, value) for effect, value, _ in wanted], how)
-    for effect, value, promised in wanted:
-        yield rates_of([answers[effect, size_key(value), seed] for seed in how.seeds], promised)
+    for effect, value, predicted_rate in wanted:
+        yield rates_of([answers[effect, size_key(value), seed] for seed in how.seeds], predicted_rate)
 
 
 def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
-    """The tests of the first model of measured trials, held against null campaigns of their design."""
+    """Calibrate the tests of the first model of measured trials with simulated null campaigns of the same design."""
     from vinetrack.diagnosis.candidates import testable
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
     from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
@@ -405,7 +406,7 @@ def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCal
 
 
 def _answers_file(target: Path) -> Path:
-    """Where answers are kept: in a results folder, else in the working directory under the name of the target."""
+    """Return the file of simulated answers: in the results folder, else in the working directory."""
     if (target / PROVENANCE).exists():
         return target / "power_answers.csv"
     name = target.resolve().name if target.is_dir() else target.stem

@@ -1,4 +1,4 @@
-"""The command `vinetrack predict`: what vines not yet built will do, as lines, a figure, a CSV."""
+"""The command `vinetrack predict`: predictions of new vines as lines, figure, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from vinetrack.planning.prediction import Quantity, VinePrediction
 
 SMALL_FORCE_N = 0.01
-"""Largest force below which forces are shown in mN, N. Chosen: three digits then need no leading zeros."""
+"""Forces are shown in mN if all are below this, N. Chosen: three digits then need no leading zeros."""
 
 SMALLEST_LISTED_CHANGE = 0.005
-"""Relative change of the final speed below which an effect that is left out is not listed. Chosen: half a per cent is a
-tenth of what a good measurement of speed resolves. At half the list grows by effects without weight, at twice some of
-one per cent are missing."""
+"""Smallest relative change of the final speed for which a neglected effect is listed. Chosen: 0.5 % is a tenth of the
+resolution of a good measurement of speed. At half insignificant effects are listed; at twice some of 1 % are
+missing."""
 
 
 @dataclass(frozen=True)
 class ConditionPrediction:
-    """One condition: its prediction, what speaks against it, and what effects left out would change."""
+    """Prediction of one condition, its design checks (`hazards`), and the influence of neglected effects."""
 
     prediction: VinePrediction
     hazards: tuple[str, ...]
@@ -59,35 +59,36 @@ def predict_conditions(
     csv: Path | None = None,
     json: Path | None = None,
 ) -> list[str]:
-    """Lines for the terminal; figure, curves and everything said are written where asked for.
+    """Predict all conditions; write figure, curves and JSON if requested.
 
     Parameters
     ----------
     asked
-        Numbers, sheet, fit and effects of the command line.
+        Inputs of the prediction.
     samples, seed : int
-        Draws, and the seed of the random numbers.
+        Number of draws, and seed of the random numbers.
     at_fraction : float
-        y/L at which a bare vine's final speed is taken.
+        y/L at which a bare vine's final speed is evaluated.
     figure, csv, json : Path, optional
-        Where the figure, the curves and all numbers are written.
+        Output files for the figure, the curves and all numbers.
 
     Returns
     -------
     list of str
+        Lines for the terminal.
 
     Raises
     ------
     ExperimentError, ResultsError, EffectError
-        If something asked for will not do; see `read_basis`.
+        If an input is not allowed; see `read_basis`.
     """
     import pandas as pd
 
     check_figure(figure)
-    ground = read_basis(asked)
-    entries = _predict_all(ground, samples, seed, at_fraction)
+    basis = read_basis(asked)
+    entries = _predict_all(basis, samples, seed, at_fraction)
     lines = [*_condition_lines(entries[0])] if len(entries) == 1 else [*_table_lines(entries)]
-    lines += [f"! {words}" for words in warnings_of(ground)]
+    lines += [f"! {warning}" for warning in warnings_of(basis)]
     if figure is not None:
         from vinetrack.figures.prediction_figures import draw_predictions
 
@@ -98,11 +99,11 @@ def predict_conditions(
         lines.append(f"Curves: {csv}")
     if json is not None:
         write_json(json, [_json_entry(entry) for entry in entries])
-        lines.append(f"Everything: {json}")
+        lines.append(f"All numbers: {json}")
     return [] if json == STANDARD_OUTPUT else lines
 
 
-def _predict_all(ground: PredictionBasis, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
+def _predict_all(basis: PredictionBasis, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
     """Predict every condition.
 
     Raises
@@ -118,7 +119,7 @@ def _predict_all(ground: PredictionBasis, samples: int, seed: int, at_fraction: 
 
     entries = []
     try:
-        for inputs in progress(inputs_of(ground), "predicting", unit="condition"):
+        for inputs in progress(inputs_of(basis), "predicting", unit="condition"):
             prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
             entries.append(ConditionPrediction(prediction, design_checks(prediction), neglected(inputs, at_fraction)))
     except SimulationError as error:
@@ -129,27 +130,27 @@ def _predict_all(ground: PredictionBasis, samples: int, seed: int, at_fraction: 
 
 
 def _condition_lines(entry: ConditionPrediction) -> Iterator[str]:
-    """Everything about one condition."""
+    """Yield all lines about a single condition."""
     from vinetrack.core.terminal import table
 
     prediction = entry.prediction
     inputs = prediction.inputs
     yield f"{describe_trial(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
-    yield from table(input_rows(inputs.bands()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<")
+    yield from table(input_rows(inputs.bands()), ("input", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     rows = [_quantity_row(quantity) for quantity in prediction.quantities]
-    yield from table(rows, ("what comes out", "at y/L", "median", "90 % band", "unit"), align="<<><<")
+    yield from table(rows, ("prediction", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
     yield from table([_share_row(share.name, share.low, share.high, share.words) for share in prediction.shares], head)
     yield from _left_out(entry)
     yield ""
-    yield from (f"! {words}" for words in entry.hazards)
+    yield from (f"! {warning}" for warning in entry.hazards)
 
 
 def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
-    """Name, place, median, band and unit; stresses in MPa, and forces in mN where all of them are that small."""
+    """Return name, place, median, band and unit; stresses are in MPa, and forces in mN if all are small."""
     place = "" if math.isnan(quantity.y_over_L) else f"{quantity.y_over_L:g}"
     values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
     if unit == "Pa":
@@ -167,7 +168,7 @@ def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str
 
 
 def _left_out(entry: ConditionPrediction) -> Iterator[str]:
-    """Effects that no vine is free of and the model leaves out, with what they would make of the final speed."""
+    """Yield a table of neglected effects that every vine has, with their influence on the final speed."""
     from vinetrack.core.terminal import table
 
     rows = [
@@ -182,11 +183,11 @@ def _left_out(entry: ConditionPrediction) -> Iterator[str]:
     ]
     if rows:
         yield ""
-        yield from table(rows, ("left out of the model", "if it were", "the final speed went", ""))
+        yield from table(rows, ("not in the model", "at the size", "final speed", "change"))
 
 
 def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
-    """A row a condition."""
+    """Yield a table with one row per condition."""
     from vinetrack.core.terminal import table
     from vinetrack.planning.prediction import TIME
 
@@ -207,8 +208,8 @@ def _table_lines(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
         yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
     yield ""
     yield "uncertainties included:"
-    words = dict.fromkeys((share.name, share.words) for entry in entries for share in entry.prediction.shares)
-    yield from (f"  {name}: {text}" for name, text in words)
+    sources = dict.fromkeys((share.name, share.words) for entry in entries for share in entry.prediction.shares)
+    yield from (f"  {name}: {text}" for name, text in sources)
     yield ""
     hazards = dict.fromkeys(text for entry in entries for text in entry.hazards)
     for text in hazards:
@@ -229,7 +230,7 @@ def _picture(prediction: VinePrediction) -> PredictionPicture:
 
 
 def _json_entry(entry: ConditionPrediction) -> dict[str, Any]:
-    """One condition as JSON holds it, SI."""
+    """Return one condition as JSON content, SI."""
     prediction = entry.prediction
     return {
         "condition": prediction.inputs.trial.condition,

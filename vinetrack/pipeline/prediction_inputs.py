@@ -1,4 +1,4 @@
-"""What a person asks about a vine not yet built, read: options or a sheet, a fit, effects; words for the answers."""
+"""Inputs of the commands about new vines: options or a sheet, a fit, effects; and formatting of their output."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ NEVER = "never"
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """What stands on the command line. `cells` are texts by column of the sheet, those that were given.
+    """Options of a command about new vines; NaN and None for those not given.
 
-    `B_error` and `spreads` are relative. NaN and None where nothing is said. `anyway` allows a fit whose model was
-    refuted.
+    `cells` are texts by column of the sheet, for the columns that were given. `B_error` and the between-trial standard
+    deviations `spreads` are relative. `anyway` allows a fit whose model was refuted.
     """
 
     cells: Mapping[str, str] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class PredictionBasis:
-    """What predictive inputs are made from: planned trials, stated values, and a fit where there is one."""
+    """What predictive inputs are made from: planned trials, stated values, and a fit if there is one."""
 
     planned: PlannedTrials
     stated: StatedValues
@@ -63,13 +63,13 @@ class PredictionBasis:
 
 
 def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
-    """Read the sheet or the options, the fit, and the effects that are asked for.
+    """Read the sheet or the options, the fit, and the requested effects.
 
     Parameters
     ----------
-    asked : what stands on the command line.
+    asked : options of the command.
     needed : sequence of str, optional
-        Columns that must be given; by default all that a prediction needs.
+        Required columns; by default those that a prediction needs.
 
     Returns
     -------
@@ -78,9 +78,9 @@ def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) ->
     Raises
     ------
     ExperimentError
-        If the sheet or an option will not do.
+        If the sheet or an option has an error.
     ResultsError
-        If there is no fit where there should be one.
+        If the results folder has no usable fit.
     EffectError
         If an effect is unknown or has no such size.
     """
@@ -130,29 +130,29 @@ def _refuse_beside_sheet(asked: PredictionRequest) -> None:
 
 
 def _effects_of_sheet(planned: PlannedTrials) -> Mapping[str, Effect]:
-    """The user's own effects of the sheet's experiment."""
+    """Return the user's own effects of the experiment to which the sheet belongs."""
     from vinetrack.pipeline.effects_stage import effects_of
 
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
 def fit_heading(asked: PredictionRequest) -> list[str]:
-    """What must stand above everything predicted from a fit: the verdict on its model.
+    """Return the heading for everything predicted from a fit: the verdict on its model.
 
     Parameters
     ----------
-    asked : numbers, sheet, fit and effects of the command line.
+    asked : options of the command.
 
     Returns
     -------
     list of str
-        Empty without a fit, and where its model is adequate.
+        Empty without a fit, and if its model is adequate.
     """
     return [] if asked.results is None else list(choose_fit(asked.results, asked.anyway).heading)
 
 
 def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Effect]]:
-    """The fit of a results folder to predict from, and the own effects of the experiment that it belongs to.
+    """Read the fit of a results folder, and the user's own effects if its model contains any.
 
     Raises
     ------
@@ -169,25 +169,25 @@ def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Eff
         fit = fit_numbers(choose_fit(results, anyway).content, results.as_posix())
     except FitError as error:
         raise ResultsError(str(error)) from None
-    lacking = [name for name in fit.model if name not in catalogue()]
-    if not lacking:
+    own_names = [name for name in fit.model if name not in catalogue()]
+    if not own_names:
         return fit, {}
     experiment = Path(str(read_json(paths.provenance).get("experiment", "")))
     user_effects = effects_of(experiment) if experiment.is_dir() else {}
-    if not set(lacking) <= set(user_effects):
+    if not set(own_names) <= set(user_effects):
         raise ResultsError(
-            f"{results} was fitted with {', '.join(lacking)}, an effect of its experiment's own, which is no longer in "
-            f"{experiment}: put the folder back, or fit again"
+            f"{results} was fitted with {', '.join(own_names)}, an effect of its experiment, which is no longer "
+            f"in {experiment}: put the folder back, or fit again"
         )
     return fit, user_effects
 
 
-def inputs_of(ground: PredictionBasis) -> list[PredictiveInputs]:
-    """Predictive inputs of every trial.
+def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
+    """Return the predictive inputs of every trial.
 
     Parameters
     ----------
-    ground : from `read_basis`.
+    basis : result of `read_basis`.
 
     Returns
     -------
@@ -203,17 +203,17 @@ def inputs_of(ground: PredictionBasis) -> list[PredictiveInputs]:
     from vinetrack.planning.input_sources import predictive_inputs
 
     try:
-        return [predictive_inputs(trial, ground.stated, ground.fit) for trial in ground.planned.trials]
+        return [predictive_inputs(trial, basis.stated, basis.fit) for trial in basis.planned.trials]
     except FitError as error:
         raise ResultsError(str(error)) from None
 
 
 def name_missing_option(error: Exception) -> Exception:
-    """What an effect needs, said of the option or the column that is missing; any other error as it is.
+    """Convert an error about a missing input of an effect to one that names the option; return others unchanged.
 
     Parameters
     ----------
-    error : of an effect.
+    error : error raised by an effect.
 
     Returns
     -------
@@ -222,28 +222,28 @@ def name_missing_option(error: Exception) -> Exception:
     match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
     if match is None:
         return error
-    words = f"is blank, and the effect {match[1]} needs it"
+    message = f"is blank, and the effect {match[1]} needs it"
     return ExperimentError(
-        [Problem(message=words, column=match[2], remedy=f"give it, as {option(match[2])} or in the sheet")]
+        [Problem(message=message, column=match[2], remedy=f"give it as {option(match[2])} or in the sheet")]
     )
 
 
-def warnings_of(ground: PredictionBasis) -> list[str]:
-    """What is legal in the sheet or the options, but hardly meant.
+def warnings_of(basis: PredictionBasis) -> list[str]:
+    """Return warnings about values of the sheet or the options that are allowed but implausible.
 
     Parameters
     ----------
-    ground : from `read_basis`.
+    basis : result of `read_basis`.
 
     Returns
     -------
     list of str
     """
-    return [str(problem) for problem in ground.planned.problems]
+    return [str(problem) for problem in basis.planned.problems]
 
 
 def format_volume(volume_m3: float) -> str:
-    """A volume in litres, or in millilitres below 0.1 L.
+    """Return a volume in litres, or in millilitres below 0.1 L.
 
     Parameters
     ----------
@@ -263,11 +263,11 @@ def format_volume(volume_m3: float) -> str:
 
 
 def describe_trial(trial: Trial) -> str:
-    """A trial as a person would write it.
+    """Describe a trial in one line.
 
     Parameters
     ----------
-    trial : what is described.
+    trial : the trial.
 
     Returns
     -------
@@ -282,15 +282,15 @@ def describe_trial(trial: Trial) -> str:
     size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
     payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
     degrees = math.degrees(trial.growth_angle_rad)
-    named = {0: "straight down", 90: "horizontally", 180: "straight up"}
-    way = named.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
+    names = {0: "straight down", 90: "horizontally", 180: "straight up"}
+    direction = names.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
     rig = "" if math.isnan(trial.chamber_m3) else f", chamber {format_volume(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
-    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {way}{rig}"
+    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {direction}{rig}"
 
 
 def display_value(value: float, unit: str, digits: int = 3) -> str:
-    """An SI value in the unit people use, to so many digits; a time that never comes is `never`.
+    """Format an SI value in its display unit; infinity, a time that is never reached, is `never`.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ def display_value(value: float, unit: str, digits: int = 3) -> str:
 
 
 def display_unit_name(unit: str) -> str:
-    """The unit that `shown` uses.
+    """Return the unit that `display_value` uses.
 
     Parameters
     ----------
@@ -326,7 +326,7 @@ def display_unit_name(unit: str) -> str:
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
-    """Rows of a table: symbol, median, 90 % band, unit, where from; constants of nature are left out.
+    """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out.
 
     Parameters
     ----------
@@ -342,27 +342,27 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
         if entry.origin == "constant":
             continue
         exact = entry.low == entry.high
-        spread = "–" if exact else f"{display_value(entry.low, entry.unit)} to {display_value(entry.high, entry.unit)}"
+        band = "–" if exact else f"{display_value(entry.low, entry.unit)} to {display_value(entry.high, entry.unit)}"
         rows.append(
-            (entry.symbol, display_value(entry.median, entry.unit), spread, display_unit_name(entry.unit), entry.origin)
+            (entry.symbol, display_value(entry.median, entry.unit), band, display_unit_name(entry.unit), entry.origin)
         )
     return rows
 
 
 def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
-    """Write a figure in the form its ending names.
+    """Write a figure in the format that the suffix names.
 
     Parameters
     ----------
     fig : matplotlib figure.
-    path : the ending names the format.
+    path : output file.
     dpi : float
         Resolution of a bitmap.
 
     Raises
     ------
     ExperimentError
-        If it names none.
+        If the suffix does not name a format.
     """
     from vinetrack.figures.style import render
 
@@ -372,17 +372,17 @@ def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
 
 
 def check_figure(path: Path | None) -> None:
-    """Refuse a picture whose ending names no form, before anything is computed.
+    """Check the suffix of an output figure before anything is computed.
 
     Parameters
     ----------
     path : Path or None
-        Where a figure is to be written.
+        Output file for a figure.
 
     Raises
     ------
     ExperimentError
-        If the ending names no format.
+        If the suffix does not name a format.
     """
     if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
         remedy = f"end it in one of {', '.join(FIGURE_FORMATS)}"

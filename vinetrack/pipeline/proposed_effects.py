@@ -1,4 +1,4 @@
-"""Laws and tables that mend a model, written beside the experiment as effects of the user's own."""
+"""Proposed effects: a force law or table that improves the model, written as an effect file of the user's own."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class WrittenProposal:
-    """Lines for the terminal, and the effect files that were written, the law first."""
+    """Lines for the terminal, and the effect files written, the law first."""
 
     lines: tuple[str, ...]
     files: tuple[Path, ...]
 
 
 def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
-    """Write the law that mends what no effect of the catalogue does, and the learned force where no law does.
+    """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table.
 
     Parameters
     ----------
     experiment : sheet and settings.
-    folder : results folder, diagnosed.
-    to : where the file goes; without it, into the experiment's folder.
+    folder : results folder with a diagnosis.
+    to : output file; None for a file in the experiment folder.
     report : callable
-        Called with a sentence at each step.
+        Called with a description of each step.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     ResultsError
         If a stage before this one has not run, or the diagnosis did not end as `unexplained`.
     FitError
-        If the model cannot be followed.
+        If the model cannot be simulated.
     """
     from vinetrack.core.tables import write_text
     from vinetrack.diagnosis.learned_effect import table_text
@@ -57,8 +57,8 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
         raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         raise ResultsError(
-            f"{folder}: its verdict is `{diagnosis.final_verdict}`. A law of its own is proposed only for what no"
-            " effect of the catalogue explains (`unexplained`); `vinetrack diagnose` prints what was found."
+            f"{folder}: its verdict is `{diagnosis.final_verdict}`. A new law is proposed only for a misfit that no"
+            " effect of the catalogue explains (`unexplained`); `vinetrack diagnose` prints the diagnosis."
         )
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
@@ -66,18 +66,18 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     proposal = propose(model, pairs, report)
     learned = (diagnosis.missing_force or {}).get("learned") or {}
     lines = [*([learned["sentence"]] if learned else []), *proposal.sentences()]
-    misses = (
-        f"From {len(proposal.before.trials)} trials of {experiment.name}, where {' + '.join(model.names)} misses"
-        f" left-out conditions by {1e3 * proposal.rms_left_out_m:.2f} mm, and with this"
+    origin = (
+        f"From {len(proposal.before.trials)} trials of {experiment.name}. RMS error in left-out conditions:"
+        f" {' + '.join(model.names)} {1e3 * proposal.rms_left_out_m:.2f} mm; with this"
     )
     files = []
     if proposal.tied:
         best = proposal.tied[0]
-        remark = f"{misses} law by {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
+        remark = f"{origin} law {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
         files.append((best.effect.path.name, effect_text(best.law, remark)))
     if proposal.table is not None:
         table = proposal.table
-        remark = f"{misses} table, which was learned from them all, by {1e3 * table.rms_left_out_m:.2f} mm."
+        remark = f"{origin} table, which was learned from all of them, {1e3 * table.rms_left_out_m:.2f} mm."
         files.append((table.effect.path.name, table_text(table.learned, remark)))
     paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
     if to is not None and paths:
@@ -88,7 +88,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     for path, (_, text) in zip(paths, files, strict=True):
         write_text(path, text)
         remember(path)
-        lines.append(f"Written to {path}. Read it; `vinetrack add {path} {folder}` fits it.")
+        lines.append(f"Written to {path}. Read it, then fit it with `vinetrack add {path} {folder}`.")
     if files:
         settings = experiment.folder / "experiment.yaml"
         lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")

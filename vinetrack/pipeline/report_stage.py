@@ -1,4 +1,4 @@
-"""The tables and pictures of a results folder put together as one page."""
+"""The report of a results folder: one page with its tables and figures."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ OF_INITIAL_MODEL = {
     **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _SHOWS_REFUTED),
     **dict.fromkeys(("model_comparison", "before_after"), _DASHED_REFUTED),
 }
-"""What the caption of a figure adds where the model in it is refuted."""
+"""Addition to the caption of a figure that shows the initial model, if that is refuted."""
 
 MAX_CURVE_ROWS = 6000
-"""Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
+"""Largest number of rows of the downloadable curves. Chosen: about 300 kB of the page."""
 
 
 def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
@@ -69,7 +69,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
 
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
-    """Everything that a results folder has for the page.
+    """Collect the content of the report from a results folder.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def _paper_section(results: Results) -> ReportSection:
 
 
 def _drawn(results: Results) -> list[RegisteredFigure]:
-    """Figures of the whole experiment that had content."""
+    """Return the figures of the whole experiment that were drawn."""
     names = set(read_json(results.figure_list)["figures"])
     return [figure for name, figure in CAMPAIGN_FIGURES.items() if name in names and _svg(results, figure).exists()]
 
@@ -152,7 +152,7 @@ def _svg(results: Results, figure: RegisteredFigure) -> Path:
 
 
 def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> ReportFigure:
-    """A figure for the page with the file of its numbers, or with a table of its own."""
+    """Return a figure for the page, with the file of its data, or with `own_data`."""
     from vinetrack.report.build import ReportFigure, figure_caption
 
     data = (results.folder / figure.data).read_text(encoding="utf-8") if figure.data else own_data
@@ -165,12 +165,12 @@ def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> R
 
 
 def _as_csv(table: pd.DataFrame) -> str:
-    """A table to download, with five digits, which is finer than any number of a figure is drawn."""
+    """Return a table to download as CSV with five digits, more than a figure can show."""
     return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
 
 
 def _curves(results: Results) -> pd.DataFrame:
-    """Measured and modelled growth of all trials, thinned evenly."""
+    """Return measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
     import pandas as pd
 
     conditions = read_result(results.comparison)["condition"]
@@ -182,27 +182,27 @@ def _curves(results: Results) -> pd.DataFrame:
 
 
 def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> Clip | None:
-    """The clip that plays in the page: of the condition where the model fails most, else the first there is."""
+    """Return the clip for the page: of the condition that the model predicts worst if it has one, else the first."""
     from vinetrack.report.build import Clip
 
-    there = trials[[results.overlay(name).exists() for name in trials["trial"]]]
-    if not len(there):
+    with_clip = trials[[results.overlay(name).exists() for name in trials["trial"]]]
+    if not len(with_clip):
         return None
     worst = diagnosed.worst if diagnosed is not None else ""
-    chosen = there[there["condition"] == worst] if (there["condition"] == worst).any() else there
+    chosen = with_clip[with_clip["condition"] == worst] if (with_clip["condition"] == worst).any() else with_clip
     name = str(chosen["trial"].iloc[0])
-    where = " The condition is the one that the model predicts worst." if len(chosen) < len(there) else ""
+    note = " The condition is the one that the model predicts worst." if len(chosen) < len(with_clip) else ""
     edges = "the tracked edge (yellow)"
     if diagnosed is not None:
         edges += ", that of the initial model (vermillion)"
         edges += f", and that with {diagnosed.added} (blue)" if diagnosed.added else ""
-    caption = f"The recording, slowed down, with {edges}.{where}"
+    caption = f"The recording, slowed down, with {edges}.{note}"
     path = results.overlay(name)
     return Clip(name, path.read_bytes(), caption, _poster(path))
 
 
 def _poster(path: Path) -> bytes:
-    """A frame two thirds into a clip, where models have come apart, as WebP; nothing of one that cannot be read."""
+    """Return a frame two thirds into a clip, where models differ visibly, as WebP; empty if it cannot be read."""
     import io
 
     import av

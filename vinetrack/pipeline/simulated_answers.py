@@ -1,6 +1,6 @@
-"""Campaigns simulated one after the other or side by side, their answers kept in a file as they come.
+"""Simulation of campaigns in one or several processes, with each answer stored in a file when it is ready.
 
-Begun again, only what is not in the file is simulated; answers about another design are passed over.
+When a simulation is resumed, only missing answers are simulated; stored answers of other designs are ignored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ P_VALUE_COLUMNS = ("design", "seed", *TESTS, "failed")
 
 @dataclass(frozen=True)
 class Simulation:
-    """How campaigns are simulated: how many, from which seed on, in how many processes, and where answers are kept."""
+    """Settings of a simulation: number of campaigns, first seed, number of processes, and file of answers."""
 
     campaigns: int
     first_seed: int
@@ -40,19 +40,19 @@ class Simulation:
 def simulate_answers(
     design: CampaignDesign, wanted: Sequence[tuple[str, float]], how: Simulation
 ) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
-    """Diagnose simulated campaigns from beginning to end.
+    """Simulate campaigns and diagnose each completely.
 
     Parameters
     ----------
-    design : of the campaigns.
+    design : design of the campaigns.
     wanted : sequence of (str, float)
-        Effect, blank for none, and value of each kind of campaign, SI.
-    how : campaigns of each kind, seeds, processes and file.
+        Effect (blank for none) and its size, SI, of each kind of campaign.
+    how : settings of the simulation.
 
     Returns
     -------
     dict
-        Answers by effect, value as `size_key` writes it, and seed.
+        Answers by effect, `size_key` of the size, and seed.
     """
     from vinetrack.core.terminal import Progress, progress
 
@@ -76,17 +76,17 @@ def simulate_answers(
 
 
 def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[CampaignPValues]:
-    """Ask every test of simulated campaigns in which nothing is missing.
+    """Apply every test to simulated null campaigns.
 
     Parameters
     ----------
-    design : of the campaigns.
-    how : campaigns, seeds, processes and file.
+    design : design of the campaigns.
+    how : settings of the simulation.
 
     Returns
     -------
     list of CampaignPValues
-        One a campaign, in the order of the seeds.
+        One per campaign, in the order of the seeds.
     """
     from vinetrack.core.terminal import Progress, progress
 
@@ -105,7 +105,7 @@ def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[Campaig
 
 
 def size_key(value: float) -> str:
-    """Return a size as it is written in the file of answers.
+    """Return the text of a size in the file of answers.
 
     Parameters
     ----------
@@ -127,11 +127,11 @@ def _test_task(task: tuple[CampaignDesign, int]) -> CampaignPValues:
 
 
 def fingerprint(design: CampaignDesign) -> str:
-    """Return a short text that changes with anything that campaigns are simulated from.
+    """Return a short hash of everything that simulated campaigns depend on.
 
     Parameters
     ----------
-    design : of the campaigns.
+    design : design of the campaigns.
 
     Returns
     -------
@@ -149,11 +149,11 @@ def fingerprint(design: CampaignDesign) -> str:
 
 
 def stored_answers(path: Path, mark: str) -> list[SimulatedDiagnosis]:
-    """Answers that an earlier run has kept about this design; those about others are passed over.
+    """Return the stored answers of a design.
 
     Parameters
     ----------
-    path : of the file; it may be absent.
+    path : file of answers, which need not exist.
     mark : fingerprint of the design.
 
     Returns
@@ -184,7 +184,7 @@ def _stored_p_values(path: Path, mark: str) -> list[CampaignPValues]:
 
 
 def _stored_rows(path: Path, mark: str) -> list[dict[str, str]]:
-    """Whole rows of a file that are about this design; none where there is no file."""
+    """Return the complete rows of a design; none if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as stream:
@@ -200,7 +200,7 @@ def _row(mark: str, answer: SimulatedDiagnosis) -> list[object]:
 
 
 def _append_row(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
-    """Append one answer; the header stands in a new file."""
+    """Append a row to the file; write the header first if the file is new."""
     new = not path.is_file()
     with path.open("a", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

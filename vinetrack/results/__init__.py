@@ -1,1 +1,1 @@
-"""A results folder: what each file is called, what it holds, and reading it back."""
+"""Results folders: names and content of the files, and reading them."""

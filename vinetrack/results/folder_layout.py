@@ -1,6 +1,6 @@
-"""A results folder: what each file in it is called, which columns it has, and reading it back.
+"""Layout of a results folder: paths of its files, columns of its tables, and reading them.
 
-Names of trials are text whatever they look like: `007` stays `007`, and a trial may be called `NaN`.
+Names of trials are always text: `007` stays `007`, and a trial may be called `NaN`.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relat
 
 
 class ResultsError(UserError):
-    """A results folder that is not one, or lacks what a stage needs: one sentence with a remedy."""
+    """A folder that is not a results folder, or lacks a file that is needed; one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -143,22 +143,22 @@ class Results:
 
     @property
     def trials(self) -> Path:
-        """One row a trial of the sheet."""
+        """One row per trial of the sheet."""
         return self.folder / "trials.csv"
 
     @property
     def steady(self) -> Path:
-        """One row a trial and rule."""
+        """Steady windows, one row per trial and rule."""
         return self.folder / "steady.csv"
 
     @property
     def points(self) -> Path:
-        """The points of the damping fit, one row a trial, and why one was not used."""
+        """Points of the damping fit, one row per trial, with the reason if a point is not used."""
         return self.folder / "damping_points.csv"
 
     @property
     def conditions(self) -> Path:
-        """What each condition gave, its replicates put together."""
+        """Results of each condition, its replicates combined."""
         return self.folder / "conditions.csv"
 
     @property
@@ -168,27 +168,27 @@ class Results:
 
     @property
     def scaling(self) -> Path:
-        """How B grows with the size of the vine."""
+        """Scaling of B with the size of the vine."""
         return self.folder / "scaling.json"
 
     @property
     def comparison(self) -> Path:
-        """Model against measurement, one row a condition."""
+        """Comparison of model and measurement, one row per condition."""
         return self.folder / "comparison.csv"
 
     @property
     def model_check(self) -> Path:
-        """B and n of steady windows beside those of whole trajectories."""
+        """B and n from steady windows, compared with those from whole trajectories."""
         return self.folder / "model_check.csv"
 
     @property
     def audit(self) -> Path:
-        """What the model leaves out, weighed along the motion of each trial."""
+        """Size of neglected effects along the motion of each trial."""
         return self.folder / "audit.csv"
 
     @property
     def payload_model(self) -> Path:
-        """Final speed against payload as the model in use has it."""
+        """Final speed against payload by the model in use."""
         return self.folder / "payload_model.csv"
 
     @property
@@ -197,7 +197,7 @@ class Results:
         return self.folder / "fit.json"
 
     def trajectories(self, condition: str) -> Path:
-        """Return the file of the trials of one condition and what the model gives for them.
+        """Return the file of measured and modelled trajectories of one condition.
 
         Parameters
         ----------
@@ -211,20 +211,20 @@ class Results:
 
     @property
     def diagnosis(self) -> Path:
-        """What the model in use lacks."""
+        """The diagnosis of the model in use."""
         return self.folder / "diagnosis.json"
 
     @property
     def ladder(self) -> Path:
-        """The errors of the model that the user came with and of every one after it."""
+        """Errors of the initial model and of each later model."""
         return self.folder / "ladder.csv"
 
     def diagnosed(self, name: str) -> Path:
-        """Return a table that the diagnosis wrote.
+        """Return a file of the folder `diagnosis`.
 
         Parameters
         ----------
-        name : of the file, with suffix.
+        name : name of the file, with suffix.
 
         Returns
         -------
@@ -234,11 +234,11 @@ class Results:
 
     @property
     def final_fit(self) -> Path:
-        """The fit of the model with every effect that the diagnosis added; only where it added any."""
+        """The fit of the model with all effects that the diagnosis added; exists only if it added any."""
         return self.folder / "diagnosis" / "final_fit.json"
 
     def predictions(self, trial: str) -> Path:
-        """Return the file of one trial and what the models before and after give for it.
+        """Return the file of one trial with the predictions of the initial and the final model.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class Results:
         return self.folder / "overlays"
 
     def overlay(self, trial: str) -> Path:
-        """Return the recording of one trial with the edges drawn.
+        """Return the clip of one trial with the edges drawn.
 
         Parameters
         ----------
@@ -270,12 +270,12 @@ class Results:
 
     @property
     def provenance(self) -> Path:
-        """What all this was made with."""
+        """Versions, settings and hashes of all inputs."""
         return self.folder / "provenance.json"
 
     @property
     def report(self) -> Path:
-        """The page for people."""
+        """The report."""
         return self.folder / "report.html"
 
     def track(self, trial: str) -> Path:
@@ -305,7 +305,7 @@ class Results:
         return result_file(self.folder / "kinematics", trial, ".csv")
 
     def analysed(self, trial: str) -> Path:
-        """Return what one trial adds to the tables of the experiment.
+        """Return the file with a trial's contribution to the tables of the experiment.
 
         Parameters
         ----------
@@ -318,7 +318,7 @@ class Results:
         return result_file(self.folder / "analysed", trial, ".json")
 
     def strip_figure(self, trial: str, suffix: str) -> Path:
-        """Return the strip of one recording with its tracked edge.
+        """Return the strip figure of one recording with its tracked edge.
 
         Parameters
         ----------
@@ -347,7 +347,7 @@ class Results:
 
     @property
     def figure_list(self) -> Path:
-        """Which figures of the whole experiment had content and were drawn."""
+        """List of the figures of the whole experiment that were drawn."""
         return self.folder / "figures" / "campaign.json"
 
     def trial_figure(self, trial: str, suffix: str) -> Path:
@@ -370,7 +370,7 @@ def read_result(path: Path) -> pd.DataFrame:
 
     Parameters
     ----------
-    path : a CSV of a results folder.
+    path : a CSV file of a results folder.
 
     Returns
     -------
@@ -379,7 +379,7 @@ def read_result(path: Path) -> pd.DataFrame:
     Raises
     ------
     ResultsError
-        If there is no such file or it is no table of ours.
+        If the file does not exist or cannot be read.
     """
     import pandas as pd
 
@@ -411,7 +411,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
     Returns
     -------
-    content : SI units; None where a number is not known.
+    content : SI units; None for an unknown number.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -423,15 +423,15 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
-    """A table with its header alone.
+    """Return a table without rows.
 
     Parameters
     ----------
-    columns : names, in order.
+    columns : names of the columns.
 
     Returns
     -------
-    table : without rows, text and numbers typed as `read_result` has them.
+    table : columns typed as by `read_result`.
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""The diagnosis of a results folder, read back as a typed object: `diagnosis.json` is read here and nowhere else."""
+"""Reading the diagnosis of a results folder as a typed object; the only reader of `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def read_diagnosis(results: Results) -> Diagnosis | None:
     Returns
     -------
     Diagnosis or None
-        None where there is none; `refused` holds the reason where none could be made.
+        None if there is none; its `refused` holds the reason if the diagnosis failed.
 
     Raises
     ------
     ResultsError
-        If the file is not one of ours.
+        If the file is not a diagnosis.
     """
     from vinetrack.diagnosis.result import Diagnosis
 

@@ -1,8 +1,7 @@
-"""The fit of a results folder, read back as a typed object; the diagnosis: `stored_diagnosis`.
+"""Reading the fit of a results folder as a typed object; the only reader of `fit.json`.
 
-Pipeline, report, explorer and the Python interface read `fit.json` here and nowhere else; its keys stand in the class,
-beside what writes them. Two modules, because the stage of the model reads a fit and must not run again when sentences
-of a diagnosis change.
+The diagnosis has a module of its own, `stored_diagnosis`, because the stage of the model reads fits and must not rerun
+when the text of a diagnosis changes.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ def read_fit(results: Results) -> FitSummary:
     Returns
     -------
     FitSummary
-        `refused` holds the reason where the model could not be fitted.
+        Its `refused` holds the reason if the model could not be fitted.
 
     Raises
     ------
     ResultsError
-        If the model has not been fitted there, or the file is not one of ours.
+        If the model has not been fitted, or the file is not a fit.
     """
     from vinetrack.inference.fit_summary import FitSummary
 
@@ -43,12 +42,12 @@ def read_fit(results: Results) -> FitSummary:
 
 
 def unreadable_file_error(path: Path, error: Exception) -> ResultsError:
-    """Return what is said of a file of the results that does not hold what it should.
+    """Return the error for a file of the results with unexpected content.
 
     Parameters
     ----------
     path : the file.
-    error : what went wrong in reading it.
+    error : exception raised while reading it.
 
     Returns
     -------
