@@ -95,7 +95,7 @@ def test_an_experiment_that_does_not_ask_is_told_how(tmp_path: Path) -> None:
     experiment = small_part(tmp_path / "part", "")
     done = run("paper", experiment, tmp_path / "results")
     assert done.exit_code == 1
-    assert "write `simulated` or `measured`" in done.output
+    assert "set it to `simulated` or `measured`" in done.output
 
 
 def test_a_stage_before_it_is_missed(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tm
     assert seen["diameter_mm"] == f"a: {narrow['reason']} (and 1 more trial)"
     assert "looks like psi, not kPa" in seen["pressure_kPa"]
     told = with_contradictions(Diagnosis.from_json(diagnosis("missing")), results, pairs)
-    assert "contradicts the sheet in diameter_mm and pressure_kPa" in told.explanation
+    assert "contradict the sheet in diameter_mm and pressure_kPa" in told.explanation
     assert set(seen.values()) <= set(told.notes)
 
 
@@ -71,5 +71,5 @@ def test_the_last_lines_of_a_run_recall_them(tmp_path: Path, slip: bool) -> None
     results.trials.write_text(",".join(empty_table(("trial", "status", "reason")).columns) + "\na,ok,\n")
     lines = run_lines(tmp_path)
     assert lines[-1].startswith("adequate:")
-    assert ("contradicts the sheet in diameter_mm" in lines[-1]) == slip
+    assert ("contradict the sheet in diameter_mm" in lines[-1]) == slip
     assert any("a factor 1.25" in line for line in lines) == slip
