@@ -1,4 +1,4 @@
-"""A fit is questioned with sensitivities past the end of growth, or, where those cannot be had, with its last ones."""
+"""A fit is tested with sensitivities past the end of growth or, where they cannot be computed, with its last ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinetrack.diagnosis.shape_products import fit_columns
 from vinetrack.dynamics.simulate import SimulationError
 
 
-def test_a_fit_whose_neighbours_cannot_be_followed_is_questioned_with_what_it_ended_with(
+def test_a_fit_whose_neighbours_cannot_be_simulated_is_tested_with_its_last_columns(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False, thorough=False)

@@ -1,4 +1,4 @@
-"""How likely forces are, and what of them positions decide: against closed forms of the normal distribution."""
+"""Marginal likelihood and posterior of a smooth force, against closed forms of the normal distribution."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ SPEED_POWER, HELD_N, NOISE_N = 0.4, 0.5, 0.05
 
 
 def seen(design: Floats, positions: Floats) -> CoefficientLikelihood:
-    """What unit noise on positions says of the coefficients."""
+    """Likelihood of the coefficients from positions with unit noise."""
     return CoefficientLikelihood(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
 
 
-def test_the_marginal_likelihood_is_that_of_the_normal_distribution() -> None:
+def test_marginal_likelihood_equals_that_of_the_normal_distribution() -> None:
     draw = np.random.default_rng(3)
     design = uniform_splines(draw.uniform(0, 1, 60), 12)
     positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
@@ -66,7 +66,7 @@ def test_the_marginal_likelihood_is_that_of_the_normal_distribution() -> None:
     assert choice.log_evidence + normal == pytest.approx(float(np.log(both)), abs=1e-6)
 
 
-def test_noise_that_is_wider_than_thought_widens_the_band() -> None:
+def test_inflated_noise_widens_the_band() -> None:
     design = uniform_splines(np.linspace(0, 1, 60), 12)
     told, at = seen(design, 9 * np.sin(np.linspace(0, 6, 60))), [np.linspace(0.05, 0.2, 9)]
     bands = [marginal_likelihood(GROWTH, told, inflation, 40.0).posteriors[0].force(at)[1] for inflation in (1.0, 4.0)]
@@ -90,10 +90,10 @@ def visited() -> tuple[Floats, Floats]:
     return draw.uniform(0.3, 8.0, 4000), draw.uniform(0.0, 0.25, 4000)
 
 
-def test_what_damping_could_hold_as_well_is_left_to_it_and_the_growth_is_learned(
+def test_a_force_along_the_growth_is_recovered_with_a_competing_damping_error(
     visited: tuple[Floats, Floats],
 ) -> None:
-    """A force that is nothing where growth begins, beside damping that is wrong: both come out."""
+    """A force that is zero where growth begins, with an error of the damping: both are recovered."""
     speed, growth = visited
     true = -0.8 * (growth / 0.25) ** 1.5 * speed / (speed + 8)
     place, normal = beside_damping(true + 0.3 * speed**SPEED_POWER, speed, growth)
@@ -105,7 +105,7 @@ def test_what_damping_could_hold_as_well_is_left_to_it_and_the_growth_is_learned
     assert np.mean(np.abs(force - true) < 1.96 * sigma) > 0.9
 
 
-def test_a_force_that_damping_cannot_hold_where_growth_begins_is_not_taken_for_nothing(
+def test_a_force_at_the_start_of_growth_that_damping_cannot_reproduce_is_detected(
     visited: tuple[Floats, Floats],
 ) -> None:
     speed, growth = visited
@@ -121,7 +121,7 @@ def test_a_force_that_damping_cannot_hold_where_growth_begins_is_not_taken_for_n
     assert np.mean(np.abs(off) < 1.96 * sigma) > 0.9
 
 
-def test_one_variable_and_two_have_the_same_odds_beforehand() -> None:
+def test_one_variable_and_two_have_equal_prior_odds() -> None:
     design = uniform_splines(np.linspace(0, 1, 60), 12)
     choice = marginal_likelihood(GROWTH, seen(design, np.zeros(60)), 1.0, 2.0)
     single = replace(choice, log_evidence=0.0)
@@ -133,8 +133,8 @@ def test_one_variable_and_two_have_the_same_odds_beforehand() -> None:
     assert weights["growth+speed"] == pytest.approx(0.25)
 
 
-def test_the_mean_and_the_band_are_those_of_the_mixture_over_lengths_and_amplitudes() -> None:
-    """Each length and amplitude by the closed form of a normal prior, with the weight of its likelihood."""
+def test_mean_and_covariance_are_those_of_the_mixture_over_hyperparameters() -> None:
+    """Each length scale and amplitude by the closed form for a normal prior, weighted by its likelihood."""
     draw = np.random.default_rng(11)
     design = uniform_splines(draw.uniform(0, 1, 40), 12)
     told = seen(design, design @ draw.standard_normal(12) + draw.standard_normal(40))
@@ -161,7 +161,7 @@ def test_the_mean_and_the_band_are_those_of_the_mixture_over_lengths_and_amplitu
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_overflows_says_nothing(value: float) -> None:
+def test_a_likelihood_that_overflows_is_not_finite(value: float) -> None:
     told = seen(np.eye(3), np.ones(3))
     assert told.is_finite
     assert not replace(told, chi2_at_zero=value).is_finite

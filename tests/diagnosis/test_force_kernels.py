@@ -15,7 +15,7 @@ TRIALS, STEPS, COLUMNS = 3, 400, 4
 
 
 def courses(seed: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Times, stiffness, friction and pushes of any size, of trials that differ."""
+    """Times, stiffness, friction and added accelerations of any size, for trials that differ."""
     draw = np.random.default_rng(seed)
     shape = (TRIALS, STEPS + 1)
     time_s = 0.3 * np.sort(draw.uniform(size=shape))
@@ -23,12 +23,12 @@ def courses(seed: int) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def stepped(x: Floats, v: Floats, h: Floats, k: Floats, c: Floats, push: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where (x, v) = before + h·rates holds with the rates there, and the acceleration."""
+    """The implicit step: (x, v) = before + h·rates with the rates at its end, and the acceleration there."""
     rate = (k * (x + h * v) + c * v + push) / (1 - h * c - h * h * k)
     return x + h * (v + h * rate), v + h * rate, rate
 
 
-def test_it_does_what_the_arrays_do() -> None:
+def test_compiled_integration_equals_that_in_arrays() -> None:
     time_s, k, c, push = courses(3)
     x, v = np.zeros((2, TRIALS, COLUMNS))
     moved, sped = integrate_responses(time_s, k, c, push, SDIRK_GAMMA)
@@ -45,7 +45,7 @@ def test_it_does_what_the_arrays_do() -> None:
         np.testing.assert_allclose(sped[:, i + 1], v, rtol=1e-12)
 
 
-def test_a_spring_that_is_pushed_swings_about_where_it_comes_to_rest() -> None:
+def test_a_spring_under_a_constant_force_oscillates_about_its_new_equilibrium() -> None:
     """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
     omega, time_s = 20.0, np.linspace(0, 0.3, STEPS + 1)[None]
     moved, sped = integrate_responses(
@@ -55,7 +55,7 @@ def test_a_spring_that_is_pushed_swings_about_where_it_comes_to_rest() -> None:
     assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
 
 
-def test_what_overflows_is_raised_where_numpy_is_told_to_raise() -> None:
+def test_overflow_raises_where_numpy_is_set_to_raise() -> None:
     time_s, k, c, push = courses(4)
     motions = [SimpleNamespace(time_s=t, stiffness=s, friction=f) for t, s, f in zip(time_s, -1e5 * k, c, strict=True)]
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""A force followed to where it leads: its slopes against differences, and motions beyond where the model would end."""
+"""Nonlinear fit of a force: its score against finite differences, and motions beyond the end of growth of the model."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, PRESSURE, R
 
 @pytest.fixture(scope="module")
 def slowed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, LinearMisfit]:
-    """Vines that felt a friction along the growth, and the model without it."""
+    """Vines with a friction along the growth, fitted by the model without it."""
     pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path_factory.mktemp("slowed"))
     fit = vt.fit(vt.base_model(), pairs, profile=False)
     return fit, linear_misfit(fit)
 
 
-def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tuple[Fit, LinearMisfit]) -> None:
-    """The slope of the cost by what a trial's pressure deviates, held against the cost a little further on."""
+def test_the_score_of_a_pressure_deviation_includes_a_force_that_depends_on_pressure(
+    slowed: tuple[Fit, LinearMisfit],
+) -> None:
+    """The score of a trial's pressure deviation against a finite difference of the cost."""
     fit, linear = slowed
     domain = next(each for each in candidate_domains(linear.motions) if each.variables == ("growth", "pressure"))
     growth, pressure = (uniform_splines(np.linspace(0, 1, 40), count) for count in domain.counts)
@@ -55,7 +57,7 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
     assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.005)
 
 
-def test_a_force_moves_a_vine_that_grows_on_where_the_model_would_have_ended(slowed: tuple[Fit, LinearMisfit]) -> None:
+def test_positions_respond_to_a_force_beyond_the_end_of_growth_of_the_model(slowed: tuple[Fit, LinearMisfit]) -> None:
     fit, linear = slowed
     early = [replace(motion, end_s=0.5 * float(motion.time_s[-1])) for motion in linear.motions]
     effects = linear.inversion.trial_effects

@@ -1,4 +1,4 @@
-"""The fewest further trials that bring an effect of some size to a wanted probability."""
+"""The fewest further trials that give an effect of some size a target power."""
 
 from __future__ import annotations
 
@@ -52,9 +52,7 @@ def plan(design: CampaignDesign, power: Power) -> FurtherTrials:
     return further_trials(design, power["leak"], 0.6 * power["leak"].size_at(0.9), 0.9, LIMITS)
 
 
-def test_the_plan_keeps_its_promise_when_its_trials_are_in_the_sheet(
-    design: CampaignDesign, plan: FurtherTrials
-) -> None:
+def test_the_power_of_a_plan_is_that_of_a_sheet_with_its_trials(design: CampaignDesign, plan: FurtherTrials) -> None:
     assert plan.before < 0.9 <= plan.after
     added = tuple(added.trial for added in plan.trials)
     count = len(design.trials) + len(added)
@@ -68,7 +66,7 @@ def test_the_plan_keeps_its_promise_when_its_trials_are_in_the_sheet(
     assert again.size_at(0.9) == pytest.approx(plan.power.size_at(0.9), rel=0.02)
 
 
-def test_one_pair_less_does_not_do(plan: FurtherTrials) -> None:
+def test_one_pair_less_is_not_enough(plan: FurtherTrials) -> None:
     fewer = [added.probability for added in plan.trials if added.probability < plan.target]
     assert len(fewer) == len(plan.trials) - 2
 
@@ -80,13 +78,13 @@ def test_trials_stay_within_the_limits_and_come_in_pairs(plan: FurtherTrials) ->
     assert all(count % 2 == 0 for count in np.unique(pressures, return_counts=True)[1])
 
 
-def test_no_trials_are_asked_for_where_none_are_needed(design: CampaignDesign, power: Power) -> None:
+def test_no_trials_are_added_where_none_are_needed(design: CampaignDesign, power: Power) -> None:
     enough = further_trials(design, power["leak"], 1.5 * power["leak"].size_at(0.98), 0.9, LIMITS)
     assert enough.trials == ()
     assert "none need be added" in further_lines(enough)[0]
 
 
-def test_what_no_trial_within_the_limits_shows_is_said(design: CampaignDesign, power: Power) -> None:
+def test_a_target_out_of_reach_within_the_limits_is_reported(design: CampaignDesign, power: Power) -> None:
     tight = LIMITS.model_copy(update={"trials": 4})
     never = further_trials(design, power["air_drag"], 0.05, 0.9, Limits(**tight.model_dump()))
     assert not never.is_reached
@@ -94,7 +92,7 @@ def test_what_no_trial_within_the_limits_shows_is_said(design: CampaignDesign, p
     assert any(line.startswith("No number of trials within `limits` suffices") for line in further_lines(never))
 
 
-def test_rows_of_the_sheet_are_read_back_as_the_same_trials(power: Power, plan: FurtherTrials) -> None:
+def test_rows_of_the_sheet_give_the_same_trials(power: Power, plan: FurtherTrials) -> None:
     rows = sheet_rows(replace(power, further=(plan,)))
     assert len({row["trial"] for row in rows}) == len(plan.trials)
     texts = {name: str(cell) for name, cell in rows[0].items() if name != "trial"}
@@ -103,7 +101,7 @@ def test_rows_of_the_sheet_are_read_back_as_the_same_trials(power: Power, plan: 
     assert read.vine == plan.trials[0].trial.vine
 
 
-def test_the_table_of_a_plan_ends_with_its_probability(plan: FurtherTrials) -> None:
+def test_the_table_of_a_plan_ends_with_its_power(plan: FurtherTrials) -> None:
     lines = further_lines(plan)
     assert lines[0].startswith("To detect leak at ")
     assert f"{100 * plan.after:.2g} %" in "\n".join(lines)

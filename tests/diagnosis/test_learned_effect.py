@@ -1,4 +1,4 @@
-"""A learned force as a table in an effect file, and which variables it may hang on."""
+"""A learned force as a table in an effect file, and the variables that it may depend on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DOMAINS = [
 
 
 def learned(domain: Domain, seed: int) -> LearnedForce:
-    """A force of arbitrary coefficients over a domain."""
+    """A force with arbitrary coefficients over a domain."""
     coefficients = np.random.default_rng(seed).standard_normal(domain.size)
     places = {
         "lead_position_m": [0.1, 0.2],
@@ -40,7 +40,7 @@ def learned(domain: Domain, seed: int) -> LearnedForce:
     return LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
 
 
-def test_a_learned_force_gives_itself_and_its_error_anywhere() -> None:
+def test_a_learned_force_can_be_evaluated_with_its_error_anywhere() -> None:
     force = learned(DOMAINS[0], 3)
     at = [np.full(1, value) for value in DOMAINS[0].low]
     (value,), (sigma,) = force.best.force(at)
@@ -50,7 +50,7 @@ def test_a_learned_force_gives_itself_and_its_error_anywhere() -> None:
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
-def test_the_file_holds_the_force_that_was_learned_wherever_trials_have_been(domain: Domain, tmp_path: Path) -> None:
+def test_the_effect_file_reproduces_the_learned_force_over_the_visited_range(domain: Domain, tmp_path: Path) -> None:
     force = learned(domain, 4)
     path = tmp_path / f"{table_name(force)}.py"
     path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
@@ -70,12 +70,12 @@ def test_the_file_holds_the_force_that_was_learned_wherever_trials_have_been(dom
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
 
 
-def test_even_splines_make_the_same_constant() -> None:
+def test_even_splines_reproduce_a_constant() -> None:
     assert uniform_table(DOMAINS[1], np.full(DOMAINS[1].size, 0.7)) == pytest.approx(0.7)
 
 
-def test_choices_are_set_aside_by_what_they_leave_and_not_by_how_smooth_they_are() -> None:
-    """Trials of even speed: a force over growth and time is a force over growth and speed."""
+def test_choices_are_excluded_by_their_misfit_and_not_by_their_smoothness() -> None:
+    """Trials of constant speed: a force over growth and time is a force over growth and speed."""
     growth = replace(DOMAINS[0], counts=(12,))
     time, speed = (replace(growth, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
     pairs = [
@@ -106,7 +106,7 @@ def test_choices_are_set_aside_by_what_they_leave_and_not_by_how_smooth_they_are
     assert kept({"growth": 0.99, "growth+time": 0.01}, {"growth": 0.0, "growth+time": -3.0}, growth) == []
 
 
-def test_what_trials_do_not_tell_is_said_of_what_they_do() -> None:
+def test_the_sentence_lists_the_variables_that_trials_cannot_distinguish() -> None:
     weights = {"growth+time": 0.74, "growth+speed": 0.26}
     both = dependence("growth+time", weights, ["growth+speed"])
     assert both.endswith(

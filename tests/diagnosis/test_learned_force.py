@@ -37,7 +37,7 @@ ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
 """Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
 
 
-def test_the_process_has_the_covariance_it_says() -> None:
+def test_the_process_has_the_matern_covariance() -> None:
     directions, variances = covariance_modes(12, 0.4)
     covariance = (directions * variances) @ directions.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
@@ -45,15 +45,15 @@ def test_the_process_has_the_covariance_it_says() -> None:
     assert covariance[0, -1] == pytest.approx(ALIKE)
 
 
-def test_a_process_from_nothing_is_the_one_conditioned_on_its_first_value() -> None:
+def test_a_process_that_is_zero_at_the_start_is_conditioned_on_its_first_value() -> None:
     directions, variances = covariance_modes(12, 0.4, zero_at_start=True)
     covariance = (directions * variances) @ directions.T
     assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
     assert covariance[-1, -1] == pytest.approx(1 - ALIKE**2)
 
 
-def test_a_surface_begins_as_it_is_told_to() -> None:
-    """Where growth begins: nothing, one number, or any function of the speed."""
+def test_a_surface_meets_its_start_condition() -> None:
+    """Where growth begins: zero, a constant, or any function of the speed."""
     speeds = np.linspace(0, 8, 9)
     begins = BOTH.basis([np.zeros(9), speeds])
     draw = np.random.default_rng(5)
@@ -64,14 +64,14 @@ def test_a_surface_begins_as_it_is_told_to() -> None:
         assert (np.abs(at_start).max() < 1e-9) == (name == ZERO_AT_START)
 
 
-def test_which_variables_say_that_growth_has_begun() -> None:
+def test_growth_or_else_time_marks_the_start_of_growth() -> None:
     assert [replace(BOTH, variables=names).start_axis for names in (("growth", "time"), ("speed", "time"))] == [0, 1]
     assert replace(BOTH, variables=("speed", "pressure")).start_conditions == (FREE_AT_START,)
     assert GROWTH.start_conditions == (ZERO_AT_START, CONSTANT_AT_START)
 
 
 @pytest.mark.parametrize("domain", [GROWTH, BOTH])
-def test_splines_add_up_to_one_and_are_constant_beyond_what_was_visited(domain: Domain) -> None:
+def test_splines_sum_to_one_and_are_constant_outside_the_visited_range(domain: Domain) -> None:
     inside = [np.linspace(low, high, 7) for low, high in zip(domain.low, domain.high, strict=True)]
     assert domain.basis(inside).sum(axis=1) == pytest.approx(np.ones(7))
     beyond = [np.array([high, 2 * high]) for high in domain.high]
@@ -80,14 +80,14 @@ def test_splines_add_up_to_one_and_are_constant_beyond_what_was_visited(domain: 
 
 
 @pytest.mark.parametrize("knots", [np.linspace(0, 1, 18), np.array([0, 0.01, 0.05, 0.3, 0.5, 1.0])])
-def test_splines_are_those_of_scipy(knots: np.ndarray) -> None:
+def test_splines_equal_those_of_scipy(knots: np.ndarray) -> None:
     at = np.concatenate([np.random.default_rng(6).uniform(-0.2, 1.2, 300), knots])
     ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
     expected = BSpline.design_matrix(np.clip(at, 0, 1), ends, 3).toarray()
     assert splines(at, knots) == pytest.approx(expected, abs=1e-14)
 
 
-def test_products_of_splines_are_summed_without_those_that_are_nothing() -> None:
+def test_the_sparse_sum_of_spline_products_equals_the_full_one() -> None:
     draw = np.random.default_rng(7)
     at = [draw.uniform(0, 0.3, 50), draw.uniform(0, 9, 50)]
     coefficients = draw.standard_normal(BOTH.size)
@@ -97,13 +97,13 @@ def test_products_of_splines_are_summed_without_those_that_are_nothing() -> None
     assert BOTH.basis(at) == pytest.approx(expected, abs=1e-15)
 
 
-def test_speeds_are_taken_as_logarithms_beyond_what_is_usual() -> None:
+def test_speeds_are_on_a_logarithmic_scale_above_their_median() -> None:
     (parts,) = replace(GROWTH, log_scale=(0.01,)).normalised([np.array([0.0, 0.01 * (math.sqrt(26) - 1), 0.25])])
     assert parts == pytest.approx([0.0, 0.5, 1.0])
 
 
-def test_a_surface_follows_the_function_whose_values_its_coefficients_are() -> None:
-    """A function linear in both variables is held exactly by its values at the places of the splines."""
+def test_a_surface_reproduces_a_function_linear_in_both_variables() -> None:
+    """With its values at the centres of the splines as coefficients, the function is reproduced exactly."""
     u, v = (np.linspace(0, 1, count) for count in (101, 101))
     places = [np.linalg.lstsq(uniform_splines(u, count), u, rcond=None)[0] for count in BOTH.counts]
     coefficients = (2 * places[0][:, None] - 3 * places[1]).ravel()
@@ -112,8 +112,8 @@ def test_a_surface_follows_the_function_whose_values_its_coefficients_are() -> N
     assert force == pytest.approx(2 * u - 3 * v[::-1])
 
 
-def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_freely_is_not() -> None:
-    """Trials that grow evenly, each at its own speed: time is growth over speed; speed is no function of growth."""
+def test_a_variable_that_is_a_function_of_others_is_recognised() -> None:
+    """Trials at constant but different speeds: time is growth over speed, but speed is not a function of growth."""
     duration_s = np.linspace(0, 1, 80)
     motions = [
         SimpleNamespace(
@@ -131,12 +131,12 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
 
 @pytest.fixture(scope="module")
 def proposal(tmp_path_factory: pytest.TempPathFactory) -> Proposal:
-    """Of vines that felt waves along the growth which become shorter: no formula of the list follows them."""
+    """For vines with a force in waves of decreasing length along the growth, which no formula reproduces."""
     pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path_factory.mktemp("waves"))
     return propose(vt.base_model(), pairs, lambda _: None)
 
 
-def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(proposal: Proposal) -> None:
+def test_a_force_without_a_formula_is_proposed_as_a_table_that_explains_the_misfit(proposal: Proposal) -> None:
     table = proposal.table
     assert table is not None
     assert table.effect.name == "learned_growth"
@@ -164,7 +164,7 @@ def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(p
     assert np.isnan(grid["pressure_Pa"]).all()
 
 
-def test_it_says_what_it_depends_on_and_goes_into_a_file(proposal: Proposal) -> None:
+def test_the_learned_force_states_its_variables_and_is_written_to_json(proposal: Proposal) -> None:
     assert proposal.table is not None
     force = missing_force(proposal.before, learn=False)
     content = json.loads(json.dumps(replace(force, learned=proposal.table.learned).to_json()))["learned"]
@@ -174,6 +174,6 @@ def test_it_says_what_it_depends_on_and_goes_into_a_file(proposal: Proposal) -> 
     assert force.to_json()["learned"] is None
 
 
-def test_where_nothing_is_missing_no_force_is_learned() -> None:
+def test_no_force_is_learned_where_nothing_is_missing() -> None:
     fit = vt.fit(vt.base_model(), pairs_of(grown(sheet((4,)), 132)), profile=False)
     assert missing_force(fit).learned is None

@@ -1,6 +1,6 @@
-"""Forces that no catalogue has, hidden by files of a user's own: drawn, and the simple law they follow named.
+"""Forces outside the catalogue, hidden by effect files of a user: their curves, and the simple laws identified.
 
-Seeds 81 to 86 were looked at while laws and errors were built; those here, from 91, score.
+Seeds 81 to 86 were used while laws and errors were developed; those here, from 91, are for scoring.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from vinetrack.inference.fit_result import Fit
 
 
 def fitted(folder: Path, name: str, size_N: float, seed: int) -> Fit:
-    """The base model fitted to vines that felt this force as well."""
+    """The base model fitted to vines with this force added."""
     return vt.fit(vt.base_model(), hidden_force(sheet((4,)), seed, name, size_N, folder), profile=False)
 
 
 def laws_of(fit: Fit) -> MissingForce:
-    """The force held against laws; learned as a smooth function it is in `test_learned_force`."""
+    """The force compared with laws; as a smooth function it is tested in `test_learned_force`."""
     return missing_force(fit, learn=False)
 
 
@@ -39,7 +39,7 @@ def patch(tmp_path_factory: pytest.TempPathFactory) -> MissingForce:
     return laws_of(fitted(tmp_path_factory.mktemp("effects"), "patch", -0.4, 91))
 
 
-def test_a_rough_patch_is_found_where_it_is_with_its_size(patch: MissingForce) -> None:
+def test_a_rough_patch_is_found_with_its_position_and_size(patch: MissingForce) -> None:
     best = patch.laws.iloc[0]
     assert best["law"] == "patch"
     assert best["amplitude_N"] == pytest.approx(-0.4, abs=0.03)
@@ -50,7 +50,7 @@ def test_a_rough_patch_is_found_where_it_is_with_its_size(patch: MissingForce) -
     assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
 
 
-def test_the_force_drawn_lies_on_the_patch_in_every_condition(patch: MissingForce) -> None:
+def test_the_force_curve_peaks_on_the_patch_in_every_condition(patch: MissingForce) -> None:
     assert tuple(patch.table.columns) == FORCE_COLUMNS
     assert set(patch.table["against"]) == {"lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"}
     along = patch.table[(patch.table["against"] == "lead_position_m") & (patch.table["condition"] != "")]
@@ -68,7 +68,7 @@ def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> Non
     assert found.laws["amplitude_N"].iloc[0] == pytest.approx(0.5, abs=0.07)
 
 
-def test_a_friction_that_falls_with_speed_is_told_from_all_others(tmp_path: Path) -> None:
+def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "stribeck", -1.5, 93))
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
     assert found.laws["amplitude_N"].iloc[0] < 0
@@ -76,7 +76,7 @@ def test_a_friction_that_falls_with_speed_is_told_from_all_others(tmp_path: Path
     assert found.depends_on["speed"] > 0.9
 
 
-def test_a_force_that_grows_with_time_is_told_from_one_that_grows_with_travel(tmp_path: Path) -> None:
+def test_a_force_that_grows_with_time_is_distinguished_from_one_that_grows_with_travel(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "growing", -0.3, 94))
     assert found.laws["law"].iloc[0] == "time"
     assert "grows in proportion to time" in found.sentence
@@ -84,17 +84,17 @@ def test_a_force_that_grows_with_time_is_told_from_one_that_grows_with_travel(tm
 
 
 @pytest.mark.parametrize(("seed", "scales"), [(95, (4,)), (96, (2, 4))])
-def test_where_nothing_is_missing_no_force_is_told(seed: int, scales: tuple[int, ...]) -> None:
+def test_no_force_is_reported_where_nothing_is_missing(seed: int, scales: tuple[int, ...]) -> None:
     found = laws_of(vt.fit(vt.base_model(), pairs_of(grown(sheet(scales), seed)), profile=False))
     assert found.sentence.startswith("No further force on the tail is significant")
 
 
-def test_a_force_of_no_simple_law_is_said_to_be_none(tmp_path: Path) -> None:
+def test_a_force_that_follows_no_simple_law_is_reported_as_such(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "odd", 0.4, 97))
     assert "like none of the simple laws" in found.sentence
 
 
-def test_it_goes_into_a_file(patch: MissingForce) -> None:
+def test_the_missing_force_is_written_to_json(patch: MissingForce) -> None:
     import json
 
     content = json.loads(json.dumps(patch.to_json()))
@@ -103,8 +103,8 @@ def test_it_goes_into_a_file(patch: MissingForce) -> None:
     assert tuple(patch.laws.columns) == LAW_COLUMNS
 
 
-def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(tmp_path: Path) -> None:
-    """The integrator with a tolerance far below its usual: a narrow force lies between its usual steps."""
+def test_sensitivities_to_a_force_equal_differences_of_simulations(tmp_path: Path) -> None:
+    """With a much tighter integrator tolerance than usual, because a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
     found = vt.fit(model, pairs_of(virtual), profile=False)
@@ -136,7 +136,7 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(tmp_path: Pa
 
 
 def test_the_force_is_learned_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On cores that are busy, threads of such small matrices wait for each other a hundred times as long."""
+    """On busy cores, threads of such small matrices wait for each other a hundred times as long as the work takes."""
     threads: list[int] = []
 
     def learned(*_: object) -> None:

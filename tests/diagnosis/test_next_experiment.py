@@ -1,6 +1,6 @@
-"""The next experiment: what is predicted is what trials grown in the laboratory then show.
+"""The next experiment: its predictions agree with trials grown in the laboratory.
 
-Seeds 4001 to 4003 score; those below 1000 were looked at while the method was made.
+Seeds 4001 to 4003 are for scoring; those below 1000 were used while the method was developed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ B_KNOWN, N = 6.44, 0.37
 
 
 def grown(trials: Sequence[Trial], seed: int, effects: Mapping[str, float], noise_m: float, off: float = 1.0) -> Pairs:
-    """Trials grown with these parameters; B of vines other than 24 mm × 200 µm is the guess by size times `off`."""
+    """Trials grown with these parameters; B of vines other than 24 mm × 200 µm is the scaling prior times `off`."""
     damping = {
         trial.vine: B_KNOWN
         if (round(trial.diameter_m * 1e3), round(trial.thickness_m * 1e6)) == (24, 200)
@@ -76,7 +76,7 @@ def base_fit(pairs: tuple[tuple[Trial, Track], ...], noise: tuple[float, float] 
 
 
 def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
-    """The trials that are recommended, to be grown."""
+    """The recommended trials, to be grown."""
     made = []
     for k, entry in enumerate(found.trials):
         trial = replace(
@@ -96,7 +96,7 @@ def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
 
 
 def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
-    """By how many σ all trials speak for the first hypothesis against the second, more than those so far did."""
+    """By how many σ all trials favour the first hypothesis over the second, in excess of those so far."""
     base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
     likelihood = []
     for fit in fits:
@@ -109,7 +109,7 @@ def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
 
 @pytest.fixture(scope="module")
 def dragged() -> tuple[Pairs, list[Fit]]:
-    """24 trials of one tube with a strong drag, fitted with it and with an inlet loss: they cannot be told apart."""
+    """24 trials of one tube with a strong drag, fitted with it and with an inlet loss: they cannot be distinguished."""
     pairs = grown(one_tube((14, 20, 28, 38), 6), 4001, {"air_drag.C_D": 60.0}, 1e-4)
     fits = fits_of(pairs, "air_drag", "inlet_loss")
     assert 2 * abs(fits[0].log_likelihood - fits[1].log_likelihood) < 9
@@ -123,12 +123,12 @@ def advised(dragged: tuple[Pairs, list[Fit]]) -> NextExperiment:
 
 @pytest.fixture(scope="module")
 def reeled() -> tuple[Pairs, list[Fit]]:
-    """Eight trials at one pressure, tail on a reel, the chamber depletes; positions good to 0.5 mm."""
+    """Eight trials at one pressure with the tail on a reel and a depleting chamber; positions accurate to 0.5 mm."""
     pairs = grown(one_tube((28,), 8, tail_store="reel"), 4002, {"reservoir_depletion.gamma": 1.4}, 5e-4)
     return pairs, fits_of(pairs, "reservoir_depletion", "tail_friction")
 
 
-def test_another_connector_tells_drag_from_inlet_loss_and_no_vine_has_to_be_made(advised: NextExperiment) -> None:
+def test_another_connector_separates_drag_from_inlet_loss_without_a_new_vine(advised: NextExperiment) -> None:
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
@@ -136,12 +136,12 @@ def test_another_connector_tells_drag_from_inlet_loss_and_no_vine_has_to_be_made
     assert "an inlet of" in advised.text
 
 
-def test_what_is_predicted_is_what_the_simulation_shows(advised: NextExperiment) -> None:
+def test_the_predicted_separation_agrees_with_the_simulated_one(advised: NextExperiment) -> None:
     (sigma,), ((mean, _),) = advised.separation_sigma.values(), advised.simulated_sigma.values()
     assert sigma == pytest.approx(mean, rel=0.2)
 
 
-def test_what_is_predicted_is_what_the_trials_show_once_they_are_made(
+def test_the_predicted_separation_agrees_with_that_of_the_trials_once_made(
     dragged: tuple[Pairs, list[Fit]], advised: NextExperiment
 ) -> None:
     pairs, fits = dragged
@@ -150,7 +150,9 @@ def test_what_is_predicted_is_what_the_trials_show_once_they_are_made(
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-def test_a_new_vine_tells_them_apart_although_its_damping_was_guessed_wrong(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
+    dragged: tuple[Pairs, list[Fit]],
+) -> None:
     pairs, fits = dragged
     found = next_experiment(fits, Limits(inlet_mm=(8.0,), trials=5))
     assert any(trial["new_vine"] for trial in found.trials)
@@ -161,7 +163,9 @@ def test_a_new_vine_tells_them_apart_although_its_damping_was_guessed_wrong(drag
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_do(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_separate_them(
+    dragged: tuple[Pairs, list[Fit]],
+) -> None:
     limits = Limits(diameter_mm=(12.0,), thickness_um=(100.0,), length_mm=(140.0,), inlet_mm=(4.0,))
     found = next_experiment(dragged[1], limits)
     assert found.trials == ()
@@ -170,7 +174,7 @@ def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_do(dragge
     assert found.text.startswith("No trials within `limits` separate the tied hypotheses by 3 σ")
 
 
-def test_every_limit_is_kept(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     limits = Limits(
         trials=3,
         pressure_kPa=(10.0, 30.0),
@@ -195,7 +199,7 @@ def test_every_limit_is_kept(dragged: tuple[Pairs, list[Fit]]) -> None:
     assert sum(entry["replicates"] for entry in found.trials) == 3
 
 
-def test_another_chamber_tells_depletion_from_friction_on_a_reel(reeled: tuple[Pairs, list[Fit]]) -> None:
+def test_another_chamber_separates_depletion_from_friction_on_a_reel(reeled: tuple[Pairs, list[Fit]]) -> None:
     pair = "reservoir_depletion | tail_friction"
     same = next_experiment(reeled[1], Limits(chamber_l=(3.7,), pressure_kPa=(28.0, 28.0), new_vines=False))
     other = next_experiment(reeled[1], Limits(chamber_l=(1.9, 3.7), pressure_kPa=(28.0, 28.0), new_vines=False))
@@ -203,7 +207,7 @@ def test_another_chamber_tells_depletion_from_friction_on_a_reel(reeled: tuple[P
     assert {trial["chamber_l"] for trial in other.trials} & {1.9}
 
 
-def test_chamber_against_friction_can_be_settled_by_recording_the_pressure(reeled: tuple[Pairs, list[Fit]]) -> None:
+def test_recording_the_pressure_can_separate_depletion_from_friction(reeled: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(
         reeled[1], Limits(trials=1, chamber_l=(3.7,), pressure_kPa=(28.0, 28.0), payload_g=(0.0, 0.0), new_vines=False)
     )
@@ -212,7 +216,7 @@ def test_chamber_against_friction_can_be_settled_by_recording_the_pressure(reele
     assert "spring balance" in str(found.calibration)
 
 
-def test_errors_of_measurement_call_for_a_measurement_and_no_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()
     assert "ruler" in str(found.calibration)
@@ -220,20 +224,20 @@ def test_errors_of_measurement_call_for_a_measurement_and_no_trials(dragged: tup
     assert found.text.startswith("Measure before making more trials: length_scale and time_base")
 
 
-def test_one_error_of_measurement_against_nothing_is_measured(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_a_measurement_error_tied_with_no_effect_calls_for_a_measurement(dragged: tuple[Pairs, list[Fit]]) -> None:
     (scaled,) = fits_of(dragged[0], "length_scale")
     plain = vt.refit(scaled, vt.base_model())
     text = next_experiment([plain, scaled]).text
     assert text.startswith("Measure before making more trials: length_scale is an error of measurement. length_scale:")
 
 
-def test_an_error_of_measurement_among_physics_may_be_measured_instead(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_a_measurement_error_tied_with_physics_may_be_measured_instead(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "air_drag", "length_scale"), Limits(trials=2, new_vines=False))
     assert "a ruler beside the vine" in str(found.calibration)
     assert "air_drag:" not in str(found.calibration)
 
 
-def test_where_no_trial_can_be_made_it_says_so(dragged: tuple[Pairs, list[Fit]]) -> None:
+def test_the_text_states_that_no_trial_is_possible(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(dragged[1], Limits(pressure_kPa=(0.5, 1.0), payload_g=(0.0, 0.0)))
     assert found.trials == ()
     assert found.text.startswith("No trial within the limits can be made and simulated.")
@@ -246,7 +250,7 @@ def test_the_same_seed_gives_the_same_advice(dragged: tuple[Pairs, list[Fit]]) -
     assert once == again
 
 
-def test_it_is_plain_json_with_units_in_its_names(advised: NextExperiment) -> None:
+def test_the_advice_is_json_with_units_in_its_names(advised: NextExperiment) -> None:
     kept = json.loads(json.dumps(advised.to_json(), allow_nan=False))
     assert kept["trials"][0].keys() >= {"pressure_kPa", "payload_g", "diameter_mm", "thickness_um", "replicates"}
     assert kept["simulated_sigma"]["air_drag | inlet_loss"].keys() == {"mean", "sd"}

@@ -1,4 +1,4 @@
-"""Thresholds of a verdict held against null campaigns of the same design."""
+"""Calibration of the tests of a verdict on null campaigns of the same design."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from vinetrack.narrative.calibration_text import calibration_lines
 from vinetrack.planning.campaign_information import FilmingPlan
 
 
-def test_the_chance_of_one_score_is_its_tail() -> None:
+def test_the_p_value_of_one_score_is_its_tail_probability() -> None:
     assert family_p_value(np.eye(1), [0], ["leak"], np.array([2.5])) == pytest.approx(2 * norm.sf(2.5))
     assert family_p_value(np.eye(1), [1], ["leak"], np.array([2.5])) == pytest.approx(norm.sf(2.5))
 
 
-def test_independent_candidates_multiply_the_chance() -> None:
+def test_p_values_of_independent_candidates_multiply() -> None:
     count, scores = 12, np.zeros(12)
     scores[3] = 3.0
     chance = family_p_value(np.eye(count), [0] * count, [f"e{k}" for k in range(count)], scores)
     assert chance == pytest.approx(1 - (1 - 2 * norm.sf(3.0)) ** count, rel=0.03)
 
 
-def test_a_score_at_its_threshold_has_the_level_of_the_family() -> None:
+def test_a_score_at_its_threshold_has_the_family_level() -> None:
     draw = np.random.default_rng(1)
     factor = draw.standard_normal((9, 4))
     cosines = factor @ factor.T + 3 * np.eye(9)
@@ -48,7 +48,7 @@ def nulls(rate: float, count: int = 400) -> tuple[float, ...]:
     return tuple((even ** (1 / rate)).tolist())
 
 
-def test_levels_that_hold_have_rate_one() -> None:
+def test_correct_levels_have_rate_one() -> None:
     test = CalibratedTest("scores", 0.003, 0.001, nulls(1.0))
     rate, low, high = test.rate
     assert rate == pytest.approx(1.0, abs=0.02)
@@ -62,24 +62,24 @@ def test_the_monte_carlo_p_value_counts_the_observed_campaign() -> None:
     assert (test.exceeding.count, test.monte_carlo) == (1, 2 / 5)
 
 
-def test_a_finding_among_null_campaigns_as_extreme_is_withdrawn() -> None:
+def test_a_rejection_is_withdrawn_where_null_campaigns_are_as_extreme() -> None:
     test = CalibratedTest("scores", 0.003, 1e-4, nulls(0.3))
     assert test.is_called
     assert test.still_called is False
 
 
-def test_a_finding_far_beyond_all_null_campaigns_stands() -> None:
+def test_a_rejection_far_beyond_all_null_campaigns_stands() -> None:
     assert CalibratedTest("scores", 0.003, 1e-9, nulls(1.0)).still_called is True
 
 
-def test_few_campaigns_without_a_tail_decide_nothing() -> None:
+def test_few_campaigns_without_an_exponential_tail_are_inconclusive() -> None:
     test = CalibratedTest("scores", 0.003, 1e-9, (0.5,) * 30)
     assert not test.is_exponential
     assert not test.resolves
     assert test.still_called is None
 
 
-def test_what_changes_is_said_in_words() -> None:
+def test_the_text_states_what_changes() -> None:
     observed = dict.fromkeys(TESTS, 0.5) | {"scores of all candidates": 1e-4}
     null = [CampaignPValues(k, dict.fromkeys(TESTS, chance)) for k, chance in enumerate(nulls(0.3))]
     null.append(CampaignPValues(999, {}, "FitError: none"))

@@ -1,7 +1,8 @@
-"""Final speed along payload: a vine whose motion is known in closed form, and errors carried on by hand.
+"""Final speed against payload, for a vine whose motion is known in closed form, with errors propagated by hand.
 
-With n = 0 and film of no weight the tail accelerates evenly, a = (½(P − P_y)A − ½B)/m + g, so that at growth y, with
-x = 2y and ẋ² = 2ax, the leading edge has ẏ = √(a·y). The gas that moves along is the least mass: ¼ρ_gas·A·L, 35 mg.
+With n = 0 and massless film the tail has the constant acceleration a = (½(P − P_y)A − ½B)/m + g, so that at growth y,
+with x = 2y and ẋ² = 2ax, the leading edge has ẏ = √(a·y). The gas that moves along is the least mass: ¼ρ_gas·A·L, 35
+mg.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def number(key: str, value: float, sigma: float, vine: str) -> Number:
 
 
 def fitted(trials: list[Trial]) -> SimpleNamespace:
-    """As much of a fit as a curve looks at: the sheet says P_y 4 kPa, the fit found 3."""
+    """The parts of a fit that a curve uses: the sheet states P_y 4 kPa, the fit estimated 3."""
     vine = trials[0].vine
     numbers = (number("eversion_damping.B", B, SIGMA_B, vine), number("yield_pressure.P_y", P_Y, SIGMA_P_Y, vine))
     shared = CORRELATION * SIGMA_B * SIGMA_P_Y
@@ -53,7 +54,7 @@ def loaded(*payloads_kg: float, **changes: float) -> list[Trial]:
     return list(with_names([replace(EVEN, name=f"p{i}", payload_kg=kg, **changes) for i, kg in enumerate(payloads_kg)]))
 
 
-def test_the_speed_of_an_even_acceleration() -> None:
+def test_the_speed_under_constant_acceleration() -> None:
     found = fitted(loaded(0.01, 0.05))
     curve = payload_curves(found, 0.75)
     assert list(curve.columns) == list(CURVE_COLUMNS)
@@ -63,7 +64,7 @@ def test_the_speed_of_an_even_acceleration() -> None:
     assert curve["final_lead_velocity_m_s"].to_numpy() == pytest.approx(np.sqrt(acceleration(mass_kg) * 0.15), rel=2e-4)
 
 
-def test_errors_of_b_and_yield_pressure_are_carried_on_with_their_correlation() -> None:
+def test_errors_of_b_and_yield_pressure_are_propagated_with_their_correlation() -> None:
     """∂a/∂B = −1/2m and ∂a/∂P_y = −A/2m; ∂ẏ/∂a = ½√(y/a)."""
     trials = loaded(0.02, 0.04)
     _, sigma = speeds_with_error(fitted(trials), trials, 0.15, 0.5)
@@ -79,14 +80,14 @@ def test_a_vine_with_one_payload_has_no_curve() -> None:
     assert payload_curves(fitted(loaded(0.02, 0.02)), 0.95).empty
 
 
-def test_pressures_have_curves_of_their_own() -> None:
+def test_each_pressure_has_its_own_curve() -> None:
     low, high = loaded(0.01, 0.03), loaded(0.01, 0.03, pressure_Pa=40e3)
     curve = payload_curves(fitted([*low, *high]), 0.95)
     assert isinstance(curve, pd.DataFrame)
     assert curve.groupby("pressure_kPa").size().to_dict() == {28.0: PAYLOADS, 40.0: PAYLOADS}
 
 
-def test_a_vine_that_does_not_get_there_stands_still() -> None:
+def test_a_vine_that_does_not_reach_the_position_has_speed_zero() -> None:
     """Upwards with 35.6 g at 4 kPa: ½ × 1 kPa × 452 mm² − 1 N < 0.349 N of weight."""
     stuck = loaded(0.0356, 0.05, pressure_Pa=4e3, growth_angle_rad=math.pi)
     assert payload_curves(fitted(stuck), 0.95)["final_lead_velocity_m_s"].tolist() == [0.0] * PAYLOADS

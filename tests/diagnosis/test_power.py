@@ -1,4 +1,4 @@
-"""What trials can see: detectable sizes, what effects are taken for, rates of simulated campaigns."""
+"""Power of trials: detectable sizes, confusion of effects, rates of simulated campaigns."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain",
 
 
 def planned(replicates: int, spreads: tuple[float, float] = (0.01, 0.03)) -> CampaignDesign:
-    """Three pressures of one vine, so many times each."""
+    """Three pressures of one vine, with so many replicates each."""
     trials: list[Trial] = []
     for pressure in ("14", "24", "34"):
         texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "pressure_kPa": pressure}
@@ -66,11 +66,11 @@ def place_of(questions: MisfitTests, name: str) -> int:
     return questions.sensitivities.effects.index(name)
 
 
-def test_a_campaign_without_noise_sounds_no_alarm(six: MisfitTests) -> None:
+def test_a_noise_free_campaign_raises_no_alarm(six: MisfitTests) -> None:
     assert six.one_sided_z.max() < 0.3 * six.family.single_shape_threshold
 
 
-def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTests, power: Power) -> None:
+def test_detectable_sizes_follow_the_normal_distribution(six: MisfitTests, power: Power) -> None:
     # Fewer trials than a scatter can be told from: only the noise model decides.
     sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
     entry = power["tail_friction"]
@@ -78,7 +78,7 @@ def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTes
     assert entry.size_at(0.5) / sigma >= six.family.threshold("tail_friction") - 0.1
 
 
-def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: MisfitTests) -> None:
+def test_estimated_scatter_absorbs_part_of_an_effect(six: MisfitTests) -> None:
     held = error_inflation(six)
     assert held[0] == pytest.approx(np.ones(held.shape[1]))
     many = planned_tests(planned(4))[0]
@@ -87,14 +87,14 @@ def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: Misfit
     assert np.all(np.diff(widening, axis=0) > -1e-9)
 
 
-def test_information_at_other_spreads_is_that_of_scores_at_those_spreads() -> None:
+def test_information_at_other_standard_deviations_is_that_of_the_scores_there() -> None:
     many = planned_tests(planned(4))[0]
     ways = [(0.002, 0.01), (0.01, 0.03), (0.03, 0.09)]
     direct = [scores_of(many.fit, many.products, replace(many.fit.state, spread=way)).information for way in ways]
     assert informations_at(many.fit, many.products, ways) == pytest.approx(np.array([np.diag(one) for one in direct]))
 
 
-def test_four_times_the_trials_halve_the_size(power: Power) -> None:
+def test_four_times_the_trials_halve_the_detectable_size(power: Power) -> None:
     # Where scatter of trials alone is in the way, and positions are known as good as exactly.
     few = power_of(planned_tests(planned(4))[0])["leak"].size_at(0.5)
     many = power_of(planned_tests(planned(16))[0])["leak"].size_at(0.5)
@@ -102,13 +102,13 @@ def test_four_times_the_trials_halve_the_size(power: Power) -> None:
     assert power["leak"].size_at(0.5) > few
 
 
-def test_more_scatter_hides_more() -> None:
+def test_more_scatter_raises_detectable_sizes() -> None:
     calm = power_of(planned_tests(planned(3, (0.002, 0.006)))[0])
     usual = power_of(planned_tests(planned(3))[0])
     assert usual["pressure_gain"].size_at(0.9) > 1.5 * calm["pressure_gain"].size_at(0.9)
 
 
-def test_two_effects_that_do_the_same_are_taken_for_each_other() -> None:
+def test_two_equivalent_effects_are_confused_with_each_other() -> None:
     # A diameter and a pressure that are off by a part act alike but for the film's mass.
     power = power_of(planned_tests(replace(planned(2), candidates=("area_scale", "pressure_gain")))[0])
     assert "pressure_gain" in power["area_scale"].taken_for
@@ -120,7 +120,7 @@ def test_an_effect_too_weak_for_these_trials_is_not_visible(power: Power) -> Non
     assert power["leak"].is_visible
 
 
-def test_what_cannot_act_is_said_with_a_reason(power: Power) -> None:
+def test_untestable_effects_are_listed_with_a_reason(power: Power) -> None:
     assert set(power.not_testable) == {"payload_drag", "static_yield"}
 
 
@@ -128,21 +128,21 @@ def test_false_alarms_add_up_over_the_tests(power: Power) -> None:
     assert FALSE_ALARM_LEVEL_FIRST_ROUND < power.false_alarm_rate < 2 * FALSE_ALARM_LEVEL_FIRST_ROUND
 
 
-def test_a_sheet_that_states_days_has_one_more_test() -> None:
+def test_a_sheet_with_days_has_one_more_test() -> None:
     design = planned(2)
     dated = replace(design, trials=tuple(replace(trial, day=trial.name[-1]) for trial in design.trials))
     rates = power_of(planned_tests(dated)[0]).false_alarms
     assert rates["specimens, days or the order of trials"] == FALSE_ALARM_LEVEL_FIRST_ROUND
 
 
-def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
+def test_a_small_effect_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
     k = place_of(six, "leak")
     assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5), noiseless_start(six.fit)) == pytest.approx(
         1.0, abs=0.03
     )
 
 
-def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six: MisfitTests, power: Power) -> None:
+def test_residual_displacements_equal_those_of_a_refit_without_the_effect(six: MisfitTests, power: Power) -> None:
     k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
     moved_m = size * residual_displacements(six.fit, six.products)[k]
     after = fitted_without(six.fit, six.sensitivities.shapes[k], size, noiseless_start(six.fit))
@@ -151,7 +151,7 @@ def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six
 
 
 @pytest.mark.parametrize("name", ["air_drag", "leak", "tail_friction"])
-def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from(
+def test_a_fit_without_an_effect_ends_with_the_columns_for_its_scores(
     six: MisfitTests, power: Power, name: str
 ) -> None:
     # No point lies near the end of growth, where `fit_columns` takes derivatives otherwise.
@@ -163,7 +163,7 @@ def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from
         assert mine[:, -1] == pytest.approx(other[:, -1], abs=1e-9)
 
 
-def test_a_fit_without_an_effect_that_does_not_settle_is_not_trusted(
+def test_a_fit_without_an_effect_that_does_not_converge_is_not_used(
     six: MisfitTests, power: Power, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start, k = noiseless_start(six.fit), place_of(six, "leak")
@@ -173,9 +173,7 @@ def test_a_fit_without_an_effect_that_does_not_settle_is_not_trusted(
     assert score_ratio(six, k, size, start) == 1.0
 
 
-def test_what_replicates_without_noise_do_alike_is_simulated_once(
-    six: MisfitTests, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_noise_free_replicates_are_simulated_once(six: MisfitTests, monkeypatch: pytest.MonkeyPatch) -> None:
     predictor, state = six.fit.predictor, six.fit.solution.state
     assert predictor.identical_trials.tolist() == [0, 0, 2, 2, 4, 4]
     counted: list[int] = []
@@ -194,7 +192,7 @@ def test_what_replicates_without_noise_do_alike_is_simulated_once(
         assert np.array_equal(shared.observed_position_m, alone.observed_position_m)
 
 
-def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories(
+def test_a_fit_without_an_effect_starts_with_the_columns_of_its_own_trajectories(
     six: MisfitTests, power: Power
 ) -> None:
     start, k = noiseless_start(six.fit), place_of(six, "leak")
@@ -208,7 +206,7 @@ def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories
         assert mine[keep, :-1] / scale == pytest.approx(other[:, :-1] / scale, abs=2e-3)
 
 
-def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
+def test_a_detection_within_the_systematic_errors_counts_half() -> None:
     sizes = 1 + 0.1 * norm.ppf(PROBABILITIES)
     found = half_power_below(1.12, sizes)
     assert found[PROBABILITIES.index(0.9)] == pytest.approx(sizes[PROBABILITIES.index(0.9)])
@@ -218,7 +216,7 @@ def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
     assert half_power_below(1.12, -sizes) == pytest.approx(-found)
 
 
-def test_an_effect_is_followed_at_further_sizes_only_where_its_score_bends(
+def test_further_sizes_are_computed_only_where_the_score_is_nonlinear(
     six: MisfitTests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def followed(ratio_at_7: float, ratio_at_4: float, larger: float = math.nan) -> tuple[int, EffectPower]:
@@ -253,7 +251,7 @@ def test_an_effect_is_followed_at_further_sizes_only_where_its_score_bends(
     assert halted.size_at(0.9) == pytest.approx(1.01 / 0.3 * straight.size_at(0.9))
 
 
-def test_power_survives_its_file(power: Power) -> None:
+def test_power_is_unchanged_by_writing_and_reading(power: Power) -> None:
     again = Power.from_json(json.loads(json.dumps(power.to_json())))
     assert again == power
     assert again.to_json() == power.to_json()
@@ -267,7 +265,7 @@ def test_intervals_of_n_are_those_of_the_fit(six: MisfitTests, power: Power) -> 
     assert widths["B"] == pytest.approx((B.high - B.low) / 2 / B.value)
 
 
-def test_a_verdict_never_stands_alone(power: Power) -> None:
+def test_a_verdict_comes_with_its_power(power: Power) -> None:
     step = Round(("gravity",), "adequate", (), (), "Nothing is missing.")
     diagnosis = Diagnosis((step,), (), "Nothing is missing.", power=power)
     beside = "(false alarms in at most 0.42 % of such campaigns; "
@@ -292,13 +290,13 @@ def entry(**changes: object) -> EffectPower:
     return replace(given, **changes)  # type: ignore[arg-type]
 
 
-def test_probabilities_are_read_back_from_sizes() -> None:
+def test_probabilities_invert_sizes() -> None:
     for probability in (0.1, 0.5, 0.9):
         assert entry().probability_at(entry().size_at(probability)) == pytest.approx(probability)
     assert (entry().probability_at(0.1), entry().probability_at(3.0)) == (0.0, 1.0)
 
 
-def test_a_size_that_no_trial_shows_is_infinite() -> None:
+def test_an_undetectable_size_is_infinite() -> None:
     blind = entry(sizes=(math.inf,) * len(PROBABILITIES))
     assert (blind.size_at(0.5), blind.probability_at(3.0), blind.is_visible) == (math.inf, 0.0, False)
 
@@ -327,7 +325,7 @@ def answer(seed: int, verdict: str, answer_set: tuple[str, ...] = (), **more: ob
     return SimulatedDiagnosis("leak", 0.5, seed, verdict, answer_set, **more)  # type: ignore[arg-type]
 
 
-def test_answers_are_counted() -> None:
+def test_simulated_diagnoses_are_counted() -> None:
     answers = [
         answer(0, "missing", ("leak",)),
         answer(1, "ambiguous", ("supply_refill", "leak")),
@@ -346,7 +344,7 @@ def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
     assert found.is_found
 
 
-def test_the_design_of_a_fit_films_as_long_as_its_trials() -> None:
+def test_the_design_of_a_fit_records_as_long_as_its_trials() -> None:
     questions, _ = planned_tests(planned(1))
     design = design_of_fit(questions.fit)
     for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):

@@ -1,4 +1,4 @@
-"""Laws of force that no catalogue has, as effects: their files do what the law says, and the right one is proposed."""
+"""Laws of force outside the catalogue, as effects: their files reproduce the laws, and the right one is proposed."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ LAWS = [
 
 
 @pytest.mark.parametrize("seen", LAWS, ids=lambda seen: seen.law.name)
-def test_the_file_of_a_law_does_what_the_law_says(seen: DetectedLaw, tmp_path: Path) -> None:
+def test_the_effect_file_of_a_law_reproduces_the_law(seen: DetectedLaw, tmp_path: Path) -> None:
     path = tmp_path / f"proposed_{seen.law.name}.py"
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
@@ -63,11 +63,11 @@ def test_the_file_of_a_law_does_what_the_law_says(seen: DetectedLaw, tmp_path: P
         (Law("speed_cubed"), "N·s³/m³"),
     ],
 )
-def test_sizes_have_the_unit_that_makes_a_force(law: Law, unit: str) -> None:
+def test_sizes_have_the_unit_that_gives_a_force(law: Law, unit: str) -> None:
     assert f'"{unit}"' in effect_text(DetectedLaw(law, (-0.2,), 0.9, "a law"))
 
 
-def test_a_force_that_grows_with_time_is_proposed_and_mends_left_out_conditions(tmp_path: Path) -> None:
+def test_a_force_that_grows_with_time_is_proposed_and_predicts_left_out_conditions(tmp_path: Path) -> None:
     pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     best = proposal.tied[0]
@@ -78,7 +78,7 @@ def test_a_force_that_grows_with_time_is_proposed_and_mends_left_out_conditions(
     assert any("Proposed: a force that grows in proportion to time" in line for line in proposal.sentences())
 
 
-def test_where_nothing_is_missing_nothing_is_proposed() -> None:
+def test_nothing_is_proposed_where_nothing_is_missing() -> None:
     proposal = propose(vt.base_model(), pairs_of(grown(sheet((4,)), 102)), lambda _: None)
     assert not proposal.tied
     assert "nothing is proposed" in proposal.sentences()[0]

@@ -1,4 +1,4 @@
-"""When a campaign that is looked at again and again may stop."""
+"""The stopping rule of a campaign that is diagnosed repeatedly."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vinetrack.pipeline.sequence_stage import LEDGER, Ledger, look_at_folder, re
 
 
 def diagnosis(log_bayes: float = 30.0, rival: float = 1e-6, verdict: str = MISSING, final: str = ADEQUATE) -> Diagnosis:
-    """A leak was found, with another candidate refitted beside it, one screened, and one that no trial shows."""
+    """A leak was found, with another candidate refitted, one only score-tested, and one without response."""
     ranking = (
         Candidate("leak", "physical", REFITTED, 80.0, 8.9, posterior_weight=1 - rival, log_bayes=log_bayes),
         Candidate("air_drag", "physical", REFITTED, 40.0, 6.3, posterior_weight=rival, log_bayes=10.0),
@@ -45,7 +45,7 @@ def diagnosis(log_bayes: float = 30.0, rival: float = 1e-6, verdict: str = MISSI
     return Diagnosis(tuple(rounds), ("leak",) if verdict == MISSING else (), "")
 
 
-def test_one_name_with_enough_evidence_stops_the_campaign() -> None:
+def test_one_effect_with_a_sufficient_likelihood_ratio_stops_the_campaign() -> None:
     look = look_at(diagnosis(), 12, 0.03)
     assert (look.decision, look.names) == (STOP, ("leak",))
     assert look.needed == pytest.approx(math.log(3 / 0.03))
@@ -66,29 +66,29 @@ def test_one_name_with_enough_evidence_stops_the_campaign() -> None:
         (replace(diagnosis(), rounds=(), refused="no trial moves"), "no trial moves"),
     ],
 )
-def test_what_keeps_a_campaign_going(given: Diagnosis, why: str) -> None:
+def test_reasons_to_continue_a_campaign(given: Diagnosis, why: str) -> None:
     look = look_at(given, 12, 0.03)
     assert look.decision == GO_ON
     assert why in look.why
 
 
-def test_the_first_few_trials_never_stop_it() -> None:
+def test_the_first_few_trials_never_stop_a_campaign() -> None:
     assert look_at(diagnosis(), 5, 0.03).decision == GO_ON
 
 
-def test_a_smaller_risk_asks_for_more() -> None:
+def test_a_smaller_risk_requires_a_larger_ratio() -> None:
     assert look_at(diagnosis(rival=1e-3), 12, 0.03).decision == STOP
     assert look_at(diagnosis(rival=1e-3), 12, 0.001).decision == GO_ON
 
 
-def test_a_richer_form_of_the_same_name_is_no_rival() -> None:
+def test_a_richer_form_of_the_same_effect_is_no_rival() -> None:
     given = diagnosis()
     richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason="it contains leak as a limit")
     first = replace(given.rounds[0], ranking=(*given.rounds[0].ranking, richer))
     assert look_at(replace(given, rounds=(first, given.rounds[1])), 12, 0.03).decision == STOP
 
 
-def test_looking_after_every_observation_errs_no_more_often_than_stated() -> None:
+def test_monitoring_after_every_observation_keeps_the_stated_risk() -> None:
     # Two normal means a priori alike, the first true: the ratio of likelihoods ever exceeds (m − 1)/risk = 1/risk.
     draw, risk = np.random.default_rng(3), 0.1
     x = draw.standard_normal((4000, 400))
@@ -97,13 +97,13 @@ def test_looking_after_every_observation_errs_no_more_often_than_stated() -> Non
     assert 0.03 < wrong <= risk
 
 
-def test_evidence_tells_how_many_trials_are_still_needed() -> None:
+def test_the_log_ratio_predicts_how_many_trials_are_still_needed() -> None:
     look = look_at(diagnosis(log_bayes=2.0, rival=1e-9), 12, 0.03)
     assert trials_to_go(look) == math.ceil(12 * (look.needed / 2.0 - 1))
     assert trials_to_go(look_at(diagnosis(), 12, 0.03)) == 0
 
 
-def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ledger_stores_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = [diagnosis(rival=0.2)]
     data = [b"six trials"]
 
@@ -124,7 +124,7 @@ def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyte
         look_at_folder(tmp_path, 0.01)
 
 
-def test_the_command_prints_looks_and_what_is_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_prints_looks_and_the_next_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     look = CampaignLook(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several effects are left")
     ledger = Ledger(0.03, (look,), ("x",), "Two trials at 30 kPa.")
     monkeypatch.setattr(sequence_stage, "look_at_folder", lambda *_: ledger)
@@ -136,7 +136,7 @@ def test_the_command_prints_looks_and_what_is_next(tmp_path: Path, monkeypatch: 
     assert json.loads(file.read_text())["looks"][0]["log_ratio"] is None
 
 
-def test_a_broken_ledger_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_ledger_is_refused(tmp_path: Path) -> None:
     (tmp_path / LEDGER).write_text("{}")
     with pytest.raises(ExperimentError, match="no ledger"):
         read_ledger(tmp_path / LEDGER)
