@@ -120,7 +120,7 @@ def test_a_ledger_stores_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyt
     last = look_at_folder(tmp_path)
     assert [look.decision for look in last.looks] == [GO_ON, STOP]
     assert read_ledger(tmp_path / LEDGER) == last
-    with pytest.raises(ExperimentError, match="stated otherwise"):
+    with pytest.raises(ExperimentError, match="differs from the risk stated"):
         look_at_folder(tmp_path, 0.01)
 
 
