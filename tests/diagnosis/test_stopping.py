@@ -138,5 +138,5 @@ def test_the_command_prints_looks_and_the_next_trials(tmp_path: Path, monkeypatc
 
 def test_an_invalid_ledger_is_refused(tmp_path: Path) -> None:
     (tmp_path / LEDGER).write_text("{}")
-    with pytest.raises(ExperimentError, match="no ledger"):
+    with pytest.raises(ExperimentError, match="not a campaign ledger"):
         read_ledger(tmp_path / LEDGER)
