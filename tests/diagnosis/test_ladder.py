@@ -132,13 +132,13 @@ def test_of_many_conditions_several_are_left_out_at_once_and_the_error_is_nearly
     """Eight conditions in four parts: no part holds two conditions of a vine that lie side by side in the sheet."""
     each = left_out(fits[1])
     seen: list[set[str]] = []
-    without = ladder_module._without
+    without = ladder_module._held_out
 
     def kept(fit: Fit, gone: Sequence[bool]) -> Errors:
         seen.append({trial.trial.condition for trial, out in zip(fit.trials, gone, strict=True) if out})
         return without(fit, gone)
 
-    monkeypatch.setattr(ladder_module, "_without", kept)
+    monkeypatch.setattr(ladder_module, "_held_out", kept)
     monkeypatch.setattr(ladder_module, "MAX_FOLDS", 4)
     parted = left_out(fits[1])
     assert [len(part) for part in seen] == [2, 2, 2, 2]

@@ -169,7 +169,7 @@ def in_sample(fit: Fit) -> Errors:
 def left_out(fit: Fit) -> Errors:
     """Predictions of every condition by the model fitted to all others (cross-validation).
 
-    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine in different folds.
+    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine spread over the folds.
 
     Parameters
     ----------
