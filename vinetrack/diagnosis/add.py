@@ -119,7 +119,7 @@ def _fit_with(before: Fit, effect: Effect) -> Fit:
     subset_fit = best_subset_fit(fitter, starts, float("inf"))
     after = full_fit(before, subset_fit) if subset_fit is not None else None
     if after is None:
-        raise FitError(f"The simulation of the model with {effect.name} fails from every start.")
+        raise FitError(f"The model with {effect.name} cannot be simulated from any start.")
     if after.log_likelihood < before.log_likelihood:
         from_before = refit(before, before.model + effect)
         after = max((after, from_before), key=lambda fit: fit.log_likelihood)

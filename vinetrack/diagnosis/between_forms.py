@@ -1,7 +1,8 @@
-"""The hypotheses that trials differ: what each changes, by which column of the sheet, how close to the conditions.
+"""Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.
 
-Each has forms, of which the likeliest counts: a drift is one of B, of the pressure, or a step of the pressure from some
-trial on; specimens and days differ in B, in pressure, or in both. `between_trials` holds the model and compares them.
+Each hypothesis has several forms, of which the best counts: a drift of B, a drift of the pressure, or a step of the
+pressure from some trial on; specimens and days differ in B, in pressure, or in both. `between_trials` states the model
+and compares the hypotheses.
 """
 
 from __future__ import annotations
@@ -26,47 +27,48 @@ SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
 few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2 for each coefficient of a group."""
 
 DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03
-"""The same from day to day, and of ln P: film in other air, a gauge zeroed anew, a regulator set anew. Chosen: a gauge
-holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent; at half and twice as of specimens."""
+"""The same between days, and of ln P: film in air of another humidity, a gauge zeroed again, a regulator set again.
+Chosen: a gauge holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent; at half and twice as for
+specimens."""
 
 MIN_TRIALS_EACH_SIDE = 2
-"""Trials that a change has before it and after it. Derived: a change of one trial alone is its random deviation."""
+"""Minimum number of trials before and after a change. Derived: a change of a single trial is its random deviation."""
 
 FEWEST_TRIALS = 6
-"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:
-with six, one order in 360 is the strict one, either way. At half chance orders pass for drifts, at twice small
-campaigns are never asked."""
+"""Number of trials from which drifts and changes are tested: with fewer, any order of a few pressures resembles any
+other. Chosen: with six, one order in 360 is strictly increasing or decreasing. At half chance orders pass for drifts,
+at twice small campaigns are never tested."""
 
 CONFOUNDED_VARIANCE_SHARE = 0.5
-"""A difference counts as confounded with the conditions where it varies within them by less than this part of what
-random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3; at
-half both are still on their sides, at twice half of all random orders count as confounded."""
+"""A difference is confounded with the conditions if its variance within conditions is below this fraction of that in
+random order (1 on average). Chosen: adjacent replicates give under 0.1, random order 0.6 to 1.3; at half both are still
+separated, at twice half of all random orders count as confounded."""
 
 
 def forms_of(fit: Fit, base: Solution) -> list[Difference]:
-    """Every form of every hypothesis that these trials allow, `ways` counting the forms of its name.
+    """List every form of every hypothesis that these trials can test.
 
     Parameters
     ----------
     fit
-        The fit that is questioned.
+        The fit of the model.
     base
-        Its solution, smooth errors of position and of recorded pressures among its numbers.
+        Its solution, with smooth errors of position and of recorded pressures among its parameters.
 
     Returns
     -------
     list of Difference
-        Without their gains.
+        Without their gains; `n_forms` counts the forms of each hypothesis.
     """
     trials = [trial.trial for trial in fit.trials]
     forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
     forms += _changes(fit, base, trials)
-    asked = Counter(difference.name for difference in forms)
-    return [replace(difference, n_forms=difference.n_forms * asked[difference.name]) for difference in forms]
+    n_forms = Counter(difference.name for difference in forms)
+    return [replace(difference, n_forms=difference.n_forms * n_forms[difference.name]) for difference in forms]
 
 
 def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
-    """N of every vine, where there are several with one n."""
+    """An exponent n for each vine, where several vines share one."""
     free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
     if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
         return []
@@ -74,19 +76,19 @@ def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
 
 
 def _tube(trial: Trial) -> str:
-    """The tube that a trial was made with: its vine, and the specimen where it is known."""
+    """The tube of a trial: its vine, and the specimen where stated."""
     return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
 
 
 def _drifts(trials: Sequence[Trial]) -> list[Difference]:
-    """Ln B by the number of trials that the tube has seen before; pressure by that of all trials before."""
+    """Drift of ln B with the earlier trials of the same tube, and of ln P with all earlier trials."""
     if len(trials) < FEWEST_TRIALS:
         return []
     ranks, stated = trial_order(trials)
-    uses, seen = np.zeros(ranks.size), Counter[str]()
+    uses, count = np.zeros(ranks.size), Counter[str]()
     for i in np.argsort(ranks):
-        uses[i] = seen[_tube(trials[i])]
-        seen[_tube(trials[i])] += 1
+        uses[i] = count[_tube(trials[i])]
+        count[_tube(trials[i])] += 1
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
     forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
     return [
@@ -106,7 +108,7 @@ def _drifts(trials: Sequence[Trial]) -> list[Difference]:
 
 
 def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Ln P of all trials from the likeliest one on, as a regulator is set anew."""
+    """Step of ln P from the likeliest trial on, as where a regulator is set again."""
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
     begins = range(MIN_TRIALS_EACH_SIDE, len(trials) - MIN_TRIALS_EACH_SIDE + 1)
     if len(trials) < FEWEST_TRIALS or not np.all(pressures_Pa > 0):
@@ -118,7 +120,7 @@ def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference
 
 
 def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
-    """Ln P of some trials, in the order in which they were made, against that of the others."""
+    """Step of ln P of some trials, in the order in which they were made, relative to the others."""
     groups = [""] * len(trials)
     for i in members:
         groups[i] = f"from {trials[members[0]].name} on"
@@ -128,17 +130,17 @@ def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
 
 
 def _groups(trials: Sequence[Trial]) -> list[Difference]:
-    """Specimens and days that the sheet states."""
-    differences_found: list[Difference] = []
+    """Differences between the specimens and days that the sheet states."""
+    stated_differences: list[Difference] = []
     if all(trial.specimen for trial in trials):
         tubes = tuple(_tube(trial) for trial in trials)
-        # A vine of which there is one tube has a B of its own already.
+        # A vine with a single tube has its own B already.
         several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
         groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
-        differences_found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
+        stated_differences += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
     days = groups_of(trials, "day")
-    differences_found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, gain_sd=DAY_GAIN_SD, stated=True)
-    return differences_found
+    stated_differences += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, gain_sd=DAY_GAIN_SD, stated=True)
+    return stated_differences
 
 
 def _forms(
@@ -151,7 +153,7 @@ def _forms(
     gain_sd: float = 0.0,
     stated: bool,
 ) -> list[Difference]:
-    """Groups that differ in B, in pressure, or in both; with `gain_sd`, by a factor of the pressure too."""
+    """Forms in which groups differ: in B, in pressure, or in both; with `gain_sd`, also by a factor of the pressure."""
     if len({group for group in groups if group}) < 2 and stated:
         return []
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
@@ -162,18 +164,18 @@ def _forms(
     in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
     in_gain = BetweenTerm(f"{name}.gain", "ΔlnP", "", True, groups, np.ones(len(groups)), gain_sd, gain_sd)
     member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
-    apart = confounded(member, trials)
+    is_confounded = confounded(member, trials)
     return [
-        Difference(name, terms, stated=stated, confounded=apart)
+        Difference(name, terms, stated=stated, confounded=is_confounded)
         for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if gain_sd else []))
         if not any(term.pressure for term in terms) or driven.any()
     ]
 
 
 def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Where specimens are not stated: another tube of each vine from some trial on, or for each condition.
+    """Changes of tube where specimens are not stated: from some trial of each vine on, or with each condition.
 
-    A tube for each condition can only be where replicates were made one after the other.
+    A tube for each condition is possible only where replicates were made consecutively.
     """
     if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
         return []
@@ -192,23 +194,23 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
             groups[i] = tube
     conditions = [trial.condition for trial in trials]
     changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
-    if _in_turn(ranks, conditions):
+    if _replicates_are_consecutive(ranks, conditions):
         changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
     return changes
 
 
-def _in_turn(ranks: Floats, conditions: Sequence[str]) -> bool:
-    """Whether the replicates of every condition were made one after the other."""
+def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> bool:
+    """Whether the replicates of every condition were made consecutively."""
     ordered = [conditions[i] for i in np.argsort(ranks)]
     changes = sum(before != after for before, after in itertools.pairwise(ordered))
     return 1 < len(set(conditions)) == changes + 1 < len(conditions)
 
 
 def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
-    """Whether regressors, shape (n_trials, k), hardly vary among the replicates of a condition.
+    """Whether regressors are confounded with the conditions: they hardly vary among replicates.
 
-    The mean square within conditions over that within vines: 1 on average where trials are in random order. Without
-    replicates nothing tells them apart.
+    The criterion is the mean square within conditions over that within vines, 1 on average for trials in random order.
+    Without replicates they are always confounded.
 
     Parameters
     ----------
@@ -227,7 +229,7 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
 
 
 def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
-    """Sum of squares about the means of groups, and its degrees of freedom."""
+    """Sum of squares about the group means, and its degrees of freedom."""
     total, names = 0.0, sorted(set(groups))
     for name in names:
         member = values[np.array([group == name for group in groups])]

@@ -1,4 +1,4 @@
-"""How much a difference between trials would gain, by the linear mixed model of a fit: no trajectory is simulated."""
+"""Likelihood gain of a difference between trials, from the linear mixed model of a fit, without simulations."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ class Difference:
     name
         Of `result.BETWEEN_SUMMARIES`.
     terms, shared
-        What is fitted along, and parameters that are shared otherwise.
+        Coefficients that are added to the fit, and parameters that are shared differently.
     stated
-        Whether the sheet has the columns it goes by.
+        Whether the sheet states the columns that define it.
     confounded
-        Whether it follows the conditions so closely that replicates cannot tell it from an effect of the conditions.
+        Whether it is confounded with the conditions, so that replicates cannot distinguish it from an effect of them.
     ways
-        How many forms it is the best of, places where it may begin included.
+        Number of forms of which it is the best, with the possible onsets counted.
     gain, p
-        Fall of −2 ln L by the linear estimate, and its chance where trials do not differ, as the best of its forms.
+        Predicted fall of −2 ln L (linear), and its p-value as the best of its forms.
     """
 
     name: str
@@ -59,16 +59,15 @@ class Difference:
 
     @property
     def penalised_gain(self) -> float:
-        """Fall of −2 ln L less what the best of so many forms costs."""
+        """Fall of −2 ln L less the penalty 2 ln(`n_forms`) for the choice among forms."""
         return self.gain - 2 * math.log(self.n_forms)
 
 
 def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
-    """Chance of such a gain where trials do not differ.
+    """p-value of a gain where trials do not differ.
 
-    Of fixed coefficients by the F test with as many degrees of freedom as trials leave, LR = N ln(1 + q F / dof):
-    χ² would call too often where trials are few. Of random effects exp(gain / 2) is a Bayes factor B, and
-    P(B > 1/α) ≤ α by Markov's inequality.
+    For fixed coefficients by the F test, LR = N ln(1 + q F / dof), because χ² would be anticonservative for few trials.
+    For random effects exp(gain / 2) is a Bayes factor K, and P(K > 1/α) ≤ α by Markov's inequality.
 
     Parameters
     ----------
@@ -95,17 +94,17 @@ def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
 
 
 def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[float, float] | None = None) -> float:
-    """Fall of −2 ln L with a difference, from the sensitivities of the fit: no trajectory is simulated.
+    """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit.
 
-    The deviation of a trial is a column of the linear mixed model already, so the columns of the coefficients are
+    The deviation of each trial is a column of the linear mixed model already, and the columns of the coefficients are
     multiples of it.
 
     Parameters
     ----------
     fit : the fit without the difference.
-    base : its solution, smooth errors of position among its numbers where there are any.
+    base : its solution, with smooth errors of position among its parameters where there are any.
     difference : the difference.
-    spread : standard deviations of pressure and B from trial to trial; None to estimate them anew.
+    spread : between-trial standard deviations of pressure and ln B; None to estimate them again.
 
     Returns
     -------
@@ -125,15 +124,15 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
 
 
 def with_shared_errors(fit: Fit, base: Solution) -> Solution:
-    """A solution with the errors that trials share among its numbers: payloads, set pressures, a tracker's.
+    """Add the shared systematic errors of payloads, set pressures and trackers to a solution as nuisance parameters.
 
-    All replicates of a condition have them together, so that with enough replicates they stand out from the scatter of
-    trials, and pass for a difference between groups of conditions.
+    They are common to all replicates of a condition. With enough replicates they exceed the scatter of trials, and
+    would pass for a difference between groups of conditions.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    base : its solution, smooth errors of position among its numbers where there are any.
+    fit : the fit of the model.
+    base : its solution, with smooth errors of position among its parameters where there are any.
 
     Returns
     -------
@@ -144,29 +143,29 @@ def with_shared_errors(fit: Fit, base: Solution) -> Solution:
 
 
 def with_trace_errors(fit: Fit, base: Solution) -> Solution:
-    """A solution with the errors of recorded pressures among its numbers, those that its fit found put back.
+    """Add the errors of recorded pressures to a solution as parameters, with the corrections of its fit undone.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    base : its solution, smooth errors of position among its numbers where there are any.
+    fit : the fit of the model.
+    base : its solution, with smooth errors of position among its parameters where there are any.
 
     Returns
     -------
     Solution
-        As of `with_shared_errors`.
+        As from `with_shared_errors`.
     """
     return with_errors(fit, base, recorded_pressures(fit.predictor, fit.solution))
 
 
 def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
-    """A solution with errors among its numbers, each with a prior of mean 0 and standard deviation 1.
+    """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1.
 
     Parameters
     ----------
-    fit : the fit that is questioned.
-    base : its solution, smooth errors of position among its numbers where there are any.
-    errors : what one standard deviation of each does.
+    fit : the fit of the model.
+    base : its solution, with smooth errors of position among its parameters where there are any.
+    errors : change of the positions by one standard deviation of each.
 
     Returns
     -------
@@ -192,20 +191,20 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
 def gains_by_onset(
     fit: Fit, base: Solution, difference: Difference, members: Sequence[int], begins: Iterable[int]
 ) -> list[float]:
-    """`linear_gain` of a difference one of whose groups begins at each of several places of its members.
+    """`linear_gain` of a difference for each of several onsets of its group.
 
-    Between-trial standard deviations stay those of the solution. The part that each trial adds to the sums over trials
-    is taken out in turn, so that all places take little longer than one.
+    Between-trial standard deviations stay those of the solution. The contribution of each trial to the sums over trials
+    is removed in turn, so that all onsets take little longer than one.
 
     Parameters
     ----------
     fit : the fit without the difference.
-    base : its solution, smooth errors of position among its numbers where there are any.
+    base : its solution, with smooth errors of position among its parameters where there are any.
     difference : the difference, with all members in the group.
     members : sequence of int
-        Places of the trials of the group, in the order in which they were made.
+        Indices of the trials of the group, in the order in which they were made.
     begins : iterable of int
-        Places among the members from which on a trial is of the group, increasing.
+        Positions among the members from which on a trial belongs to the group, increasing.
 
     Returns
     -------
@@ -226,7 +225,7 @@ def gains_by_onset(
     of_term = np.zeros(places.shape[1], dtype=bool)
     of_term[last - len(difference.terms) : last] = True
     felt = of_term[:, None] | of_term
-    # One place more for keys that a trial does not feel.
+    # One more row for keys to which a trial does not respond.
     information, slope = np.pad(information, (0, 1)), np.append(slope, 0.0)
     gains: list[float] = []
     taken = 0

@@ -1,17 +1,18 @@
-"""Differences between trials as explanations: n by vine, drift with the order of trials, specimens, days.
+"""Differences between trials as hypotheses: n by vine, drift with the order of trials, specimens, days.
 
-A tube that wears, another tube for the high pressures or a gauge whose zero moves from day to day changes B or the
-pressure of whole groups of trials. Where all replicates of a condition share the group, that looks exactly like physics
-that follows the condition. So such differences are hypotheses of the diagnosis like the effects of the catalogue:
+A tube that wears, another tube for the high pressures, or a gauge whose zero changes between days changes B or the
+pressure of whole groups of trials. Where all replicates of a condition are in one group, this is indistinguishable from
+physics that depends on the condition. Such differences are therefore hypotheses like the effects of the catalogue:
 
     ln B_j          = ln B_vine + Σ_g a_g z_gj + u_j
-    P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random from trial to trial
+    P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random effects of trials
 
-with z_gj the number of trials that the vine (or specimen) of trial j has seen (pressure: all trials before, as a supply
-empties or a regulator creeps; or 1 from some trial on, as a regulator is set anew), or 1 in group g and 0 elsewhere
-(pressure: 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y, which are the same to a force (P − P_y) A).
-Coefficients of groups are random effects with a prior, integrated out of the likelihood, so that a hypothesis with many
-groups pays for each of them; a drift has one coefficient, fixed. All are compared by the same Δχ² as effects are.
+For a drift, z_gj is the number of earlier trials of the vine or specimen of trial j; for the pressure that of all
+earlier trials, as a supply empties or a regulator creeps, or 1 from some trial on, as a regulator is set again. For
+groups it is 1 in group g and 0 elsewhere; for the pressure 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y,
+which have the same effect on a force (P − P_y) A. Coefficients of groups are random effects with a prior and are
+integrated out of the likelihood, so that a hypothesis is penalised for each of its groups; a drift has one fixed
+coefficient. All are compared by Δχ², as effects are.
 """
 
 from __future__ import annotations
@@ -49,30 +50,30 @@ from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.position_errors import with_smooth_errors
 
 PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
-"""Change of ln B a trial that is still plausible, of ln P, and of ln P at once. Chosen: a tube whose B rises by 5 % a
-trial is done for after ten; a supply that loses 1 % a trial has lost a fifth after twenty, and somebody has looked at
-the gauge; a regulator is set to 5 %, as `pressure_gain` has it."""
+"""Largest plausible drift of ln B and of ln P per trial, and step of ln P. Chosen: a tube whose B rises by 5 % a trial
+is worn out after ten; a supply that loses 1 % a trial has lost a fifth after twenty, which somebody would have seen on
+the gauge; a regulator is set to 5 %, as in `pressure_gain`."""
 
 MAX_GAIN_SHORTFALL = 40.0
-"""How far in −2 ln L the linear estimate may stay behind the best hypothesis and still be fitted. Chosen: well above
-the answer set's 9 times the usual inflation of 1 to 3; twice as much only costs time."""
+"""Predicted −2 ln L by which a difference may be behind the best hypothesis and still be fitted. Chosen: well above the
+answer set's 9 times the usual inflation of 1 to 3; twice as much only costs time."""
 
 MIN_LINEAR_GAIN = 2.0
-"""Fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of what the gate asks for."""
+"""Predicted fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of the threshold."""
 
 SYSTEMATICS_CHECK_P_VALUE = 0.01
-"""Chance below which a difference is also asked beside the errors that all replicates of a condition share. Chosen for
-time: three times the level of all tests of a first model, so that at half of it as at twice nothing that would be
-called goes unasked; beside more errors no difference gains chance."""
+"""p-value below which a difference is also tested with shared systematic errors in the model. Chosen for time: three
+times the level of the first round, so that at half and at twice every difference that could be significant is tested;
+with more nuisance parameters no difference becomes more significant."""
 
 FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30
-"""Iterations of the fit of a difference: at first, and in all. Chosen for time; a fit that has not settled by then says
-so."""
+"""Iterations of the fit of a difference, at first and in all. Chosen for time; a fit that has not converged by then
+states so."""
 
 
 @dataclass(frozen=True)
 class BetweenRatio(LikelihoodRatio):
-    """The likelihood ratio of a difference between trials; `difference` tells which."""
+    """The likelihood ratio of a difference between trials."""
 
     difference: Difference = field(default_factory=lambda: Difference(""))
 
@@ -84,23 +85,23 @@ class BetweenRatio(LikelihoodRatio):
 
     @property
     def others(self) -> tuple[Number, ...]:
-        """All other numbers of its fit."""
+        """All other parameters of its fit."""
         keys = {number.name for number in self.numbers}
         return tuple(number for number in self.fit.numbers if number.name not in keys)
 
 
 def differences(fit: Fit) -> list[Difference]:
-    """The hypotheses that trials differ which these data allow, each with its linear estimate.
+    """Hypotheses that trials differ, with their predicted gains and p-values.
 
     Parameters
     ----------
     fit
-        The fit that is questioned.
+        The fit of the model.
 
     Returns
     -------
     list
-        Of the forms of a hypothesis (B, pressure, both) the one that gains most.
+        Of each hypothesis the form (B, pressure, both) with the largest gain.
     """
     if DAMPING not in fit.predictor.layout.keys:
         return []
@@ -117,18 +118,18 @@ def differences(fit: Fit) -> list[Difference]:
 
 
 def significant(among: Sequence[Difference], level: float) -> list[Difference]:
-    """Differences that are no chance, and that follow the conditions so closely that they may pass for physics.
+    """Significant differences that are confounded with the conditions, so that they could pass for physics.
 
-    One that random order or replicates keep apart from the conditions is a random deviation of the trials, which the
-    fit allows for. Those that the sheet states make a model inadequate of themselves. The others go by the order of the
-    rows, which need not be that of the trials: they decide nothing, and are told beside a model that is adequate.
+    Random order and replicates separate a difference from the conditions; it is then a random deviation of the trials,
+    which the fit includes. Differences by a column of the sheet make a model inadequate. Others follow the order of the
+    rows, which need not be that of the trials: they affect no verdict and are reported beside an adequate model.
 
     Parameters
     ----------
     among : sequence of Difference
         Those that were estimated.
     level : float
-        Chance of a false alarm of them all (Bonferroni).
+        Family-wise false-alarm probability (Bonferroni).
 
     Returns
     -------
@@ -140,12 +141,12 @@ def significant(among: Sequence[Difference], level: float) -> list[Difference]:
 def between_fits(
     before: Fit, among: Sequence[Difference], best: float, report: Callable[[str], None]
 ) -> list[LikelihoodRatio]:
-    """Fits of the differences whose estimate comes near the `best` Δχ² of the effects.
+    """Fit the differences whose predicted gain is near the best Δχ² of the effects.
 
     Parameters
     ----------
     before
-        The fit that is questioned.
+        The fit of the model.
     among : sequence of Difference
         Those that were estimated.
     best : float
@@ -171,17 +172,17 @@ def between_fits(
 
 
 def _widened_by(difference: Difference) -> tuple[str, ...]:
-    """Names whose scatter from trial to trial takes away from the significance of a difference.
+    """Names of the sizes whose scatter between trials reduces the significance of a difference.
 
-    Those of its numbers; but a coefficient of a random effect, which only the few trials of its group feel, has a
-    robust error that says nothing.
+    Those of its parameters; but the coefficient of a random effect depends on the few trials of its group only, and its
+    robust standard error is meaningless.
     """
     random = any(math.isfinite(term.prior_sd) for term in difference.terms)
     return () if random else (difference.name, *difference.shared)
 
 
 def _effect_of(difference: Difference) -> Effect:
-    """A stand-in for the effect that the tables of candidates and the answer set show."""
+    """The difference in the form of an effect, for the tables of candidates and the answer set."""
     drift = tuple(
         Parameter(name, term.symbol, term.unit, 0.0, plausible=(-PLAUSIBLE_DRIFT[name], PLAUSIBLE_DRIFT[name]))
         for term in difference.terms
@@ -205,19 +206,19 @@ def _effect_of(difference: Difference) -> Effect:
 
 
 def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference) -> Difference | None:
-    """The difference with its linear estimate; None where it cannot be laid out."""
+    """The difference with its predicted gain and p-value; None where the gain is not finite."""
     gain = linear_gain(fit, base, difference)
     if not math.isfinite(gain):
         return None
     p = gain_p_value(fit, difference, gain)
     if p < SYSTEMATICS_CHECK_P_VALUE and difference.stated and difference.confounded:
-        beside = linear_gain(fit, with_shared_errors(fit, plain), difference)
-        p = max(p, gain_p_value(fit, difference, beside))
+        gain_with_errors = linear_gain(fit, with_shared_errors(fit, plain), difference)
+        p = max(p, gain_p_value(fit, difference, gain_with_errors))
     return replace(difference, gain=gain, p=min(p * difference.n_forms, 1.0))
 
 
 def _fitted(before: Fit, difference: Difference) -> Fit | None:
-    """The difference fitted; None where it cannot be followed."""
+    """Fit of the difference; None where the fit fails."""
     between = (*before.predictor.layout.between, *difference.terms)
     try:
         fit = refit(before, between=between, shared=difference.shared, most_iterations=FIRST_ITERATIONS, thorough=False)
@@ -227,18 +228,18 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
 
 
 def between_candidates(
-    tried: Sequence[LikelihoodRatio], answer: Sequence[str], aside: Mapping[str, str]
+    fitted: Sequence[LikelihoodRatio], answer: Sequence[str], rejected: Mapping[str, str]
 ) -> list[Candidate]:
     """Rows of the ranking of candidates for the differences that were fitted.
 
     Parameters
     ----------
-    tried : sequence of LikelihoodRatio
+    fitted : sequence of LikelihoodRatio
         Hypotheses that were fitted.
     answer : sequence of str
         Names in the answer set.
-    aside : mapping
-        Why those set aside were, by name.
+    rejected : mapping
+        Reasons of rejection, by name.
 
     Returns
     -------
@@ -254,11 +255,11 @@ def between_candidates(
             hypothesis.numbers,
             hypothesis.plausible,
             hypothesis.names[0] in answer,
-            aside.get(hypothesis.names[0], hypothesis.reason),
+            rejected.get(hypothesis.names[0], hypothesis.reason),
             {},
             hypothesis.others if hypothesis.names[0] in answer else (),
         )
-        for hypothesis in tried
+        for hypothesis in fitted
         if hypothesis.effects[-1].kind == BETWEEN_TRIALS
     ]
 

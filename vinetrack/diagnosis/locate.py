@@ -229,14 +229,14 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
             f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
         ]
     worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
-    beside = (
+    scatter = (
         f"where replicates scatter by {_mm(worst['floor_m'])}"
         if math.isfinite(worst["floor_m"])
         else "without replicates"
     )
     ahead = "ahead of" if worst["worst_residual_m"] > 0 else "behind"
     places = [
-        f"The model fails most at {_named(worst, table)}: root mean square {_mm(worst['rms_m'])} {beside}; there the"
+        f"The model fails most at {_named(worst, table)}: root mean square {_mm(worst['rms_m'])} {scatter}; there the"
         f" vine is {_off(worst)} {ahead} the model"
         f" ({worst['z']:.1f} σ in all)."
     ]

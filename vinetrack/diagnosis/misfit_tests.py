@@ -1,6 +1,6 @@
 """Tests of one fitted model: is anything missing, and which effect would explain it. No model is refitted.
 
-A model is rejected by any of three kinds of test. Score tests ask each candidate of the catalogue (`score_test`, with
+A model is rejected by any of three kinds of test. Score tests are made of each candidate (`score_test`, with
 family-wise thresholds from `family_test`). Omnibus tests name no candidate: score tests of smooth probe forces
 (`structure_test`), and tests of the trial effects and the noise (`trial_effect_tests`). The last compares the misfit
 with the noise and the slow errors of the tracks.
@@ -31,7 +31,7 @@ from vinetrack.inference.systematics import systematics_of
 
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
 """Probability that the best of all candidates exceeds its threshold where nothing is missing: in the first round, and
-once an effect was added. The later level is stricter because a pair of effects can imitate what is in no catalogue.
+once an effect was added. The later level is smaller because a pair of effects can imitate what is in no catalogue.
 Chosen as a tenth of the required 3 % false alarms on null campaigns, for each of the tests that may raise one; measured
 0 of 42 (benchmarks/hidden_effects.py, scoring seeds 16000 and 17000)."""
 

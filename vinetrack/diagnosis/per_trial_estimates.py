@@ -85,7 +85,7 @@ def align_trials(fit: Fit) -> AlignedTrials:
     try:
         return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
     except SimulationError as error:
-        raise FitError(f"The model cannot be followed: {error}") from error
+        raise FitError(f"The model cannot be simulated: {error}") from error
 
 
 def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:

@@ -125,7 +125,7 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
     Projection
     """
     problem = fit.solution.problem
-    p, size, asked = products.n_keys, problem.prior_mean.size, products.n_tested
+    p, size, n_tested = products.n_keys, problem.prior_mean.size, products.n_tested
     X, r, C = slice(0, p), p, slice(p + 1, None)
     blocks, places = products_without_trial_effects(fit, products, state), products.tested_indices
     hessian = sum_matrix_blocks(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
@@ -133,12 +133,16 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
         state.theta - problem.prior_mean
     )
     # Parameters and errors to which a trial does not respond are added up in a last row and column, and dropped.
-    cross, total, score = np.zeros((size + 1, asked + 1)), np.zeros((asked + 1, asked + 1)), np.zeros(asked + 1)
+    cross, total, score = (
+        np.zeros((size + 1, n_tested + 1)),
+        np.zeros((n_tested + 1, n_tested + 1)),
+        np.zeros(n_tested + 1),
+    )
     np.add.at(cross, (problem.index[:, :, None], places[:, None, :]), blocks[:, X, C])
     for part in products.parts:
-        total += _sum_of_blocks(blocks[part, C, C], places[part], asked + 1)
+        total += _sum_of_blocks(blocks[part, C, C], places[part], n_tested + 1)
     np.add.at(score, places, blocks[:, C, r])
-    cross, total, score = cross[:size, :asked], total[:asked, :asked], score[:asked]
+    cross, total, score = cross[:size, :n_tested], total[:n_tested, :n_tested], score[:n_tested]
     estimated = np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~_at_bound(fit))
     inverse = inverse_of_block(hessian, estimated)
     lever, step = inverse @ cross, inverse @ gradient
@@ -193,7 +197,7 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
     Scores
     """
     projection = projected(fit, products, state or fit.state)
-    blocks, index, asked = projection.blocks, fit.solution.problem.index, products.tested_indices
+    blocks, index, tested = projection.blocks, fit.solution.problem.index, products.tested_indices
     p, n_shapes = products.n_keys, products.n_shapes
     X, r, C, S = slice(0, p), p, slice(p + 1, None), slice(p + 1, p + 1 + n_shapes)
     M = _marginalisation(projection.information, n_shapes)
@@ -208,7 +212,7 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
     trial_scores = np.empty((len(blocks), n_shapes))
     trial_informations = np.empty((len(blocks), n_shapes, n_shapes))
     for part in products.parts:
-        of_part, keys, places = blocks[part], index[part], asked[part]
+        of_part, keys, places = blocks[part], index[part], tested[part]
         residual = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[keys])
         trial_scores[part] = np.einsum("nc,ncs->ns", residual[:, C], M_counted[places]) - np.einsum(
             "nk,nks->ns", residual[:, X], lever_M_counted[keys]
@@ -301,11 +305,11 @@ def _marginalisation(information: Floats, n_shapes: int) -> Floats:
 
     Applied to the columns of shapes and systematic errors, it gives those of the shapes with the errors integrated out.
     """
-    asked = len(information)
-    matrix = np.zeros((asked, n_shapes))
+    n_tested = len(information)
+    matrix = np.zeros((n_tested, n_shapes))
     matrix[:n_shapes] = np.eye(n_shapes)
-    if asked > n_shapes:
-        inner = information[n_shapes:, n_shapes:] + np.eye(asked - n_shapes)
+    if n_tested > n_shapes:
+        inner = information[n_shapes:, n_shapes:] + np.eye(n_tested - n_shapes)
         matrix[n_shapes:] = -np.linalg.solve(inner, information[n_shapes:, :n_shapes])
     return matrix
 
