@@ -11,7 +11,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
+from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 
 
 def trial(pressure_kPa: float, **more: Any) -> Trial:
@@ -30,7 +30,7 @@ def trial(pressure_kPa: float, **more: Any) -> Trial:
 
 def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
     """Conditions for an experiment of these trials."""
-    return conditions(with_names(trials), Limits(**limits))
+    return feasible_conditions(with_names(trials), Limits(**limits))
 
 
 def values(found: list[Condition], name: str, unit: float) -> set[float]:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.narrative.law_text import headline, tally, without_law
+from vinetrack.narrative.law_text import damping_headline, status_tally, vines_without_law
 from vinetrack.report.build import ReportContent, ReportFigure, ReportSection, ReportTable, build_report
 from vinetrack.report.section import data_uri
 from vinetrack.report.svg import inline_svg
@@ -114,22 +114,24 @@ def test_the_first_screen_says_n_with_its_error_and_how_many_trials() -> None:
 
 
 def test_one_vine_has_b_in_the_headline() -> None:
-    assert "B = 2.00 (95 %: 1.90 to 2.10) N·(s/m)ⁿ" in headline(damping("v"))
+    assert "B = 2.00 (95 %: 1.90 to 2.10) N·(s/m)ⁿ" in damping_headline(damping("v"))
 
 
 def test_a_refusal_is_the_headline() -> None:
-    assert headline(damping(refused="no vine has enough trials")) == "No damping law: no vine has enough trials."
+    assert (
+        damping_headline(damping(refused="no vine has enough trials")) == "No damping law: no vine has enough trials."
+    )
 
 
 def test_every_status_is_counted() -> None:
     mixed = pd.concat([trials("a"), trials("b", "c", status="failed"), trials("d", status="left_out")])
-    assert tally(mixed) == "4 trials: 1 ok, 2 failed, 1 left out on request."
+    assert status_tally(mixed) == "4 trials: 1 ok, 2 failed, 1 left out on request."
 
 
 def test_vines_that_the_fit_left_out_are_named() -> None:
     fit = damping("v")
     fit["both_axes"] = {**fit["both_axes"], "left_out": {"w": "2 steady trials"}}
-    assert without_law(fit) == ["w: 2 steady trials"]
+    assert vines_without_law(fit) == ["w: 2 steady trials"]
     assert "No B for w: 2 steady trials." in page(damping=fit)
 
 

@@ -244,12 +244,12 @@ def _gather(
 def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Fit the damping law to the steady points: damping.json."""
     with _errors_as_sentences(log):
-        from vinetrack.narrative.law_text import headline
+        from vinetrack.narrative.law_text import damping_headline
         from vinetrack.pipeline.damping_stage import fit_law
 
         with _activity_sign("fitting the damping law, with bootstrap", log):
             law = fit_law(results, _run_settings(settings).damping)
-        typer.echo(headline(law))
+        typer.echo(damping_headline(law))
 
 
 @app.command("model", rich_help_panel="Stages of the workflow")

@@ -33,7 +33,7 @@ from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.planning.campaign_information import FEWEST_GROWTH_FRAMES
-from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
+from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.scaling_priors import damping_prior
 
 MAX_ADDED_TRIALS = 48
@@ -105,7 +105,7 @@ def further_trials(
     most = limits.trials if "trials" in limits.model_fields_set else MAX_ADDED_TRIALS
     before = now.probability_at(value)
     plan = FurtherTrials(now.effect, now.parameter, now.symbol, now.unit, value, target, before, power=now)
-    feasible = conditions(design.trials, limits)
+    feasible = feasible_conditions(design.trials, limits)
     if before >= target or not feasible:
         return replace(plan, unlimited=before)
     search = _Search(design, feasible, now.effect)

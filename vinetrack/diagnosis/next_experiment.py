@@ -25,13 +25,19 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.plan_text import calibration_for, entries, in_words, only_measurement, outlook
+from vinetrack.narrative.plan_text import (
+    advice_text,
+    calibration_advice,
+    only_measurement,
+    separation_text,
+    trial_entries,
+)
 from vinetrack.narrative.verdict_summary import joined
-from vinetrack.planning.design_simulation import Bench, expected, observed, separation
+from vinetrack.planning.design_simulation import DesignProblem, expected_rises, mean_separation, simulated_rises
 from vinetrack.planning.discriminating_design import RefitTerms, best_design, best_new_vines, refit_terms, worth
-from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, conditions
-from vinetrack.planning.hypothesis_predictions import carry
-from vinetrack.planning.simulated_tracks import camera_of, courses
+from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, feasible_conditions
+from vinetrack.planning.hypothesis_predictions import extend
+from vinetrack.planning.simulated_tracks import growth_courses, sampling_of
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 
@@ -113,14 +119,14 @@ def _without_nan(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Option:
-    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `expected`."""
+    """A set of trials (indices of conditions, one a trial) and the expected rises of −2 ln L, see `expected_rises`."""
 
     design: tuple[int, ...]
     rises: Floats
 
     @property
     def separations(self) -> Floats:
-        return separation(self.rises)
+        return mean_separation(self.rises)
 
     @property
     def worth(self) -> float:
@@ -157,7 +163,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     tied = list(tied)[:MAX_HYPOTHESES]
     names = _hypothesis_names(tied)
     if only_measurement(tied):
-        advice = calibration_for(list(itertools.combinations(tied, 2)))
+        advice = calibration_advice(list(itertools.combinations(tied, 2)))
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
         are = "are errors" if len(faults) > 1 else "is an error"
         text = f"Measure before making more trials: {joined(faults)} {are} of measurement. {advice}"
@@ -165,7 +171,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     bench, terms = _feasible_trials(tied, names, limits)
     options = _options(bench, terms, limits, seed)
     if not options:
-        advice = calibration_for(list(itertools.combinations(tied, 2)))
+        advice = calibration_advice(list(itertools.combinations(tied, 2)))
         return NextExperiment(
             text=f"No trial within the limits can be made and simulated. {advice}", calibration=advice
         )
@@ -187,30 +193,34 @@ def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
 
 
-def _feasible_trials(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[RefitTerms]]:
+def _feasible_trials(
+    tied: Sequence[Fit], names: Sequence[str], limits: Limits
+) -> tuple[DesignProblem, list[RefitTerms]]:
     """The hypotheses and conditions that can be simulated, and the quadratic forms of −2 ln L of a trial of each."""
     data = tied[0].predictor.data
-    feasible = conditions([trial_data.trial for trial_data in data], limits)
+    feasible = feasible_conditions([trial_data.trial for trial_data in data], limits)
     if not feasible:
-        return Bench((), (), ()), []
-    cameras = [camera_of(data, condition.like) for condition in feasible]
-    runs = courses([carry(fit, name, feasible) for fit, name in zip(tied, names, strict=True)], feasible, cameras)
+        return DesignProblem((), (), ()), []
+    cameras = [sampling_of(data, condition.like) for condition in feasible]
+    runs = growth_courses(
+        [extend(fit, name, feasible) for fit, name in zip(tied, names, strict=True)], feasible, cameras
+    )
     usable = [
         (condition, camera, run)
         for condition, camera, run in zip(feasible, cameras, runs, strict=True)
         if run is not None
     ]
     if not usable:
-        return Bench((), (), ()), []
-    chosen, samplings, growth_courses = (list(column) for column in zip(*usable, strict=True))
-    hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
+        return DesignProblem((), (), ()), []
+    chosen, samplings, courses = (list(column) for column in zip(*usable, strict=True))
+    hypotheses = [extend(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
     try:
-        return Bench(hypotheses, chosen, samplings), refit_terms(hypotheses, chosen, samplings, growth_courses)
+        return DesignProblem(hypotheses, chosen, samplings), refit_terms(hypotheses, chosen, samplings, courses)
     except SimulationError as error:
         raise FitError(f"Further trials cannot be simulated under every hypothesis: {error}") from error
 
 
-def _options(bench: Bench, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
+def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
     """The best set of trials for each level of effort that gains over the lower ones, with its expected separation.
 
     One level beyond a sufficient one is computed as well, for comparison.
@@ -223,11 +233,11 @@ def _options(bench: Bench, terms: list[RefitTerms], limits: Limits, seed: int) -
         design, predicted = best_design(terms, allowed, limits.trials)
         if predicted > LEAST_GAIN * before:
             before = predicted
-            options.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
+            options.append(_Option(tuple(design.tolist()), expected_rises(bench, design.tolist(), [0], seed)))
     return options
 
 
-def _conditions_by_effort(bench: Bench, terms: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
+def _conditions_by_effort(bench: DesignProblem, terms: list[RefitTerms], trials: int) -> Iterator[NDArray[np.int_]]:
     """Conditions to choose from: with the rig so far, with another rig as well, and with one new vine as well."""
     efforts = np.array([condition.effort for condition in bench.conditions])
     for effort in (SAME_RIG, OTHER_RIG):
@@ -257,14 +267,14 @@ def _recommended(options: Sequence[_Option]) -> _Option:
     return max(options, key=lambda option: option.worth)
 
 
-def _recommendation(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
+def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _recommended(options)
-    best = _Option(best.design, np.concatenate([best.rises, expected(bench, best.design, [1], seed)]))
+    best = _Option(best.design, np.concatenate([best.rises, expected_rises(bench, best.design, [1], seed)]))
     names = [hypothesis.name for hypothesis in bench.hypotheses]
     expected_sigma = _by_pair(best.separations)
     worth_it = max(expected_sigma.values()) >= LEAST_SEPARATION
     draws = max(CHECK_DRAWS.get(len(names), 1) - (min(expected_sigma.values()) > CLEAR_SEPARATION), 1)
-    simulated = _simulated_separations(observed(bench, best.design, range(draws), seed)) if worth_it else {}
+    simulated = _simulated_separations(simulated_rises(bench, best.design, range(draws), seed)) if worth_it else {}
     unresolved = [
         pair
         for pair, sigma in expected_sigma.items()
@@ -272,18 +282,18 @@ def _recommendation(bench: Bench, options: Sequence[_Option], seed: int) -> Next
     ]
     worth_it = worth_it and len(unresolved) < len(expected_sigma)
     fits = [hypothesis.fit for hypothesis in bench.hypotheses]
-    advice = calibration_for([(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)])
+    advice = calibration_advice([(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)])
     sigmas = {_pair_name(names, pair): sigma for pair, sigma in expected_sigma.items()}
     simulated_by_name = {_pair_name(names, pair): mean_and_sd for pair, mean_and_sd in simulated.items()}
-    trials = entries(bench.conditions, best.design)
+    trials = trial_entries(bench.conditions, best.design)
     if_true = {
         _pair_name(names, (a, b)): {names[a]: float(best.separations[a, b]), names[b]: float(best.separations[b, a])}
         for a, b in expected_sigma
     }
     return NextExperiment(
-        text=in_words(
+        text=advice_text(
             trials,
-            outlook(if_true, simulated_by_name),
+            separation_text(if_true, simulated_by_name),
             [_pair_name(names, pair) for pair in unresolved],
             advice,
             worth_it=worth_it,
@@ -295,7 +305,7 @@ def _recommendation(bench: Bench, options: Sequence[_Option], seed: int) -> Next
         simulated_sigma=simulated_by_name,
         alternatives=tuple(
             {
-                "trials": [dict(entry) for entry in entries(bench.conditions, option.design)],
+                "trials": [dict(entry) for entry in trial_entries(bench.conditions, option.design)],
                 "separation_sigma": {_pair_name(names, p): s for p, s in _by_pair(option.separations).items()},
             }
             for option in sorted(options, key=lambda ranked: -ranked.worth)

@@ -65,7 +65,7 @@ DIAGNOSIS_REFERENCES = (
 )
 
 
-def headline(damping: Mapping[str, Any]) -> str:
+def damping_headline(damping: Mapping[str, Any]) -> str:
     """Return the main result in one sentence.
 
     Parameters
@@ -91,7 +91,7 @@ def headline(damping: Mapping[str, Any]) -> str:
     return f"From steady speeds: {law}."
 
 
-def tally(trials: pd.DataFrame) -> str:
+def status_tally(trials: pd.DataFrame) -> str:
     """Return the number of trials of each status, as a sentence.
 
     Parameters
@@ -166,7 +166,7 @@ def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
     return table
 
 
-def without_law(damping: Mapping[str, Any]) -> list[str]:
+def vines_without_law(damping: Mapping[str, Any]) -> list[str]:
     """Return the vines that the preferred fit of `damping.json` left out, each with the reason.
 
     Parameters

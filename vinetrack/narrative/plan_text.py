@@ -56,7 +56,7 @@ def only_measurement(tied: Sequence[Fit]) -> bool:
     return bool(differ) and all(effect.kind == "measurement" for effect in differ)
 
 
-def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
+def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
     """Return what to measure in order to exclude one of each pair of hypotheses, as the files of their effects state.
 
     Where a fault of the measurement is among them, a calibration decides, and only the calibration is returned.
@@ -100,7 +100,7 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
     return f"{words}, {' and '.join(changed)}" if changed else words
 
 
-def outlook(
+def separation_text(
     if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
 ) -> str:
     """Return the expected significance with which the trials separate each pair of hypotheses.
@@ -128,7 +128,7 @@ def outlook(
     return ", ".join(parts)
 
 
-def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
+def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
     """Return the trials of a design as entries of `next_experiment`, one for each condition.
 
     Parameters
@@ -158,7 +158,7 @@ def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
     }
 
 
-def in_words(
+def advice_text(
     trials: Sequence[Mapping[str, Any]],
     promise: str,
     left: Sequence[str],
@@ -171,10 +171,10 @@ def in_words(
 
     Parameters
     ----------
-    trials : entries of `entries`.
-    promise : the text of `outlook`, expected significances.
+    trials : entries of `trial_entries`.
+    promise : the text of `separation_text`, expected significances.
     left : pairs that the trials do not separate.
-    advice : the text of `calibration_for`.
+    advice : the text of `calibration_advice`.
     worth_it : whether the best design separates a pair by at least `least`.
     least : smallest separation that is worth a trial, standard deviations.
 

@@ -5,9 +5,9 @@ origins and noise, and sampled as the experiment films. Every hypothesis is then
 standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain part of its misfit
 as scatter. The squared separation is the increase in the difference of −2 ln L.
 
-There are two levels of detail. `expected` sets the truth to the best values and treats the old trials as linear in the
-parameters, which is fast enough to compare designs. `observed` draws the truth from its distribution given the old
-trials and simulates every trajectory anew, as a check.
+There are two levels of detail. `expected_rises` sets the truth to the best values and treats the old trials as linear
+in the parameters, which is fast enough to compare designs. `simulated_rises` draws the truth from its distribution
+given the old trials and simulates every trajectory anew, as a check.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, initial_trial_effects
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
-from vinetrack.planning.simulated_tracks import TrackSampling, film
+from vinetrack.planning.simulated_tracks import TrackSampling, film_trials
 
 MOST_ITERATIONS = 20
 """Iterations of a refit, at most. Chosen for time: refits start from a fit and end within ten. At half some are cut
@@ -136,7 +136,7 @@ class PartlyLinear(Predictor):
 
 
 @dataclass(frozen=True)
-class Bench:
+class DesignProblem:
     """A design problem: the hypotheses, the candidate conditions and the camera of each."""
 
     hypotheses: Sequence[Hypothesis]
@@ -144,7 +144,7 @@ class Bench:
     cameras: Sequence[TrackSampling]
 
 
-def expected(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
+def expected_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair, the truth at its best values; NaN where a refit fails.
 
     The deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the average.
@@ -165,8 +165,8 @@ def expected(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
     return _rises(bench, design, draws, seed, thorough=False)
 
 
-def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
-    """Return the rises of `expected` with random true parameters and deviations and every trajectory simulated.
+def simulated_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
+    """Return the rises of `expected_rises` with random true parameters and deviations and every trajectory simulated.
 
     Only where the pressure was recorded do the old trials stay linear: to simulate with a recorded pressure takes a
     hundred times as long.
@@ -187,17 +187,17 @@ def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
     return _rises(bench, design, draws, seed, thorough=True)
 
 
-def _rises(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool) -> Floats:
+def _rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool) -> Floats:
     n = len(bench.hypotheses)
     rises = np.full((len(draws), n, n), math.nan)
     before = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in bench.hypotheses])
     for k, a in np.ndindex(len(draws), n):
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = bench.hypotheses[a]
-        theta = drawn(truth, rng) if thorough else truth.theta
+        theta = draw_parameters(truth, rng) if thorough else truth.theta
         deviations = rng.standard_normal((len(design), 2)) if thorough else _alternating(design, draws[k])
         try:
-            filmed = film(truth, design, bench.conditions, bench.cameras, theta, deviations * truth.spread, rng)
+            filmed = film_trials(truth, design, bench.conditions, bench.cameras, theta, deviations * truth.spread, rng)
         except SimulationError:
             continue
         new = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
@@ -213,13 +213,13 @@ def _alternating(design: Sequence[int], draw: int) -> Floats:
     return signs[(np.arange(len(design)) + draw) % 4]
 
 
-def separation(rises: Floats) -> Floats:
+def mean_separation(rises: Floats) -> Floats:
     """Return the square root of the mean rise of −2 ln L over the draws; 0 where a wrong hypothesis fits better.
 
     Parameters
     ----------
     rises : array, shape (n_draws, n, n)
-        From `expected` or `observed`; NaN is ignored.
+        From `expected_rises` or `simulated_rises`; NaN is ignored.
 
     Returns
     -------
@@ -231,7 +231,7 @@ def separation(rises: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(mean, 0.0)))
 
 
-def drawn(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
+def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
 
     Parameters
@@ -310,4 +310,4 @@ def _extended_state(hypothesis: Hypothesis, predictor: PartlyLinear, data: Seque
     )
 
 
-__all__ = ["Bench", "PartlyLinear", "drawn", "expected", "observed", "separation"]
+__all__ = ["DesignProblem", "PartlyLinear", "draw_parameters", "expected_rises", "mean_separation", "simulated_rises"]

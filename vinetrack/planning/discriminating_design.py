@@ -26,7 +26,7 @@ from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, solve_per_trial
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis, ScatterLevel
-from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank
+from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank_trial
 
 POINTS = 100
 """Times at which a condition is evaluated; each stands for the frames around it. Chosen: sums over smooth curves are
@@ -114,10 +114,10 @@ def refit_terms(
 
     Parameters
     ----------
-    hypotheses : extended to the conditions, see `hypothesis_predictions.carry`.
+    hypotheses : extended to the conditions, see `hypothesis_predictions.extend`.
     conditions : trials that could be made.
     cameras : of each condition.
-    runs : course of growth of each condition, see `simulated_tracks.courses`.
+    runs : course of growth of each condition, see `simulated_tracks.growth_courses`.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def refit_terms(
     """
     data = hypotheses[0].fit.predictor.data
     times, weights = zip(*(_times(camera, run) for camera, run in zip(cameras, runs, strict=True)), strict=True)
-    placeholders = [blank(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
+    placeholders = [blank_trial(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
     trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
     predictors = [hypothesis.predictor(range(len(conditions)), placeholders) for hypothesis in hypotheses]
     columns = [

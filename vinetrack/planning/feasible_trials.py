@@ -69,7 +69,7 @@ class Condition:
     changed: tuple[str, ...] = ()
 
 
-def conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
+def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
     """Return every candidate trial; empty where the limits exclude all.
 
     Parameters

@@ -111,7 +111,7 @@ class Hypothesis:
         return predictor
 
 
-def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
+def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     """Extend a fit to further conditions; new vines add parameters with priors.
 
     Parameters

@@ -50,7 +50,7 @@ class TrackSampling:
     longest_s: float
 
 
-def camera_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
+def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
     """Return how the experiment films, at the frame rate of the trial at `like`.
 
     Parameters
@@ -95,7 +95,7 @@ class GrowthCourse:
     ends_s: float
 
 
-def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
+def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
     """Return the data of a candidate trial at these times; a recorded pressure is constant.
 
     Parameters
@@ -128,7 +128,7 @@ def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_p
     )
 
 
-def courses(
+def growth_courses(
     hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
 ) -> list[GrowthCourse | None]:
     """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt.
@@ -145,7 +145,7 @@ def courses(
     """
     data = hypotheses[0].fit.predictor.data
     times = [np.linspace(0.0, camera.longest_s, SIMULATED_TIMES) for camera in cameras]
-    items = [blank(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
+    items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
     trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
     runs: list[list[Trajectory | None]] = []
     jobs: list[Job] = []
@@ -219,7 +219,7 @@ def _largest_speed_ratio(fit: Fit) -> float:
     return max((value for value in ratios if math.isfinite(value)), default=0.0)
 
 
-def film(
+def film_trials(
     truth: Hypothesis,
     places: Sequence[int],
     conditions: Sequence[Condition],
@@ -254,7 +254,7 @@ def film(
         camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
         for camera in of_chosen
     ]
-    items = [blank(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
+    items = [blank_trial(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
     predictor = truth.predictor(places, items)
     trial_effects = np.zeros((len(chosen), N_TRIAL_EFFECTS))
     trial_effects[:, RELEASE] = [(camera.rest_frames - 1 + rng.uniform()) * camera.frame_s for camera in of_chosen]

@@ -14,12 +14,12 @@ from vinetrack.narrative.law_text import (
     DIAGNOSIS_METHODS,
     DIAGNOSIS_REFERENCES,
     REFERENCES,
+    damping_headline,
     exponent_table,
-    headline,
     methods,
-    tally,
+    status_tally,
     vine_table,
-    without_law,
+    vines_without_law,
 )
 from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_section
 from vinetrack.report.model_section import ModelResult, model_section
@@ -105,11 +105,11 @@ def build_report(content: ReportContent) -> str:
     return environment.get_template("report.html").render(
         name=content.name,
         style=Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
-        headline=headline(content.damping),
-        tally=tally(content.trials),
+        headline=damping_headline(content.damping),
+        tally=status_tally(content.trials),
         notes=content.notes,
         exponents=exponent_table(content.damping),
-        without_law=without_law(content.damping),
+        without_law=vines_without_law(content.damping),
         vines=vine_table(content.damping),
         model=model_section(content.model),
         diagnosis=diagnosis_section(content.diagnosis),
