@@ -38,7 +38,8 @@ class Truth:
     """What a recording shows. Arrays have shape (n_frames,), one entry for every frame in the file, in order.
 
     `source_frame` is the frame of the undisturbed recording that is shown; `time_s` its mid-exposure; `in_frame` says
-    whether the tip is inside the picture; −1 and NaN where a frame shows nothing. Positions as in the module's text.
+    whether the tip is inside the picture; −1 and NaN where a frame shows nothing. Positions are defined in the module
+    docstring.
     """
 
     source_frame: NDArray[np.int_]
@@ -54,7 +55,7 @@ class Truth:
     exposure_s: float
 
     def write_csv(self, path: Path) -> None:
-        """Write one row a frame.
+        """Write one row for each frame.
 
         Parameters
         ----------
@@ -118,7 +119,7 @@ class FrameRenderer:
         self._prepare_sensor()
 
     def _hang_backdrop(self, maps: PathMaps) -> None:
-        """Paint the backdrop on plane pixels and see it once through the lens, for frames without shake."""
+        """Paint the backdrop on plane pixels and project it through the lens once, for frames without shake."""
         margin = 4 + math.ceil(4 * self.scene.shake_px)
         x0, y0 = (math.floor(part.min()) - margin for part in (maps.plane_x, maps.plane_y))
         x1, y1 = (math.ceil(part.max()) + margin for part in (maps.plane_x, maps.plane_y))
@@ -175,7 +176,7 @@ class FrameRenderer:
         return light
 
     def backdrop(self) -> Image:
-        """Light of everything that does not move, shape (height, width)."""
+        """Light of the static scene, shape (height, width)."""
         return self._still.copy()
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
@@ -252,7 +253,7 @@ class FrameRenderer:
 
 
 def frame_order(scene: Scene, n_frames: int) -> NDArray[np.int_]:
-    """Which frame of the undisturbed recording each frame of the file shows; −1 for rubbish.
+    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a spoiled frame.
 
     Parameters
     ----------
@@ -297,7 +298,7 @@ def render_recording(
     scene : what stands before the camera.
     motion : position of the leading edge, m: a function of time, s, or samples (time, position).
     n_frames : of the undisturbed recording.
-    capture_fps : frames a second.
+    capture_fps : frames per second.
     out_path : of the recording.
     exposure_s : of a frame; the scene's fraction of a frame if None.
     seed : of noise and textures.

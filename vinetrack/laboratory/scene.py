@@ -254,7 +254,7 @@ def _presets() -> dict[str, Scene]:
 
 
 PRESETS = tuple(_presets())
-"""Names that `preset` knows."""
+"""Names of presets."""
 
 
 def preset(name: str) -> Scene:

@@ -17,7 +17,7 @@ NORMAL_BITS = 12
 """Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level. Chosen;
 each bit more doubles the table."""
 TAIL_TAPER_PX = 30.0
-"""Over this length the tail's end, a crumpled bunch of film, comes to nothing. Chosen by eye."""
+"""Length over which the end of the tail, a crumpled bunch of film, fades out. Chosen by eye."""
 
 
 @njit(cache=True)

@@ -121,7 +121,7 @@ def _paint_board(
 
 
 def plane_seen(camera: Camera) -> Floats:
-    """Point of the plane that each pixel's middle sees, from where the optical axis meets it; (height, width, 2), m.
+    """Return the point of the plane at the centre of each pixel, relative to the optical axis; (height, width, 2), m.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> 
 
 
 class TargetRenderer:
-    """Frames of a target that stands still, or moves from frame to frame as `moves` says.
+    """Frames of a target that is still, or changes from frame to frame as `moves` specifies.
 
     Stands in for `render.FrameRenderer` where a file is written. `moves` lists, for each frame, what changes:
     fields of `Target` such as `{"centre_m": (0.01, 0)}` or of `Camera` such as `{"tilt_x_deg": 10}`.

@@ -1,7 +1,7 @@
-"""Surfaces of the virtual laboratory, painted once a recording: backdrop with ruler and launcher, film, tail, ball.
+"""Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film, tail, ball.
 
-All are float32 radiances or fractions on a grid of plane pixels. Each takes its own random generator, so that one
-surface does not change when another gets more detail.
+All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that a change of
+one surface does not change the others.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from vinetrack.laboratory.scene import Ball, Scene, Tube
 Image = NDArray[np.float32]
 
 OVERSAMPLING = 4
-"""Sub-pixels per pixel when lines are drawn, so that their edges lie within 1/8 px of where they belong. Derived: half
-a sub-pixel."""
+"""Sub-pixels per pixel for drawing lines. Derived: edges are then within half a sub-pixel, 1/8 px, of their
+positions."""
 
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
@@ -40,7 +40,7 @@ def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, i
 
 
 def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
-    """The wall behind: a gradient along the path, soft blotches and grain."""
+    """The wall in the background: a gradient along the path, soft blotches and grain."""
     look = scene.backdrop
     shape = (along.shape[0], along.shape[1])
     span = max(float(along.max()), 1.0)
@@ -123,7 +123,7 @@ def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -
 
 
 def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
-    """Out-of-focus things on the wall: an aluminium profile with its slot, a hose, a label."""
+    """Out-of-focus objects on the wall: an aluminium profile with its slot, a hose, a label."""
     import cv2
 
     height, width = canvas.shape
@@ -149,7 +149,7 @@ def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
 
 
 def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
-    """Paint everything that does not move, blurred by the optics.
+    """Paint the static scene, blurred by the optics.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""The paper's published numbers set beside ours."""
+"""Comparison of the published numbers of the paper with ours."""

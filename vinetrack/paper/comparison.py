@@ -138,7 +138,7 @@ def _since_release(
 def position_errors(
     conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """How far trials lie from Eq. (2) with the printed B and n, their mean and each alone, columns `POSITION_COLUMNS`.
+    """Compare positions with Eq. (2) and the printed B and n, of the mean and of single trials (`POSITION_COLUMNS`).
 
     From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
 
