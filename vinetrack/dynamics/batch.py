@@ -206,25 +206,31 @@ def _limits(
         for k in np.flatnonzero(on[:, effect]).tolist():
             film[k] *= function(_NOTHING, TrialInputs(*inputs[k]), *thetas[k, place])
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
-    left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
-    loss = np.asarray(rig.mass_loss)
-    floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
-    broken = [i for i, effect in enumerate(model.effects) if effect.breakpoints is not None and on[:, i].any()]
-    if not broken and not any(bends):
-        return floor[:, None].copy(), end
+    everting_mass_kg = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
+    mass_loss_kg_m = np.asarray(rig.mass_loss)
+    floor_x_m = np.where(
+        mass_loss_kg_m > 0,
+        np.maximum(everting_mass_kg, 0.0) / np.where(mass_loss_kg_m > 0, mass_loss_kg_m, 1.0),
+        math.inf,
+    )
+    with_breakpoints = [
+        i for i, effect in enumerate(model.effects) if effect.breakpoints is not None and on[:, i].any()
+    ]
+    if not with_breakpoints and not any(bends):
+        return floor_x_m[:, None].copy(), end
     positions_m = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
-    for i in broken:
+    for i in with_breakpoints:
         of_effect = model.effects[i].breakpoints
         assert of_effect is not None
-        known: dict[tuple[bytes, bytes], list[float]] = {}
+        cached: dict[tuple[bytes, bytes], list[float]] = {}
         for k in np.flatnonzero(on[:, i]).tolist():
             # Finite differences change one parameter of a trial at a time, and most affect no breakpoint.
             key = inputs[k].tobytes(), thetas[k, model.places[i]].tobytes()
-            if key not in known:
-                known[key] = list(of_effect(TrialInputs(*inputs[k]), *thetas[k, model.places[i]]))
-            positions_m[k] += known[key]
+            if key not in cached:
+                cached[key] = list(of_effect(TrialInputs(*inputs[k]), *thetas[k, model.places[i]]))
+            positions_m[k] += cached[key]
     breakpoints = np.full((len(inputs), 1 + max(map(len, positions_m), default=0)), math.inf)
-    breakpoints[:, 0] = floor
+    breakpoints[:, 0] = floor_x_m
     for k, positions in enumerate(positions_m):
         breakpoints[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
     return np.sort(breakpoints, axis=1), end

@@ -205,8 +205,8 @@ def _with_consistent_area(hooks: _HookCaller, state: State, rig: TrialInputs) ->
     start, plain = state.pressure, state.area
     area = plain
     for turn in range(30):
-        before, area = area, hooks("area", state._replace(area=plain), rig, plain, "area")
-        if turn > 0 and np.all(np.abs(area - before) <= 1e-10 * area):
+        previous_area, area = area, hooks("area", state._replace(area=plain), rig, plain, "area")
+        if turn > 0 and np.all(np.abs(area - previous_area) <= 1e-10 * area):
             break
         state = state._replace(area=area, pressure=start)
         state = state._replace(pressure=hooks("pressure", state, rig, start, "pressure"))
@@ -231,11 +231,11 @@ def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any
     pressure = np.empty(shape)
     pressure[0] = float(fields[State._fields.index("set_pressure")][0])
     for i, step in enumerate(np.diff(state.time)):
-        now = float(pressure[i])
-        change = rate(i, now)
-        delta = 1e-6 * (abs(now) + 1e3)
-        decay = step * (rate(i, now + delta) - change) / delta
-        pressure[i + 1] = now + step * change * (np.expm1(decay) / decay if decay else 1.0)
+        current = float(pressure[i])
+        change = rate(i, current)
+        delta = 1e-6 * (abs(current) + 1e3)
+        decay = step * (rate(i, current + delta) - change) / delta
+        pressure[i + 1] = current + step * change * (np.expm1(decay) / decay if decay else 1.0)
     return pressure
 
 

@@ -125,8 +125,8 @@ class Model:
             for hook, function in effect.functions.items():
                 functions.setdefault(hook, []).append((effect.order, i, function, place))
         return {
-            hook: [(i, function, place) for _, i, function, place in sorted(known, key=lambda entry: entry[0])]
-            for hook, known in functions.items()
+            hook: [(i, function, place) for _, i, function, place in sorted(entries, key=lambda entry: entry[0])]
+            for hook, entries in functions.items()
         }
 
     def __add__(self, other: Effect | str) -> Model:

@@ -226,12 +226,12 @@ def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, 
     """Fill the rows of `out` from `row` up to a fraction of a step with r·y, r·ẏ, r·ÿ of the tip; the next row."""
     r = trial.inputs[RATIO]
     while row < times.size and times[row] <= time + fraction * h:
-        now = _slack_at((times[row] - time) / h, h, s, end, k)
-        speed = _free_tip_speed(equations, trial, times[row], r * now.y, now.chamber, u, u > 0)
-        out[row, 0] = r * now.y
+        state = _slack_at((times[row] - time) / h, h, s, end, k)
+        speed = _free_tip_speed(equations, trial, times[row], r * state.y, state.chamber, u, u > 0)
+        out[row, 0] = r * state.y
         out[row, 1] = speed
         out[row, 2] = (u_end - u) / h
-        out[row, 3] = equations.observed(times[row], r * now.y, speed, now.chamber, trial)
+        out[row, 3] = equations.observed(times[row], r * state.y, speed, state.chamber, trial)
         row += 1
     return row
 
@@ -275,8 +275,8 @@ def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
         if row == times.size and time + fraction * h > until:
             return RUNNING, row, Point(until, end.x, end.v, 0.0, end.chamber), u_end
         if status != RUNNING:
-            now = _slack_at(fraction, h, s, end, k)
-            return status, row, Point(time + fraction * h, r * now.y, max(now.v, 0.0), 0.0, now.chamber), u_end
+            state = _slack_at(fraction, h, s, end, k)
+            return status, row, Point(time + fraction * h, r * state.y, max(state.v, 0.0), 0.0, state.chamber), u_end
         time += h
         s = _resting_on_tip(end, stop / r + end.y, u_end / r)
         u = _slack_rates(equations, trial, time, s, u_end, u_end > 0, k[0])

@@ -77,8 +77,8 @@ def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: F
     volume = inputs[:, place["area"]] * inputs[:, place["length"]] / inputs[:, place["travel_ratio"]] ** 2
     changed[:, place["set_pressure"]] = set_pressure_Pa
     changed[:, place["least_mass"]] += denser * volume
-    known = ~np.isnan(yield_pressure_Pa)
-    changed[known, place["yield_pressure"]] = yield_pressure_Pa[known]
+    given = ~np.isnan(yield_pressure_Pa)
+    changed[given, place["yield_pressure"]] = yield_pressure_Pa[given]
     return changed
 
 

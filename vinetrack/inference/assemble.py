@@ -252,10 +252,10 @@ def _trial_effect_sigma(solution: Solution, precision_of_fit: Precision) -> Floa
 
 def _trial_fits(predictor: Predictor, solution: Solution, precision_of_fit: Precision) -> tuple[TrialFit, ...]:
     state, sigma = solution.state, _trial_effect_sigma(solution, precision_of_fit)
-    moved = predictor.trajectories_at(state.theta, state.trial_effects)
+    trajectories = predictor.trajectories_at(state.theta, state.trial_effects)
     return tuple(
-        trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
-                  moved[i].lead_velocity_m_s, state.rho,
+        trial_fit(trial_data, state.trial_effects[i], sigma[i], trajectories[i].observed_position_m,
+                  trajectories[i].lead_velocity_m_s, state.rho,
                   float(state.variance[i]))
         for i, trial_data in enumerate(predictor.data)
     )  # fmt: skip

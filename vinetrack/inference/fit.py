@@ -131,8 +131,8 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     FitError
         If no trial moves.
     """
-    moved = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
-    if any(float(np.ptp(trajectory.observed_position_m)) > STANDSTILL_M for trajectory in moved):
+    trajectories = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
+    if any(float(np.ptp(trajectory.observed_position_m)) > STANDSTILL_M for trajectory in trajectories):
         return
     model = " + ".join(predictor.layout.model.names)
     angles = sorted({round(math.degrees(trial_data.trial.growth_angle_rad)) for trial_data in predictor.data})

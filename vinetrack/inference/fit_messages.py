@@ -170,11 +170,14 @@ def _smoothing_messages(data: Sequence[FitTrial]) -> list[str]:
 
 def _pressure_messages(data: Sequence[FitTrial]) -> list[str]:
     """A note on recorded pressures that the fit corrected."""
-    moved = [float(np.max(np.abs(trace_correction_Pa(each)))) for each in data if each.trace_error_sizes is not None]
-    if not moved:
+    corrections = [
+        float(np.max(np.abs(trace_correction_Pa(each)))) for each in data if each.trace_error_sizes is not None
+    ]
+    if not corrections:
         return []
-    trials = f"{len(moved)} trials" if len(moved) > 1 else "one trial"
+    trials = f"{len(corrections)} trials" if len(corrections) > 1 else "one trial"
+    largest_kPa = max(corrections) / 1e3
     return [
-        f"recorded pressures of {trials} are corrected by up to {max(moved) / 1e3:.2g} kPa, within the errors that the"
-        " noise of the gauge leaves, to agree with the motion"
+        f"recorded pressures of {trials} are corrected by up to {largest_kPa:.2g} kPa, within the errors that the noise"
+        " of the gauge leaves, to agree with the motion"
     ]

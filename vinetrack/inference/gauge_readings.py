@@ -210,14 +210,14 @@ def _resolution(pressure_Pa: Floats) -> float:
 
 def _common_divisor(values: Floats, exact: float) -> float:
     """Largest number that divides all differences of values to within `exact`, by Euclid's algorithm; 0 if none."""
-    left = np.unique(np.abs(values - values[0]))
-    left = left[left > exact]
-    while left.size > 1:
-        least = left[0]
-        remainder = np.mod(left, least)
-        remainder = np.unique(np.minimum(remainder, least - remainder))
-        left = np.concatenate([remainder[remainder > exact], [least]])
-    return float(left[0]) if left.size and left[0] > 2 * exact else 0.0
+    remainders = np.unique(np.abs(values - values[0]))
+    remainders = remainders[remainders > exact]
+    while remainders.size > 1:
+        smallest = remainders[0]
+        remainder = np.mod(remainders, smallest)
+        remainder = np.unique(np.minimum(remainder, smallest - remainder))
+        remainders = np.concatenate([remainder[remainder > exact], [smallest]])
+    return float(remainders[0]) if remainders.size and remainders[0] > 2 * exact else 0.0
 
 
 def _straight_runs(values: Floats, reach: float) -> NDArray[np.intp]:

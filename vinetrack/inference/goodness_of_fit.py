@@ -41,9 +41,11 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     data = predictor.data
     rho = track_correlation(data)
     noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), variance_floor(data))
-    left = at_correlation(solution.cross_products, rho)[:, -1, -1]
-    accepted = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.has_deviation.any(axis=1)
-    return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - accepted, 1.0)))
+    residual_squares = at_correlation(solution.cross_products, rho)[:, -1, -1]
+    fitted_degrees = (
+        np.count_nonzero(solution.problem.free) / residual_squares.size + 2 + solution.problem.has_deviation.any(axis=1)
+    )
+    return float(np.sum(residual_squares / noise) / np.sum(np.maximum(solution.problem.points - fitted_degrees, 1.0)))
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
@@ -78,8 +80,8 @@ def relative_residual(predictor: Predictor, solution: Solution) -> float:
     -------
     float
     """
-    parts = [
+    relative = [
         math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
         for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
     ]
-    return float(np.median(parts))
+    return float(np.median(relative))

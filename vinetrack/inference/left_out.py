@@ -97,7 +97,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
     predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
     data = predictor.data
     try:
-        moved = predictor.run(predictor.jobs(np.empty(0), trial_effects))
+        trajectories = predictor.run(predictor.jobs(np.empty(0), trial_effects))
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     sigma = np.zeros((len(data), N_TRIAL_EFFECTS))
@@ -107,8 +107,8 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
             trial_data,
             trial_effects[i],
             sigma[i],
-            moved[i].observed_position_m,
-            moved[i].lead_velocity_m_s,
+            trajectories[i].observed_position_m,
+            trajectories[i].lead_velocity_m_s,
             rho,
             variance,
         )
@@ -152,7 +152,7 @@ def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) ->
     return predictor, trial_effects, square
 
 
-def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
+def scaled_least_squares(design: Floats, residual: Floats, least: float) -> Floats:
     """Least squares with columns scaled to unit length; directions that are hardly determined get zero.
 
     At constant speed a later release and a higher origin are collinear.
@@ -160,7 +160,7 @@ def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
     Parameters
     ----------
     design : array, shape (n_points, n_columns)
-    left : array, shape (n_points,)
+    residual : array, shape (n_points,)
         Right-hand side.
     least : float
         Least singular value that counts, relative to the largest.
@@ -170,7 +170,7 @@ def scaled_least_squares(design: Floats, left: Floats, least: float) -> Floats:
     array, shape (n_columns,)
     """
     length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(design / length, left, rcond=least)[0] / length)
+    return np.asarray(np.linalg.lstsq(design / length, residual, rcond=least)[0] / length)
 
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:

@@ -84,11 +84,13 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     white = at_zero_deviations(white, state, -1)
-    flat = white[:, :2, :2] + problem.release_origin_precision[:, :, None] * np.eye(2)
-    left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(flat, white[:, :2, 2:])
+    alignment_information = white[:, :2, :2] + problem.release_origin_precision[:, :, None] * np.eye(2)
+    reduced = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_per_trial(alignment_information, white[:, :2, 2:])
     log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
-    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(problem.release_origin_precision).sum(axis=1))
-    return Marginal(left, float(log_noise + log_flat + np.sum(problem.points) * math.log(2 * math.pi)))
+    log_alignment = np.sum(
+        np.linalg.slogdet(alignment_information)[1] - np.log(problem.release_origin_precision).sum(axis=1)
+    )
+    return Marginal(reduced, float(log_noise + log_alignment + np.sum(problem.points) * math.log(2 * math.pi)))
 
 
 def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
@@ -200,11 +202,11 @@ def profiled_deviance(
     total = constant - float(step @ (2 * slope - information @ step))
     k = np.flatnonzero(moving)
     if k.size:
-        inside = information if moving.all() else information[np.ix_(k, k)]
+        information_inside = information if moving.all() else information[np.ix_(k, k)]
         if restricted:
-            total += float(np.linalg.slogdet(inside)[1])
+            total += float(np.linalg.slogdet(information_inside)[1])
         elif problem.random is not None and problem.random[k].any():
-            total += _groups_integrated(inside, problem.prior_precision[k], problem.random[k])
+            total += _groups_integrated(information_inside, problem.prior_precision[k], problem.random[k])
     return total
 
 

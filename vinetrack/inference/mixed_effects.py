@@ -193,8 +193,8 @@ def sum_matrix_blocks(blocks: Floats, problem: MixedProblem) -> Floats:
     """
     p = problem.prior_mean.size
     columns = problem.places
-    flat = columns[:, :, None] * (p + 1) + columns[:, None, :]
-    total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
+    flat_index = columns[:, :, None] * (p + 1) + columns[:, None, :]
+    total = np.bincount(flat_index.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
 
@@ -314,8 +314,8 @@ def bounded_solve(
     if moving.all():
         # In most calls no bound is active, and a single solve suffices. A fit calls this some hundred times.
         full_step = solve_scaled(square, slope)
-        room = np.where(full_step > 0, problem.upper - theta, theta - problem.lower)
-        if (np.abs(full_step) <= room).all():
+        distance_to_bound = np.where(full_step > 0, problem.upper - theta, theta - problem.lower)
+        if (np.abs(full_step) <= distance_to_bound).all():
             return full_step, moving
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
@@ -328,9 +328,9 @@ def bounded_solve(
         )
         # Go as far as the first bound, which lowers the sum of squares; fix those parameters and solve for the others.
         current = theta[k] + step[k]
-        room = np.where(remaining_step > 0, problem.upper[k] - current, problem.lower[k] - current)
+        distance_to_bound = np.where(remaining_step > 0, problem.upper[k] - current, problem.lower[k] - current)
         with np.errstate(divide="ignore", invalid="ignore"):
-            part = np.where(remaining_step == 0, np.inf, np.maximum(room / remaining_step, 0.0))
+            part = np.where(remaining_step == 0, np.inf, np.maximum(distance_to_bound / remaining_step, 0.0))
         first = float(np.min(part))
         if first >= 1:
             step[k] += remaining_step

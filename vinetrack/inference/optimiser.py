@@ -265,8 +265,8 @@ def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted
     With n points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares
     except the noise itself.
     """
-    left = 1 - predicted_decrease / max(penalised_squares, 1e-300)
-    return -float(np.sum(problem.points)) * math.log(left) if left > 0 else math.inf
+    remaining = 1 - predicted_decrease / max(penalised_squares, 1e-300)
+    return -float(np.sum(problem.points)) * math.log(remaining) if remaining > 0 else math.inf
 
 
 def _decrease_per_step(deviances: Sequence[float]) -> float:

@@ -34,9 +34,9 @@ def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
 
 def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
     """The layout of these trials and parameters; names, scales and priors are unchanged."""
-    moved = np.full(len(layout.free) + 1, -1)
-    moved[places] = np.arange(places.size)
-    index = moved[layout.index[rows]]
+    new_index = np.full(len(layout.free) + 1, -1)
+    new_index[places] = np.arange(places.size)
+    index = new_index[layout.index[rows]]
     columns = np.flatnonzero((index >= 0).any(axis=0))
     return replace(
         layout,

@@ -159,26 +159,26 @@ def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
     solution, data = basis.solution, fit.predictor.data
     pairs = [_leave_one_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
-    seen = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
-    if not seen:
+    predictable = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
+    if not predictable:
         return Calibration(0.0, NORMAL_95, math.inf, 0)
-    square = np.array([np.mean(residual**2) for _, residual, _ in seen])
-    mean_variance = np.array([np.mean(variance) for *_, variance in seen])
-    travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in seen])
+    square = np.array([np.mean(residual**2) for _, residual, _ in predictable])
+    mean_variance = np.array([np.mean(variance) for *_, variance in predictable])
+    travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in predictable])
     delta2 = _paule_mandel(square, mean_variance, travel2)
     assumed = delta2 == 0.0 and not basis.between.any() and not any(solution.estimable)
     # Restricted likelihood loses a degree of freedom for each fitted parameter; δ and τ lose one.
     fitted = 1 if delta2 > 0 or basis.between.any() else int(np.count_nonzero(solution.problem.prior_precision == 0))
-    degrees = math.inf if assumed else max(float(len(seen) - fitted), 1.0)
-    reached = np.sort(
+    degrees = math.inf if assumed else max(float(len(predictable) - fitted), 1.0)
+    reaches = np.sort(
         [
             np.quantile(np.abs(residual) / np.sqrt(variance + delta2 * scale), COVERED_POSITIONS)
-            for (_, residual, variance), scale in zip(seen, travel2, strict=True)
+            for (_, residual, variance), scale in zip(predictable, travel2, strict=True)
         ]
     )
-    enough = min(math.ceil(COVERAGE * (len(seen) + 1)), len(seen))
-    reach = max(float(student(np.array([degrees]))[0]), float(reached[enough - 1]))
-    return Calibration(math.sqrt(delta2), reach, degrees, len(seen))
+    enough = min(math.ceil(COVERAGE * (len(predictable) + 1)), len(predictable))
+    reach = max(float(student(np.array([degrees]))[0]), float(reaches[enough - 1]))
+    return Calibration(math.sqrt(delta2), reach, degrees, len(predictable))
 
 
 def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:

@@ -264,8 +264,8 @@ class Predictor:
         )
         observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(effect_sets))]
         return [
-            self.by_trial(self._residuals(left_m, effects))
-            for left_m, effects in zip(observed_m, effect_sets, strict=True)
+            self.by_trial(self._residuals(observed_of_set, effects))
+            for observed_of_set, effects in zip(observed_m, effect_sets, strict=True)
         ]
 
     def _residuals(self, observed_m: Floats, trial_effects: Floats) -> Floats:
@@ -327,7 +327,9 @@ class Predictor:
             points = self._points_of(perturbed.trial)
             if past_end:
                 pairs = zip(perturbed.trial, trajectories[jobs], strict=True)
-                change = np.concatenate([position_change(trajectories[i], moved) for i, moved in pairs])
+                change = np.concatenate(
+                    [position_change(trajectories[i], perturbed_trajectory) for i, perturbed_trajectory in pairs]
+                )
             else:
                 change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
                 self._clip_after_end(change, motions, perturbed.trial, jobs)
@@ -351,10 +353,10 @@ class Predictor:
         if not np.any(ends[trials, 0] == ENDED):
             return
         starts = starts_of([self.times_s[i] for i in trials])
-        for k, (i, moved) in enumerate(zip(trials, ends[jobs], strict=True)):
+        for k, (i, perturbed_end) in enumerate(zip(trials, ends[jobs], strict=True)):
             if ends[i, 0] == ENDED:
                 over = motions.stamps(i) > ends[i, 1]
-                clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=moved[0] == ENDED)
+                clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=perturbed_end[0] == ENDED)
 
     def products(self, columns: Sequence[Floats]) -> Floats:
         """Cross products of the columns of every trial under its noise, see `whitening`.

@@ -109,10 +109,10 @@ class Systematics:
         """
         if self.estimated_m is None:
             return list(columns)
-        whole = [of_fit.copy() for of_fit in columns]
-        for of_fit, trial_estimate_m in zip(whole, self.estimated_m, strict=True):
+        restored = [of_fit.copy() for of_fit in columns]
+        for of_fit, trial_estimate_m in zip(restored, self.estimated_m, strict=True):
             of_fit[:, -1] += trial_estimate_m
-        return whole
+        return restored
 
     @property
     def n_columns(self) -> int:
@@ -187,8 +187,8 @@ def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[T
     except SimulationError:
         return no_errors
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
-    for i, before, after in zip(loaded, plain, heavier, strict=True):
-        columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
+    for i, plain_trajectory, heavier_trajectory in zip(loaded, plain, heavier, strict=True):
+        columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(plain_trajectory, heavier_trajectory)
     names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
     return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
 
@@ -213,11 +213,11 @@ def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[Trial
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     other = Predictor(predictor.layout, [_with_heavier_film(each) for each in predictor.data], predictor.host)
     try:
-        plain, moved = predictor.run(jobs), other.run(jobs)
+        plain, heavier = predictor.run(jobs), other.run(jobs)
     except SimulationError:
         with_film = []
     for i in with_film:
-        columns[i][:, 0] = position_change(plain[i], moved[i])
+        columns[i][:, 0] = position_change(plain[i], heavier[i])
     if not with_film:
         return Systematics.none([trial.time_s.size for trial in trials])
     return _one_per_group(columns, [trial.trial.vine if i in with_film else None for i, trial in enumerate(trials)])
@@ -279,8 +279,8 @@ def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only:
         for k in range(n_columns):
             rows = [i for i, count in enumerate(counts) if count > k]
             other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
-            for i, moved in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
-                columns[i][:, k] = position_change(plain[i], moved)
+            for i, perturbed in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
+                columns[i][:, k] = position_change(plain[i], perturbed)
                 places[i, k] = begins[i] + k
     except SimulationError:
         return no_errors
@@ -313,8 +313,8 @@ def _tracker_errors(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Fl
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     # With extreme parameters no trial moves, and all growth fractions are zero.
-    reach = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
-    return [_slow_shapes(growth_m / reach, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
+    largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
+    return [_slow_shapes(growth_m / largest_growth_m, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
 
 
 def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
@@ -326,8 +326,8 @@ def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
     if slow_m is None:
         return np.zeros((part.size, HALF_WAVES + 2 + len(END_SHAPES)))
     usual = np.minimum(slow_m, np.median(slow_m))
-    beyond = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
+    excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
     waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
     start = np.exp(-np.maximum(part, 0.0) / START_FRACTION)
-    ends = [times * usual * np.exp((part - np.max(part)) / reach) for reach, times in END_SHAPES]
-    return np.column_stack([waves, beyond * start, beyond * (1 - start), *ends])
+    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in END_SHAPES]
+    return np.column_stack([waves, excess * start, excess * (1 - start), *ends])

@@ -117,13 +117,17 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
     -------
     array, shape (n_trials, 4)
     """
-    reach = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
-    moved = trial_effects + step
-    moved[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
+    largest_release_step = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
+    effects = trial_effects + step
+    effects[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(
+        step[:, RELEASE], -largest_release_step, largest_release_step
+    )
     deviations = [PRESSURE, DAMPING_DEVIATION]
     deviation_step = np.clip(step[:, deviations], -LARGEST_DEVIATION_STEP, LARGEST_DEVIATION_STEP)
-    moved[:, deviations] = np.clip(trial_effects[:, deviations] + deviation_step, -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    return moved
+    effects[:, deviations] = np.clip(
+        trial_effects[:, deviations] + deviation_step, -LARGEST_DEVIATION, LARGEST_DEVIATION
+    )
+    return effects
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a long step: see `whitening`

@@ -80,22 +80,22 @@ def decrease_within_bounds(
         for i in range(count):
             u = places[i]
             remaining[i] = scale[i] * remaining[i] - step[u]
-            room = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
+            distance_to_bound = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
             if remaining[i] != 0:
-                fraction_to_bound = min(fraction_to_bound, max(room / remaining[i], 0.0))
+                fraction_to_bound = min(fraction_to_bound, max(distance_to_bound / remaining[i], 0.0))
         bound_met = fraction_to_bound < 1
         for i in range(count):
             u = places[i]
-            room = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
-            if bound_met and remaining[i] != 0 and max(room / remaining[i], 0.0) <= fraction_to_bound:
+            distance_to_bound = above[u] - step[u] if remaining[i] > 0 else -below[u] - step[u]
+            if bound_met and remaining[i] != 0 and max(distance_to_bound / remaining[i], 0.0) <= fraction_to_bound:
                 moving[u] = False
             step[u] += min(fraction_to_bound, 1.0) * remaining[i]
     decrease = 0.0
     for u in range(size):
-        along = 0.0
+        product = 0.0
         for v in range(size):
-            along += matrix[u, v] * step[v]
-        decrease += step[u] * (2 * slope[u] - along)
+            product += matrix[u, v] * step[v]
+        decrease += step[u] * (2 * slope[u] - product)
     return True, decrease, log_det
 
 
@@ -163,7 +163,7 @@ def noise_at_correlations(
     points: Floats,
     rhos: Floats,
     shared: float,
-    least: float,
+    least_residual_part: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Restricted likelihood and residual sums of squares of all trials at each noise correlation, trial effects fitted.
 
@@ -177,7 +177,7 @@ def noise_at_correlations(
     rhos : array, shape (n_rhos,)
     shared : float
         Degrees of freedom that the shared parameters take from each trial.
-    least : float
+    least_residual_part : float
         Least part of the sum of squares that remains as residual.
 
     Returns
@@ -223,7 +223,7 @@ def noise_at_correlations(
             for u in range(m):
                 explained += scale[u] * (white[u, m] - prior_gradient[i, u]) * solution[u]
             dof = max(points[i] - dof_taken, 1.0)
-            residual_square = max(white[m, m] - explained, least * white[m, m])
+            residual_square = max(white[m, m] - explained, least_residual_part * white[m, m])
             scores[k] += dof * math.log(residual_square / dof) + log_det
             squares[k, i], degrees[k, i] = residual_square, dof
     return scores, squares, degrees
