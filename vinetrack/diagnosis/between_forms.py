@@ -187,8 +187,8 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
         if not begins:
             continue
         tube = f"{vine}, later tube"
-        whole = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
-        form = _forms(SPECIMEN, whole, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+        vine_in_group = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
+        form = _forms(SPECIMEN, vine_in_group, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
         first = begins[int(np.argmax(gains_by_onset(fit, base, form, members, begins)))]
         for i in members[first:]:
             groups[i] = tube
@@ -221,11 +221,11 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
     -------
     bool
     """
-    within, inner = _square_within(regressors, [trial.condition for trial in trials])
-    whole, outer = _square_within(regressors, [trial.vine for trial in trials])
-    if inner == 0 or whole == 0:
+    in_conditions, inner_degrees = _square_within(regressors, [trial.condition for trial in trials])
+    in_vines, outer_degrees = _square_within(regressors, [trial.vine for trial in trials])
+    if inner_degrees == 0 or in_vines == 0:
         return True
-    return within / inner < CONFOUNDED_VARIANCE_SHARE * whole / max(outer, 1)
+    return in_conditions / inner_degrees < CONFOUNDED_VARIANCE_SHARE * in_vines / max(outer_degrees, 1)
 
 
 def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:

@@ -113,14 +113,14 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
     """
     cross_products, problem, state = _widened(fit, base, difference)
     before = marginal(base.cross_products, base.problem, base.state)
-    part = marginal(cross_products, problem, state)
+    after = marginal(cross_products, problem, state)
     if spread is None:
-        old = estimate_between_trial_sd(before, base.problem, base.state, base.estimable, restricted=False)
-        new = estimate_between_trial_sd(part, problem, state, base.estimable, restricted=False)
+        sd_before = estimate_between_trial_sd(before, base.problem, base.state, base.estimable, restricted=False)
+        sd_after = estimate_between_trial_sd(after, problem, state, base.estimable, restricted=False)
     else:
-        old = new = spread
-    plain = deviance(before, base.problem, base.state, old, restricted=False)
-    return plain - deviance(part, problem, state, new, restricted=False)
+        sd_before = sd_after = spread
+    deviance_before = deviance(before, base.problem, base.state, sd_before, restricted=False)
+    return deviance_before - deviance(after, problem, state, sd_after, restricted=False)
 
 
 def with_shared_errors(fit: Fit, base: Solution) -> Solution:
@@ -189,7 +189,7 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
 
 
 def gains_by_onset(
-    fit: Fit, base: Solution, difference: Difference, members: Sequence[int], begins: Iterable[int]
+    fit: Fit, base: Solution, difference: Difference, members: Sequence[int], onsets: Iterable[int]
 ) -> list[float]:
     """`linear_gain` of a difference for each of several onsets of its group.
 
@@ -203,7 +203,7 @@ def gains_by_onset(
     difference : the difference, with all members in the group.
     members : sequence of int
         Indices of the trials of the group, in the order in which they were made.
-    begins : iterable of int
+    onsets : iterable of int
         Positions among the members from which on a trial belongs to the group, increasing.
 
     Returns
@@ -213,29 +213,31 @@ def gains_by_onset(
     """
     cross_products, problem, state = _widened(fit, base, difference)
     spread = base.state.spread
-    plain = deviance(
+    deviance_before = deviance(
         marginal(base.cross_products, base.problem, base.state), base.problem, base.state, spread, restricted=False
     )
-    part = marginal(cross_products, problem, state)
-    information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    constant = square + log_det + part.log_constant
-    blocks, _ = deviations_eliminated(part, problem, spread)
+    marginals = marginal(cross_products, problem, state)
+    information, gradient, square, log_det = normal_equations(marginals, problem, state, spread)
+    constant = square + log_det + marginals.log_constant
+    blocks, _ = deviations_eliminated(marginals, problem, spread)
     places, shapes = problem.places, base.problem.index.shape[1] - len(fit.predictor.layout.keys)
-    last = places.shape[1] - shapes
+    end_of_terms = places.shape[1] - shapes
     of_term = np.zeros(places.shape[1], dtype=bool)
-    of_term[last - len(difference.terms) : last] = True
-    felt = of_term[:, None] | of_term
+    of_term[end_of_terms - len(difference.terms) : end_of_terms] = True
+    affected = of_term[:, None] | of_term
     # One more row for keys to which a trial does not respond.
-    information, slope = np.pad(information, (0, 1)), np.append(slope, 0.0)
+    information, gradient = np.pad(information, (0, 1)), np.append(gradient, 0.0)
     gains: list[float] = []
-    taken = 0
-    for begin in begins:
-        for i in members[taken:begin]:
-            np.subtract.at(information, (places[i][:, None], places[i]), np.where(felt, blocks[i, :-1, :-1], 0.0))
-            np.subtract.at(slope, places[i][of_term], blocks[i, :-1, -1][of_term])
-        taken = begin
-        left = profiled_deviance(information[:-1, :-1], slope[:-1], constant, problem, state, restricted=False)
-        gains.append(plain - left)
+    removed = 0
+    for onset in onsets:
+        for i in members[removed:onset]:
+            np.subtract.at(information, (places[i][:, None], places[i]), np.where(affected, blocks[i, :-1, :-1], 0.0))
+            np.subtract.at(gradient, places[i][of_term], blocks[i, :-1, -1][of_term])
+        removed = onset
+        deviance_after = profiled_deviance(
+            information[:-1, :-1], gradient[:-1], constant, problem, state, restricted=False
+        )
+        gains.append(deviance_before - deviance_after)
     return gains
 
 
@@ -256,25 +258,27 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
         theta[k] = theta[k] if value is None else number.to_scaled(value)
     shapes = base.problem.index.shape[1] - len(old.keys)
     if shapes:
-        further, beyond = state.theta[len(old.free) :], base.problem.index[:, len(old.keys) :]
-        moved = np.where(beyond < 0, -1, beyond - len(old.free) + len(layout.free))
-        problem = replace(with_shapes(problem, further.size), index=np.column_stack([problem.index, moved]))
-        theta = np.append(theta, further)
-    turn = _turn(old, layout, shapes)
-    cross_products = np.einsum("nka,nckl,nlb->ncab", turn, base.cross_products, turn, optimize=True)
+        error_values, error_index = state.theta[len(old.free) :], base.problem.index[:, len(old.keys) :]
+        shifted = np.where(error_index < 0, -1, error_index - len(old.free) + len(layout.free))
+        problem = replace(with_shapes(problem, error_values.size), index=np.column_stack([problem.index, shifted]))
+        theta = np.append(theta, error_values)
+    T = _column_map(old, layout, shapes)
+    cross_products = np.einsum("nka,nckl,nlb->ncab", T, base.cross_products, T, optimize=True)
     return cross_products, problem, replace(state, theta=theta)
 
 
-def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
-    """What makes the columns of one layout those of another, shape (n_trials, n_columns before, n_columns after).
+def _column_map(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
+    """Matrices that map the columns of one layout to those of another, shape (n_trials, n_columns before, after).
 
-    Columns are those of the trials' own numbers, the keys, the shapes of smooth errors, the residual.
+    Columns are those of the trial effects, the keys, the shapes of smooth errors, and the residual.
     """
     count, size = len(old.keys), N_TRIAL_EFFECTS + len(layout.keys) + shapes + 1
-    turn = np.zeros((len(layout.index), N_TRIAL_EFFECTS + count + shapes + 1, size))
-    turn[:, range(N_TRIAL_EFFECTS), range(N_TRIAL_EFFECTS)] = 1.0
-    behind = np.arange(shapes + 1)
-    turn[:, N_TRIAL_EFFECTS + count + behind, N_TRIAL_EFFECTS + len(layout.keys) + behind] = 1.0
+    matrix = np.zeros((len(layout.index), N_TRIAL_EFFECTS + count + shapes + 1, size))
+    matrix[:, range(N_TRIAL_EFFECTS), range(N_TRIAL_EFFECTS)] = 1.0
+    errors_and_residual = np.arange(shapes + 1)
+    matrix[
+        :, N_TRIAL_EFFECTS + count + errors_and_residual, N_TRIAL_EFFECTS + len(layout.keys) + errors_and_residual
+    ] = 1.0
     before_scale = np.array([number.scale for number in old.free] + [1.0])
     scale = np.array([number.scale for number in layout.free] + [0.0])
     logarithmic = np.array([number.logarithmic for number in layout.free] + [False])
@@ -282,9 +286,9 @@ def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
         term, place = layout.term(key), layout.index[:, column]
         if term is not None and key not in old.keys:
             source = PRESSURE if term.pressure else DAMPING_DEVIATION
-            turn[:, source, N_TRIAL_EFFECTS + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
+            matrix[:, source, N_TRIAL_EFFECTS + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
             continue
         former = old.keys.index(key)
         ratio = scale[place] / before_scale[old.index[:, former]]
-        turn[:, N_TRIAL_EFFECTS + former, N_TRIAL_EFFECTS + column] = np.where(logarithmic[place], 1.0, ratio)
-    return turn
+        matrix[:, N_TRIAL_EFFECTS + former, N_TRIAL_EFFECTS + column] = np.where(logarithmic[place], 1.0, ratio)
+    return matrix

@@ -117,7 +117,7 @@ def differences(fit: Fit) -> list[Difference]:
     return list(best.values())
 
 
-def significant(among: Sequence[Difference], level: float) -> list[Difference]:
+def significant(estimated: Sequence[Difference], level: float) -> list[Difference]:
     """Significant differences that are confounded with the conditions, so that they could pass for physics.
 
     Random order and replicates separate a difference from the conditions; it is then a random deviation of the trials,
@@ -126,8 +126,8 @@ def significant(among: Sequence[Difference], level: float) -> list[Difference]:
 
     Parameters
     ----------
-    among : sequence of Difference
-        Those that were estimated.
+    estimated : sequence of Difference
+        From `differences`.
     level : float
         Family-wise false-alarm probability (Bonferroni).
 
@@ -135,11 +135,11 @@ def significant(among: Sequence[Difference], level: float) -> list[Difference]:
     -------
     list of Difference
     """
-    return [difference for difference in among if difference.confounded and difference.p < level / len(among)]
+    return [difference for difference in estimated if difference.confounded and difference.p < level / len(estimated)]
 
 
 def between_fits(
-    before: Fit, among: Sequence[Difference], best: float, report: Callable[[str], None]
+    before: Fit, estimated: Sequence[Difference], best: float, report: Callable[[str], None]
 ) -> list[LikelihoodRatio]:
     """Fit the differences whose predicted gain is near the best Δχ² of the effects.
 
@@ -147,8 +147,8 @@ def between_fits(
     ----------
     before
         The fit of the model.
-    among : sequence of Difference
-        Those that were estimated.
+    estimated : sequence of Difference
+        From `differences`.
     best : float
         Largest Δχ² of the effects.
     report : callable
@@ -159,7 +159,7 @@ def between_fits(
     list of LikelihoodRatio
     """
     fitted: list[LikelihoodRatio] = []
-    for difference in among:
+    for difference in estimated:
         if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(MAX_GAIN_SHORTFALL, 0.3 * best):
             continue
         report(f"fitting {difference.name}")

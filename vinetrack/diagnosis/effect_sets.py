@@ -249,7 +249,7 @@ class EffectSets:
         """
         best: LikelihoodRatio | None = None
         for size in range(1, MAX_EFFECTS + 1):
-            plausible = [known for known in self.of_size(size) if known.plausible and known.credible]
+            plausible = [each for each in self.of_size(size) if each.plausible and each.credible]
             if not plausible or (best is not None and not self.is_better(plausible[0], best)):
                 break
             best = plausible[0]

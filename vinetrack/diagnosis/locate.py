@@ -123,13 +123,13 @@ def locate(fit: Fit) -> Failure:
         rows.append(_condition_row(members, common_stretches(of[name], "time_s", edges[name]), scatter))
     table = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
     vines = list(dict.fromkeys(course.trial.vine for course in courses))
-    whole = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
+    by_vine = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
     return Failure(
         model="+".join(fit.model.names),
         by_condition=table.sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
-        along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
-        along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
+        along_position=_along("lead_position_m", of, by_vine, POSITION_COLUMNS, scatter),
+        along_speed=_along("lead_velocity_m_s", of, by_vine, SPEED_COLUMNS, scatter),
         scatter=scatter,
         drift=drift(fit, scatter),
     )
@@ -165,13 +165,13 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
 def _along(
     along: str,
     of: dict[str, list[ResidualCourse]],
-    whole: dict[str, list[ResidualCourse]],
+    by_vine: dict[str, list[ResidualCourse]],
     columns: Sequence[str],
     scatter: Scatter,
 ) -> pd.DataFrame:
     """Mean residuals of each condition in the same stretches, and of all trials of a vine together."""
     parts = []
-    for members in whole.values():
+    for members in by_vine.values():
         edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), MAX_STRETCHES + 1)
         names = dict.fromkeys(member.trial.condition for member in members)
         parts += [(of[name], along, edges, name) for name in names] + [(members, along, edges, "")]
@@ -194,15 +194,15 @@ def _mean_rows(
     parts = [stretch_means(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     present = np.isfinite(both).all(axis=2)
-    each = np.array([stretch_variances(*part, scatter) for part in zip(members, parts, strict=True)])
+    variances = np.array([stretch_variances(*part, scatter) for part in zip(members, parts, strict=True)])
     rows: list[tuple[object, ...]] = []
     for k in range(edges.size - 1):
-        there = present[:, k]
-        if not there.any():
+        reached = present[:, k]
+        if not reached.any():
             continue
-        count = int(there.sum())
-        mean = float(both[there, k, 0].mean())
-        sigma = math.sqrt(float(each[there, k].sum())) / count
+        count = int(reached.sum())
+        mean = float(both[reached, k, 0].mean())
+        sigma = math.sqrt(float(variances[reached, k].sum())) / count
         low, high = float(edges[k]), float(edges[k + 1])
         middle = (low + high) / 2
         rows.append((members[0].trial.vine, condition, low, high, middle, mean, sigma, mean / sigma, count))
