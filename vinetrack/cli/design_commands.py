@@ -92,7 +92,7 @@ def _predict(
 
         if tail_slack not in (None, "taut", "free"):
             raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
-        asked = PredictionRequest(
+        request = PredictionRequest(
             cells=cells,
             sheet=sheet,
             results=results,
@@ -104,9 +104,9 @@ def _predict(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        heading = fit_heading(asked)
+        heading = fit_heading(request)
         lines = predict_conditions(
-            asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json
+            request, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json
         )
         say([*heading, *lines] if lines else [])
 
@@ -162,7 +162,7 @@ def _vine(
         from vinetrack.pipeline.design_stage import design_vine
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = PredictionRequest(
+        request = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
@@ -170,8 +170,8 @@ def _vine(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        lines = fit_heading(asked) + design_vine(
-            asked,
+        lines = fit_heading(request) + design_vine(
+            request,
             films=films,
             diameter=diameter,
             length=length,
@@ -232,7 +232,7 @@ def _reservoir(
         from vinetrack.pipeline.design_stage import design_reservoir
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = PredictionRequest(
+        request = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
@@ -240,8 +240,10 @@ def _reservoir(
             B=math.nan if B is None else B,
             n=math.nan if n is None else n,
         )
-        lines = fit_heading(asked)
-        lines += design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure)
+        lines = fit_heading(request)
+        lines += design_reservoir(
+            request, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure
+        )
         print_result(lines, {"lines": lines}, json_file)
 
 
@@ -332,7 +334,7 @@ def _campaign(
         from vinetrack.pipeline.campaign_stage import CampaignRequest, design_campaign
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
-        asked = PredictionRequest(
+        request = PredictionRequest(
             cells=cells,
             results=results,
             anyway=anyway,
@@ -358,7 +360,7 @@ def _campaign(
             seed=seed,
             power=power,
         )
-        lines = fit_heading(asked) + design_campaign(asked, wanted, sheet=sheet, figure=figure)
+        lines = fit_heading(request) + design_campaign(request, wanted, sheet=sheet, figure=figure)
         print_result(lines, {"lines": lines}, json_file)
 
 

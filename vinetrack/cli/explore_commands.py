@@ -56,5 +56,5 @@ def _explore(
     with _errors_as_sentences(log):
         from vinetrack.explorer.command import ExploreOptions, explore
 
-        asked = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
-        explore(results, experiment, asked, typer.echo)
+        options = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
+        explore(results, experiment, options, typer.echo)

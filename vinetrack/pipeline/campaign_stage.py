@@ -85,13 +85,13 @@ def _read_vine(text: str) -> dict[str, str]:
 
 
 def design_campaign(
-    asked: PredictionRequest, wanted: CampaignRequest, *, sheet: Path | None = None, figure: Path | None = None
+    request: PredictionRequest, wanted: CampaignRequest, *, sheet: Path | None = None, figure: Path | None = None
 ) -> list[str]:
     """Design a campaign; write its sheet and figure if requested.
 
     Parameters
     ----------
-    asked
+    request
         Inputs of the prediction.
     wanted
         Goals of and constraints on the campaign.
@@ -118,7 +118,7 @@ def design_campaign(
     from vinetrack.planning.campaign_information import FilmingPlan
 
     check_figure(figure)
-    vine_inputs = _vine_inputs(asked, wanted)
+    vine_inputs = _vine_inputs(request, wanted)
     scope = _scope(wanted)
     camera = FilmingPlan(wanted.capture_fps, wanted.noise_mm / 1e3, wanted.correlation, wanted.longest_s)
     try:
@@ -144,7 +144,7 @@ def design_campaign(
     return lines
 
 
-def _vine_inputs(asked: PredictionRequest, wanted: CampaignRequest) -> list[PredictiveInputs]:
+def _vine_inputs(request: PredictionRequest, wanted: CampaignRequest) -> list[PredictiveInputs]:
     """Return the predictive inputs of each vine."""
     if not wanted.vines:
         raise ExperimentError(
@@ -152,8 +152,8 @@ def _vine_inputs(asked: PredictionRequest, wanted: CampaignRequest) -> list[Pred
         )
     vine_inputs = []
     for text in dict.fromkeys(wanted.vines):
-        cells = {**asked.cells, **_read_vine(text), "pressure_kPa": PLACEHOLDER_KPA}
-        vine_inputs += inputs_of(read_basis(replace(asked, cells=cells)))
+        cells = {**request.cells, **_read_vine(text), "pressure_kPa": PLACEHOLDER_KPA}
+        vine_inputs += inputs_of(read_basis(replace(request, cells=cells)))
     return vine_inputs
 
 

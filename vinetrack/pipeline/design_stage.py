@@ -113,7 +113,7 @@ def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "
 
 
 def design_vine(
-    asked: PredictionRequest,
+    request: PredictionRequest,
     *,
     films: str,
     diameter: str,
@@ -129,7 +129,7 @@ def design_vine(
 
     Parameters
     ----------
-    asked
+    request
         Inputs of the prediction.
     films : str
         Wall thicknesses, µm, joined by commas.
@@ -163,20 +163,20 @@ def design_vine(
     from vinetrack.planning.fastest_vine import Room, fastest
 
     check_figure(figure)
-    ground = read_basis(asked, needed=("pressure_kPa",))
+    basis = read_basis(request, needed=("pressure_kPa",))
     room = Room(
         films_m=read_list("thickness_um", films, FILMS),
         diameter_m=read_range("diameter_mm", diameter),
         length_m=read_range("length_mm", length),
-        pressure_Pa=ground.planned.trials[0].pressure_Pa,
-        rig=ground.planned.trials[0],
+        pressure_Pa=basis.planned.trials[0].pressure_Pa,
+        rig=basis.planned.trials[0],
         burst_share=burst_share,
         burst_stress_Pa=1e6 * burst_stress_MPa,
     )
     _check_films(room, films, diameter)
     try:
         with waiting("looking for the fastest vine"):
-            choices = fastest(room, ground.stated, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
+            choices = fastest(room, basis.stated, basis.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     except EffectError as error:
         raise name_missing_option(error) from None
     except (SimulationError, FitError) as error:
@@ -281,7 +281,7 @@ REQUIRED_FOR_RESERVOIR = ("diameter_mm", "length_mm", "pressure_kPa")
 
 
 def design_reservoir(
-    asked: PredictionRequest,
+    request: PredictionRequest,
     *,
     within_percent: float,
     supply_s: float | None,
@@ -294,7 +294,7 @@ def design_reservoir(
 
     Parameters
     ----------
-    asked
+    request
         Inputs of the prediction.
     within_percent : float
         Allowed loss of gauge pressure, %.
@@ -319,9 +319,9 @@ def design_reservoir(
     from vinetrack.effects import EffectError
 
     check_figure(figure)
-    ground = read_basis(asked, needed=REQUIRED_FOR_RESERVOIR)
-    trial = ground.planned.trials[0]
-    inputs = inputs_of(ground)[0] if math.isfinite(trial.thickness_m) else None
+    basis = read_basis(request, needed=REQUIRED_FOR_RESERVOIR)
+    trial = basis.planned.trials[0]
+    inputs = inputs_of(basis)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100
     try:
         with waiting("simulating"):
@@ -410,5 +410,5 @@ def _reservoir_picture(trial: Trial, loss: float) -> Figure:
         )
         for name, gamma in GAMMAS.items()
     ]  # fmt: skip
-    asked = [chamber for chamber in chambers(trial, loss) if chamber.name == "asked about"]
-    return draw_reservoir(volumes, laws, loss, swept, asked[0].volume_m3 if asked else None)
+    requested = [chamber for chamber in chambers(trial, loss) if chamber.name == "asked about"]
+    return draw_reservoir(volumes, laws, loss, swept, requested[0].volume_m3 if requested else None)

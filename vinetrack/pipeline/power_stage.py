@@ -68,12 +68,12 @@ class _Campaign:
     limits: Limits = field(default_factory=Limits)
 
 
-def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Power:
+def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
     """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns.
 
     Parameters
     ----------
-    asked : options of the command.
+    request : options of the command.
     given : optional
         A fit, or pairs of trial and track, in place of the target.
 
@@ -89,27 +89,27 @@ def power_of_target(asked: PowerRequest, given: Fit | Pairs | None = None) -> Po
     from vinetrack.core.terminal import waiting
 
     with waiting("calculating the power of the trials"):
-        campaign = _campaign(asked) if given is None else _campaign_in_memory(asked, given)
-    names = [text.partition("=")[0] for text in asked.effects]
+        campaign = _campaign(request) if given is None else _campaign_in_memory(request, given)
+    names = [text.partition("=")[0] for text in request.effects]
     power = campaign.power
     for name in names:
         if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
             _refuse_effect(name, power)
-    if asked.simulate:
-        power = replace(power, simulated=tuple(_simulated_rates(asked, campaign)))
-    if asked.calibrate:
-        power = replace(power, calibration=_null_calibration(asked, given))
-    if math.isfinite(asked.reach):
-        power = replace(power, further=tuple(_further_trials(asked, campaign)))
+    if request.simulate:
+        power = replace(power, simulated=tuple(_simulated_rates(request, campaign)))
+    if request.calibrate:
+        power = replace(power, calibration=_null_calibration(request, given))
+    if math.isfinite(request.reach):
+        power = replace(power, further=tuple(_further_trials(request, campaign)))
     return power.of_effects(names)
 
 
-def _further_trials(asked: PowerRequest, campaign: _Campaign) -> Iterator[FurtherTrials]:
+def _further_trials(request: PowerRequest, campaign: _Campaign) -> Iterator[FurtherTrials]:
     """Determine the fewest further trials that detect each requested effect of given size."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.further_trials import further_trials
 
-    for text in asked.effects:
+    for text in request.effects:
         name, _, size = text.partition("=")
         if not size or name in campaign.power.not_testable:
             remedy = "write the size to detect, such as leak=0.5" if not size else campaign.power.not_testable[name]
@@ -117,7 +117,7 @@ def _further_trials(asked: PowerRequest, campaign: _Campaign) -> Iterator[Furthe
             raise ExperimentError([Problem(message=message, column="--effect", value=text, remedy=remedy)])
         value = _size_of(text, campaign.power[name])
         with waiting(f"searching for trials that detect {name}"):
-            yield further_trials(campaign.design, campaign.power[name], value, asked.reach, campaign.limits)
+            yield further_trials(campaign.design, campaign.power[name], value, request.reach, campaign.limits)
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:
@@ -163,28 +163,28 @@ class _MeasuredTrials:
     limits: Limits = field(default_factory=Limits)
 
 
-def _campaign(asked: PowerRequest) -> _Campaign:
+def _campaign(request: PowerRequest) -> _Campaign:
     """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
     from vinetrack.experiment.planned import planned_sheet
 
-    measured = _measured_trials(asked)
+    measured = _measured_trials(request)
     if measured is not None:
-        return _measured_campaign(asked, measured)
-    return _planned_campaign(asked, planned_sheet(asked.target, every_row=True))
+        return _measured_campaign(request, measured)
+    return _planned_campaign(request, planned_sheet(request.target, every_row=True))
 
 
-def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
+def _measured_trials(request: PowerRequest) -> _MeasuredTrials | None:
     """Read the trials of a results folder or of an experiment with tracks; None for a target without measurements."""
     from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
 
-    if (asked.target / PROVENANCE).exists():
-        return _trials_of_results(asked)
-    if not asked.target.is_dir():
+    if (request.target / PROVENANCE).exists():
+        return _trials_of_results(request)
+    if not request.target.is_dir():
         return None
     try:
-        read = read_experiment(asked.target)
+        read = read_experiment(request.target)
     except ExperimentError:
         return None  # recordings that do not exist yet: a plan
     if all(trial.track is None for trial in read.trials):
@@ -195,16 +195,16 @@ def _measured_trials(asked: PowerRequest) -> _MeasuredTrials | None:
     return _MeasuredTrials(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
 
 
-def _campaign_in_memory(asked: PowerRequest, given: Fit | Pairs) -> _Campaign:
+def _campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> _Campaign:
     """Return the campaign of a fit, or of trials in memory with the base model."""
     from vinetrack.inference.fit_result import Fit
 
     if isinstance(given, Fit):
         return _Campaign(fit_power(given), design_of_fit(given))
-    return _measured_campaign(asked, _MeasuredTrials(list(given), BASE_EFFECTS))
+    return _measured_campaign(request, _MeasuredTrials(list(given), BASE_EFFECTS))
 
 
-def _trials_of_results(asked: PowerRequest) -> _MeasuredTrials:
+def _trials_of_results(request: PowerRequest) -> _MeasuredTrials:
     from vinetrack.diagnosis.result import ADEQUATE
     from vinetrack.effects import own_effects
     from vinetrack.pipeline.model_stage import measured_trials
@@ -212,8 +212,8 @@ def _trials_of_results(asked: PowerRequest) -> _MeasuredTrials:
     from vinetrack.results.folder_layout import Results
     from vinetrack.results.stored_diagnosis import read_diagnosis
 
-    results = Results(asked.target)
-    experiment = read_source_experiment(asked.target, asked.experiment)
+    results = Results(request.target)
+    experiment = read_source_experiment(request.target, request.experiment)
     settings = experiment.settings
     diagnosis = read_diagnosis(results)
     accepted = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
@@ -223,7 +223,7 @@ def _trials_of_results(asked: PowerRequest) -> _MeasuredTrials:
     return _MeasuredTrials(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
 
 
-def _measured_campaign(asked: PowerRequest, measured: _MeasuredTrials) -> _Campaign:
+def _measured_campaign(request: PowerRequest, measured: _MeasuredTrials) -> _Campaign:
     """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for
     from vinetrack.dynamics.model import make_model
@@ -233,8 +233,8 @@ def _measured_campaign(asked: PowerRequest, measured: _MeasuredTrials) -> _Campa
     model = make_model(measured.names, measured.user_effects)
     host = host_for(model, candidates_of(model, candidates, measured.user_effects))
     first = fit(model, pairs, host=host, profile=False, thorough=False)
-    stated = _stated_noise(asked, first.noise_m, first.noise_correlation)
-    spreads = _stated_spreads(asked, (float(first.state.spread[0]), float(first.state.spread[1])))
+    stated = _stated_noise(request, first.noise_m, first.noise_correlation)
+    spreads = _stated_spreads(request, (float(first.state.spread[0]), float(first.state.spread[1])))
     inputs: list[PowerInput] = []
     if stated is not None or spreads is not None:
         first = fit(model, pairs, spreads=spreads, noise=stated, host=host, profile=False, thorough=False)
@@ -245,21 +245,21 @@ def _measured_campaign(asked: PowerRequest, measured: _MeasuredTrials) -> _Campa
     return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
 
 
-def _stated_noise(asked: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
-    if math.isnan(asked.noise_mm) and math.isnan(asked.noise_correlation):
+def _stated_noise(request: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
+    if math.isnan(request.noise_mm) and math.isnan(request.noise_correlation):
         return None
     return (
-        noise_m if math.isnan(asked.noise_mm) else asked.noise_mm / 1e3,
-        correlation if math.isnan(asked.noise_correlation) else asked.noise_correlation,
+        noise_m if math.isnan(request.noise_mm) else request.noise_mm / 1e3,
+        correlation if math.isnan(request.noise_correlation) else request.noise_correlation,
     )
 
 
-def _stated_spreads(asked: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
-    if math.isnan(asked.spread_P) and math.isnan(asked.spread_B):
+def _stated_spreads(request: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
+    if math.isnan(request.spread_P) and math.isnan(request.spread_B):
         return None
     return (
-        otherwise[0] if math.isnan(asked.spread_P) else asked.spread_P,
-        otherwise[1] if math.isnan(asked.spread_B) else asked.spread_B,
+        otherwise[0] if math.isnan(request.spread_P) else request.spread_P,
+        otherwise[1] if math.isnan(request.spread_B) else request.spread_B,
     )
 
 
@@ -273,7 +273,7 @@ def _input_rows(
     ]
 
 
-def _planned_campaign(asked: PowerRequest, planned: PlannedTrials) -> _Campaign:
+def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> _Campaign:
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     from vinetrack.effects import own_effects
     from vinetrack.inference.parameters import DAMPING, EXPONENT
@@ -281,25 +281,25 @@ def _planned_campaign(asked: PowerRequest, planned: PlannedTrials) -> _Campaign:
 
     folder, settings = planned.folder or Path(), planned.settings
     user_effects = dict(own_effects([folder / path for path in settings.effects]))
-    stated = StatedValues(B=asked.B, n=asked.n, model=settings.model, user_effects=user_effects)
+    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=user_effects)
     by_vine = {}
     for trial in planned.trials:
         if trial.vine not in by_vine:
             by_vine[trial.vine] = predictive_inputs(trial, stated)
     vine_inputs = list(by_vine.values())
     first = vine_inputs[0]
-    noise = _stated_noise(asked, DEFAULT_NOISE_MM / 1e3, 0.0)
+    noise = _stated_noise(request, DEFAULT_NOISE_MM / 1e3, 0.0)
     noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
-    spreads = _stated_spreads(asked, first.spreads)
+    spreads = _stated_spreads(request, first.spreads)
     trials = tuple(_with_yield(trial, by_vine[trial.vine].trial) for trial in planned.trials)
-    filmed_fps = [asked.capture_fps if math.isfinite(asked.capture_fps) else trial.capture_fps for trial in trials]
+    filmed_fps = [request.capture_fps if math.isfinite(request.capture_fps) else trial.capture_fps for trial in trials]
     cameras = tuple(
         FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
     )
     origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
     inputs = [
         *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
-        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(asked, trials)),
+        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(request, trials)),
         *(
             PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
             for vine, of_vine in by_vine.items()
@@ -318,8 +318,8 @@ def _planned_campaign(asked: PowerRequest, planned: PlannedTrials) -> _Campaign:
     return _Campaign(design_power(design, inputs), design, settings.limits)
 
 
-def _fps_origin(asked: PowerRequest, trials: Sequence[Trial]) -> str:
-    if math.isfinite(asked.capture_fps):
+def _fps_origin(request: PowerRequest, trials: Sequence[Trial]) -> str:
+    if math.isfinite(request.capture_fps):
         return "stated"
     return "sheet" if all(math.isfinite(trial.capture_fps) for trial in trials) else "guess"
 
@@ -334,11 +334,11 @@ def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
     return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=default_Pa)
 
 
-def _simulated_sizes(asked: PowerRequest, campaign: _Campaign) -> list[tuple[str, float, float]]:
+def _simulated_sizes(request: PowerRequest, campaign: _Campaign) -> list[tuple[str, float, float]]:
     """Return effect, size in SI and predicted rate of every kind of campaign to simulate, the null campaign first."""
     power = campaign.power
     wanted = [("", math.nan, power.false_alarm_rate)]
-    for text in asked.effects:
+    for text in request.effects:
         name, _, size = text.partition("=")
         if name in power.not_testable:
             continue
@@ -361,19 +361,21 @@ def _size_of(text: str, entry: EffectPower) -> float:
         raise ExperimentError([problem]) from None
 
 
-def _simulated_rates(asked: PowerRequest, campaign: _Campaign) -> Iterator[SimulatedRates]:
+def _simulated_rates(request: PowerRequest, campaign: _Campaign) -> Iterator[SimulatedRates]:
     """Simulate and diagnose campaigns; yield the rate of each kind. Answers of an earlier run are reused."""
-    wanted = _simulated_sizes(asked, campaign)
-    how = Simulation(asked.simulate, asked.first_seed, asked.jobs, asked.answers or _answers_file(asked.target))
+    wanted = _simulated_sizes(request, campaign)
+    simulation = Simulation(
+        request.simulate, request.first_seed, request.jobs, request.answers or _answers_file(request.target)
+    )
     design = replace(
         campaign.design, other_values={entry.effect: entry.other_values for entry in campaign.power.effects}
     )
-    answers = simulate_answers(design, [(effect, value) for effect, value, _ in wanted], how)
+    answers = simulate_answers(design, [(effect, value) for effect, value, _ in wanted], simulation)
     for effect, value, predicted_rate in wanted:
-        yield rates_of([answers[effect, size_key(value), seed] for seed in how.seeds], predicted_rate)
+        yield rates_of([answers[effect, size_key(value), seed] for seed in simulation.seeds], predicted_rate)
 
 
-def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
+def _null_calibration(request: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
     """Calibrate the tests of the first model of measured trials with simulated null campaigns of the same design."""
     from vinetrack.diagnosis.candidates import testable
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
@@ -386,10 +388,10 @@ def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCal
         questioned = candidates_of(given.model, None, given.model.user_effects)
         fitted = with_host(given, host_for(given.model, questioned))
     else:
-        measured = _measured_trials(asked) if given is None else _MeasuredTrials(list(given), BASE_EFFECTS)
+        measured = _measured_trials(request) if given is None else _MeasuredTrials(list(given), BASE_EFFECTS)
         if measured is None:
             problem = Problem(
-                message="needs measured trials", column="--calibrate", value=str(asked.target),
+                message="needs measured trials", column="--calibrate", value=str(request.target),
                 remedy="run the trials first, or estimate the false-alarm rate with --simulate",
             )  # fmt: skip
             raise ExperimentError([problem])
@@ -399,10 +401,10 @@ def _null_calibration(asked: PowerRequest, given: Fit | Pairs | None) -> NullCal
         fitted = initial_fit(model, measured.pairs, questioned, profile=False)
     effects, _ = testable(questioned, fitted.predictor.data)
     observed = p_values_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND))
-    path = asked.answers or _answers_file(asked.target)
+    path = request.answers or _answers_file(request.target)
     path = path.with_name(f"{path.stem}_calibration.csv")
-    how = Simulation(asked.calibrate, asked.first_seed, asked.jobs, path)
-    return calibrate(observed, simulate_null_tests(design_of_fit(fitted, candidates), how), fitted.model.names)
+    simulation = Simulation(request.calibrate, request.first_seed, request.jobs, path)
+    return calibrate(observed, simulate_null_tests(design_of_fit(fitted, candidates), simulation), fitted.model.names)
 
 
 def _answers_file(target: Path) -> Path:

@@ -50,7 +50,7 @@ class ConditionPrediction:
 
 
 def predict_conditions(
-    asked: PredictionRequest,
+    request: PredictionRequest,
     *,
     samples: int,
     seed: int,
@@ -63,7 +63,7 @@ def predict_conditions(
 
     Parameters
     ----------
-    asked
+    request
         Inputs of the prediction.
     samples, seed : int
         Number of draws, and seed of the random numbers.
@@ -85,7 +85,7 @@ def predict_conditions(
     import pandas as pd
 
     check_figure(figure)
-    basis = read_basis(asked)
+    basis = read_basis(request)
     entries = _predict_all(basis, samples, seed, at_fraction)
     lines = [*_condition_lines(entries[0])] if len(entries) == 1 else [*_table_lines(entries)]
     lines += [f"! {warning}" for warning in warnings_of(basis)]

@@ -62,12 +62,12 @@ class PredictionBasis:
     fit: FitNumbers | None
 
 
-def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
+def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
     """Read the sheet or the options, the fit, and the requested effects.
 
     Parameters
     ----------
-    asked : options of the command.
+    request : options of the command.
     needed : sequence of str, optional
         Required columns; by default those that a prediction needs.
 
@@ -89,41 +89,41 @@ def read_basis(asked: PredictionRequest, needed: Sequence[str] | None = None) ->
     from vinetrack.planning.input_sources import StatedValues
     from vinetrack.planning.predictive_inputs import read_sizes
 
-    if asked.sheet is not None:
-        planned = planned_sheet(asked.sheet)
-        _refuse_beside_sheet(asked)
+    if request.sheet is not None:
+        planned = planned_sheet(request.sheet)
+        _refuse_options_with_sheet(request)
     else:
         planned = planned_trial(
-            asked.cells, ExperimentSettings(), REQUIRED_FOR_PREDICTION if needed is None else needed
+            request.cells, ExperimentSettings(), REQUIRED_FOR_PREDICTION if needed is None else needed
         )
-    if asked.tail_slack is not None:
+    if request.tail_slack is not None:
         planned = replace(
-            planned, trials=tuple(replace(trial, tail_slack=asked.tail_slack) for trial in planned.trials)
+            planned, trials=tuple(replace(trial, tail_slack=request.tail_slack) for trial in planned.trials)
         )
     fit, user_effects = (
-        (None, _effects_of_sheet(planned)) if asked.results is None else _read_fit(asked.results, asked.anyway)
+        (None, _effects_of_sheet(planned)) if request.results is None else _read_fit(request.results, request.anyway)
     )
-    sizes = [read_sizes(text, user_effects) for text in asked.effects]
+    sizes = [read_sizes(text, user_effects) for text in request.effects]
     stated = StatedValues(
-        B=asked.B,
-        B_error=asked.B_error,
-        n=asked.n,
-        n_error=asked.n_error,
+        B=request.B,
+        B_error=request.B_error,
+        n=request.n,
+        n_error=request.n_error,
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         user_effects=user_effects,
-        spreads=asked.spreads,
+        spreads=request.spreads,
     )
     return PredictionBasis(planned, stated, fit)
 
 
-def _refuse_beside_sheet(asked: PredictionRequest) -> None:
+def _refuse_options_with_sheet(request: PredictionRequest) -> None:
     problems = [
         Problem(
             message="is given in addition to a sheet", column=option(name), value=text, remedy="write it in the sheet"
         )
-        for name, text in asked.cells.items()
+        for name, text in request.cells.items()
     ]
     if problems:
         raise ExperimentError(problems)
@@ -136,19 +136,19 @@ def _effects_of_sheet(planned: PlannedTrials) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def fit_heading(asked: PredictionRequest) -> list[str]:
+def fit_heading(request: PredictionRequest) -> list[str]:
     """Return the heading for everything predicted from a fit: the verdict on its model.
 
     Parameters
     ----------
-    asked : options of the command.
+    request : options of the command.
 
     Returns
     -------
     list of str
         Empty without a fit, and if its model is adequate.
     """
-    return [] if asked.results is None else list(choose_fit(asked.results, asked.anyway).heading)
+    return [] if request.results is None else list(choose_fit(request.results, request.anyway).heading)
 
 
 def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Effect]]:

@@ -38,7 +38,7 @@ class Simulation:
 
 
 def simulate_answers(
-    design: CampaignDesign, wanted: Sequence[tuple[str, float]], how: Simulation
+    design: CampaignDesign, wanted: Sequence[tuple[str, float]], simulation: Simulation
 ) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
     """Simulate campaigns and diagnose each completely.
 
@@ -47,7 +47,7 @@ def simulate_answers(
     design : design of the campaigns.
     wanted : sequence of (str, float)
         Effect (blank for none) and its size, SI, of each kind of campaign.
-    how : settings of the simulation.
+    simulation : settings of the simulation.
 
     Returns
     -------
@@ -57,31 +57,31 @@ def simulate_answers(
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
-    kept = {(a.effect, size_key(a.value), a.seed): a for a in stored_answers(how.path, mark)}
+    kept = {(a.effect, size_key(a.value), a.seed): a for a in stored_answers(simulation.path, mark)}
     tasks: list[Task] = [
         (design, effect, value, seed)
-        for seed in how.seeds
+        for seed in simulation.seeds
         for effect, value in wanted
         if (effect, size_key(value), seed) not in kept
     ]
-    total = len(wanted) * how.campaigns
+    total = len(wanted) * simulation.campaigns
     bar: Progress[None]
     with progress(total, "simulating", unit="campaign") as bar:
         bar.advance(total - len(tasks))
-        for answer in map_unordered(_diagnose_task, tasks, how.jobs):
-            _append_row(how.path, ANSWER_COLUMNS, _row(mark, answer))
+        for answer in map_unordered(_diagnose_task, tasks, simulation.jobs):
+            _append_row(simulation.path, ANSWER_COLUMNS, _row(mark, answer))
             kept[answer.effect, size_key(answer.value), answer.seed] = answer
             bar.advance()
     return kept
 
 
-def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[CampaignPValues]:
+def simulate_null_tests(design: CampaignDesign, simulation: Simulation) -> list[CampaignPValues]:
     """Apply every test to simulated null campaigns.
 
     Parameters
     ----------
     design : design of the campaigns.
-    how : settings of the simulation.
+    simulation : settings of the simulation.
 
     Returns
     -------
@@ -91,17 +91,17 @@ def simulate_null_tests(design: CampaignDesign, how: Simulation) -> list[Campaig
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
-    kept = {campaign.seed: campaign for campaign in _stored_p_values(how.path, mark)}
-    tasks = [(design, seed) for seed in how.seeds if seed not in kept]
+    kept = {campaign.seed: campaign for campaign in _stored_p_values(simulation.path, mark)}
+    tasks = [(design, seed) for seed in simulation.seeds if seed not in kept]
     bar: Progress[None]
-    with progress(how.campaigns, "calibrating", unit="campaign") as bar:
-        bar.advance(how.campaigns - len(tasks))
-        for campaign in map_unordered(_test_task, tasks, how.jobs):
+    with progress(simulation.campaigns, "calibrating", unit="campaign") as bar:
+        bar.advance(simulation.campaigns - len(tasks))
+        for campaign in map_unordered(_test_task, tasks, simulation.jobs):
             values = [f"{campaign.p_values[name]:.6g}" if campaign.p_values else "" for name in TESTS]
-            _append_row(how.path, P_VALUE_COLUMNS, [mark, campaign.seed, *values, campaign.failed])
+            _append_row(simulation.path, P_VALUE_COLUMNS, [mark, campaign.seed, *values, campaign.failed])
             kept[campaign.seed] = campaign
             bar.advance()
-    return [kept[seed] for seed in how.seeds]
+    return [kept[seed] for seed in simulation.seeds]
 
 
 def size_key(value: float) -> str:
