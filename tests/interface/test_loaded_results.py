@@ -60,7 +60,7 @@ def test_a_figure_of_one_trial_takes_its_name(loaded: LoadedResults) -> None:
 
 
 def test_a_figure_without_content_is_neither_drawn_nor_written(loaded: LoadedResults, small_run: Path) -> None:
-    with pytest.raises(ResultsError, match="the figures with content are damping_law"):
+    with pytest.raises(ResultsError, match="those with content are damping_law"):
         loaded.plot("missing_force")
     assert not (small_run / "figures" / "missing_force.svg").exists()
     assert (small_run / "figures" / "ladder.svg").exists()
@@ -115,7 +115,7 @@ def test_a_frame_that_says_too_little_is_refused_in_a_sentence(change: dict, wor
 
 def test_a_setting_that_changes_along_a_trial_is_refused_and_a_pressure_is_a_trace() -> None:
     frame = vt.example_tracks()
-    with pytest.raises(ExperimentError, match="changes along the trial P24_1"):
+    with pytest.raises(ExperimentError, match="changes within the trial P24_1"):
         vt.tracks_from_frame(frame.assign(length_mm=280.0 + frame["time_s"]))
     _, track = vt.tracks_from_frame(frame.assign(pressure_kPa=frame["pressure_kPa"] - frame["time_s"]))[0]
     assert track.pressure_Pa is not None
