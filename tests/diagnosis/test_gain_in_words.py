@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import gain_in_words
-from vinetrack.narrative.verdict_summary import NONE_SEEN, estimate_text, estimates_text, interval_text
+from vinetrack.narrative.verdict_summary import SIGNIFICANT_SIGMA, estimate_text, estimates_text, interval_text
 
 
 def fit(log_likelihood: float, converged: bool = True) -> Any:
@@ -51,5 +51,5 @@ def test_a_bound_that_an_interval_ends_at_is_named() -> None:
 def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
     from vinetrack.diagnosis.result import Candidate
 
-    row = Candidate("tail_stretch", "physical", "refitted", 1.0, NONE_SEEN - 0.1, (number(1.0, 0.6),))
+    row = Candidate("tail_stretch", "physical", "refitted", 1.0, SIGNIFICANT_SIGMA - 0.1, (number(1.0, 0.6),))
     assert estimates_text(row).endswith(": not significant")

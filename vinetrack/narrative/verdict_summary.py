@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MEANINGS = {
     MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
     AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
-    "The next experiment below would separate them.",
+    "The next experiment below says how to separate them.",
     ARTEFACT: "A fault of the measurement, not missing physics, explains the misfit: nothing was added. "
     "Correct the measurement first.",
     ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
@@ -57,7 +57,7 @@ THEREAFTER = {
 MOST_UNDETECTABLE_LISTED = 6
 """Undetectable effects listed on the first screen, at most. Chosen: two lines; the table of the page has all."""
 
-NONE_SEEN = 2.0
+SIGNIFICANT_SIGMA = 2.0
 """Standard errors below which a size is reported as not significant. Chosen: the usual 95 %. At half of it one size in
 three of pure noise would be reported as significant; at twice, some real sizes would not be."""
 
@@ -299,7 +299,7 @@ def estimates_text(row: Candidate) -> str:
         errors from no effect.
     """
     text = ", ".join(estimate_text(entry) for entry in row.numbers if is_finite(entry.value))
-    return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < NONE_SEEN else text
+    return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < SIGNIFICANT_SIGMA else text
 
 
 def _sizes(diagnosis: Diagnosis) -> list[Fact]:

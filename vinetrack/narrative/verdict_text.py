@@ -334,8 +334,8 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         best = int((tests.one_sided_z - thresholds).argmax())
         text += (
             f" The most significant of {_count_testable(tests)} candidates, {names[best]}, reaches "
-            f"{tests.one_sided_z[best]:.1f} σ, short of its threshold of {thresholds[best]:.1f} σ. Where nothing is "
-            f"missing, chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns."
+            f"{tests.one_sided_z[best]:.1f} σ; its threshold is {thresholds[best]:.1f} σ. Where nothing is missing, "
+            f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns."
         )
         kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
         if kind == MEASUREMENT and tests.one_sided_z[best] >= WORTH_A_CHECK_SIGMA:
