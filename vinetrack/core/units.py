@@ -83,7 +83,7 @@ UNITS: dict[str, Unit] = {
     "rad": Unit("rad", "radians"),
     "g_cm3": Unit("kg_m3", "g/cm³", multiply=1000.0),
     "kg_m3": Unit("kg_m3", "kg/m³"),
-    "fps": Unit("fps", "frames a second"),
+    "fps": Unit("fps", "frames per second"),
 }
 """Units by the suffix of a name. By definition (international yard and pound agreement, 1959) an inch is 25.4 mm, a
 foot 304.8 mm, a pound 453.59237 g and an ounce 1/16 pound; a psi is the weight of a pound (g = 9.80665 m/s²) on a

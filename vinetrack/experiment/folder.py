@@ -53,9 +53,9 @@ class Experiment:
 
     `trials` are the trials to analyse, in the order of the sheet; `failed` maps the name of every faulty trial to the
     reason, and `left_out` that of every excluded one (`use: no`). `names` lists all three in the order of the sheet,
-    `lines` gives their lines in it. `problems` are all errors and warnings. `angle_blank` names the vines whose growth
-    angle is not stated and is taken as straight down. `columns` are the columns of the sheet; a value of any other
-    column comes from the settings.
+    `lines` gives their lines in it. `problems` are all errors and warnings. `angle_blank` names the trials of vines
+    whose growth angle is not stated and is taken as straight down. `columns` are the columns of the sheet; a value of
+    any other column comes from the settings.
     """
 
     name: str
