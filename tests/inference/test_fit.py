@@ -207,7 +207,7 @@ def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campai
 
 def test_residuals_above_the_noise_give_a_message(depleting: Fit) -> None:
     assert depleting.chi2_per_dof > 2
-    assert any("something is missing" in message for message in depleting.messages)
+    assert any("an effect is missing" in message for message in depleting.messages)
 
 
 def test_a_falling_ball_gives_g() -> None:
