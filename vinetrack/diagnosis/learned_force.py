@@ -238,7 +238,7 @@ class _LinearChoices:
         return [choice.domain for choice, _ in self.choices]
 
     def log_bayes_factor(self, choice: VariableChoice) -> float:
-        """Ln Z of a choice in excess of that of no force."""
+        """Log Bayes factor of a choice against no force."""
         return choice.log_evidence - self.log_evidence_without_force
 
 
