@@ -61,7 +61,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     elsewhere = shutil.copy(path, tmp_path)
     code, output = run("add", elsewhere, results, "--save")
     assert code == 1
-    assert f"put the file into {experiment}" in output
+    assert f"move the file into {experiment}" in output
     code, output = run("add", path, results, "--save")
     assert code == 0, output
     assert "proposed_time added to" in output
