@@ -19,6 +19,8 @@ from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import ASTRAY_PX, band_disagreement, dwell_error_px, repair_jumps
 from vinetrack.video.edge_state import (
+    FIT_ROUNDS,
+    ROUGH_ROUNDS,
     EdgeState,
     blur_lengths,
     core_frames,
@@ -55,6 +57,11 @@ Chosen: half a pixel. At half or twice stated errors behind doors halve or doubl
 SETTLED_PX = 0.2
 """Largest change of any moving edge from one round to the next at which they are done. Chosen below the error of
 blurred frames at the fastest; at half more rounds are made, at twice fewer."""
+SAME_PATH_PX = 1.0
+"""Largest difference of two paths that are one. Derived: a path is of whole pixels."""
+MANY_ROWS = 48
+"""Rows from which every second one is enough for all rounds but the last. Chosen: 24 rows show the shape of a tip; only
+time depends on it, since the last rounds take all. At half thin vines would be followed by 12 rows at first."""
 UNFIT = 3.0
 """Factor of the bands' disagreement where no blur within reason fits: all rows err together then. Chosen: pictures out
 of focus then state errors of a pixel. At half or twice they state half or twice as much."""
@@ -131,16 +138,19 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     path, passed = grown_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
+    whole, strip = strip, _every_other_row(strip)
     state = first_state(strip, path, exposure)
     change = _frame_changes(strip)
     for turn in range(3):
         before, path = path, _second_path(strip, state, passed, change)
-        if turn > 0 and np.array_equal(before, path):
+        if turn > 0 and np.abs(before - path).max() <= SAME_PATH_PX:
             break
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
     fit = _fit_some(strip, state, frames_that_tell(state.edge))
     for turn in range(3 * rounds):
         before = fit[:, 0]
+        if turn == rounds - 1:
+            strip, state = whole, _on_all_rows(state, whole)
         state = _restate(strip, state, fit, exposure)
         seen = frames_that_tell(state.edge)
         if turn == 1 and not np.isfinite(exposure_frames):
@@ -148,7 +158,8 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
         state = find_shape(strip, state, fit, turn == 0)
         if turn > 0:
             state = find_shading(strip, state, fit)
-        fit = repair_jumps(strip, state, _fit_some(strip, state, seen), seen)
+        steps = FIT_ROUNDS if turn >= rounds - 1 else ROUGH_ROUNDS
+        fit = repair_jumps(strip, state, _fit_some(strip, state, seen, steps), seen)
         if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
             break
     alone = _fit_some(strip, state, ~seen)
@@ -160,9 +171,25 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     return replace(finished, seen_exposure_frames=shown, fast_px_per_frame=speed)
 
 
-def _fit_some(strip: Strip, state: EdgeState, chosen: Bools) -> Floats:
+def _every_other_row(strip: Strip) -> Strip:
+    """Every second row of a strip of MANY_ROWS or more, which tell as much of a smooth tip; the strip itself else."""
+    if strip.values.shape[1] < MANY_ROWS:
+        return strip
+    return replace(strip, values=np.ascontiguousarray(strip.values[:, ::2]))
+
+
+def _on_all_rows(state: EdgeState, strip: Strip) -> EdgeState:
+    """The state for all rows of a strip, where it was that of every second one; its pictures are to be made anew."""
+    rows = strip.values.shape[1]
+    if len(state.lag) == rows:
+        return state
+    lag = np.interp(np.arange(rows), np.arange(0, rows, 2), state.lag)
+    return replace(state, lag=lag, pictures=np.repeat(state.pictures, 2, axis=1)[:, :rows])
+
+
+def _fit_some(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
     """Most likely edge of the chosen frames, shape (n_frames, 6), NaN in the others."""
-    return fit_edges(strip, replace(state, edge=np.where(chosen, state.edge, np.nan)))
+    return fit_edges(strip, replace(state, edge=np.where(chosen, state.edge, np.nan)), rounds)
 
 
 @dataclass(frozen=True)
@@ -285,7 +312,7 @@ def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int], change
     evidence = kernels.film_evidence(
         strip.values, strip.scale, strip.offset, state.pictures, width, EVIDENCE_CLIP
     )  # fmt: skip
-    evidence[:, : max(passed[0] - kernels.BEHIND, 0)] = 0.0
+    evidence[:, : max(passed[0] - kernels.BEHIND, 0)] = evidence[:, passed[1] + kernels.BEYOND :] = 0.0
     path = ky.evident_path(evidence * _novelty(change, state.edge)[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.BEHIND, passed[1] + 2)
 

@@ -18,6 +18,8 @@ STEP = 0.05
 Z_STEP, Z_LAST = 0.02, 8.0
 """Spacing and end of the table of the normal distribution. Derived: cubic interpolation errs by Z_STEP⁴/384 of the
 fourth derivative, 2e-10, and Φ(−8) = 6e-16."""
+SHORTEST_PX = 0.02
+"""Motion blur below which there is none. Derived: it moves covers by less than STEP does, p''·SHORTEST_PX²/24 < 1e-4."""
 PHASES = round(1 / STEP)
 """Entries of a table of covers by pixel. Derived from STEP."""
 VECTOR = 8
@@ -69,7 +71,7 @@ def cover_table(length: float, blur: float, half: float) -> np.ndarray:
     p and dp/dx, shape (2, PHASES + 1, 2 middle + 2 + VECTOR).
     """
     middle = math.ceil(half) + 1
-    length = max(length, 0.02)
+    length = max(length, SHORTEST_PX)
     reach = cover_reach(length, blur)
     table = np.zeros((2, PHASES + 1, 2 * middle + 2 + VECTOR))
     for k in range(2 * middle + 2):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving_frames
+from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving_frames, search_edges
 from vinetrack.video.slow_errors import shared_disagreement
 from vinetrack.video.strip import Strip
 
@@ -133,15 +133,11 @@ def _is_rough(edge: Floats) -> NDArray[np.bool_]:
 
 def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
     """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
-    best = None
-    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]:
-        edge = np.full(len(state.edge), np.nan)
-        edge[t] = start
-        fit = fit_edges(strip, replace(state, edge=edge))[t]
-        inside = low - 0.5 <= fit[0] <= high + 0.5 and fit[3] > LEAST_FITTED_AMPLITUDE - 1
-        if inside and np.isfinite(fit[2]) and (best is None or fit[2] < best[2]):
-            best = fit
-    return best
+    places = np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]
+    fits = search_edges(strip, state, np.full(len(places), t), places)
+    inside = (fits[:, 0] >= low - 0.5) & (fits[:, 0] <= high + 0.5) & (fits[:, 3] > LEAST_FITTED_AMPLITUDE - 1)
+    inside &= np.isfinite(fits[:, 2])
+    return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
 
 
 BANDS = 4

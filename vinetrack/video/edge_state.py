@@ -33,6 +33,10 @@ TEXTURE = 12.0
 PRIOR_SD = 0.15
 """Relative scatter allowed to amplitude and level of the contrast from frame to frame. Chosen: flicker and shading of
 a tip. By reasoning: at half changes of light displace the edge, at twice a payload before it passes for one."""
+FIT_ROUNDS, ROUGH_ROUNDS = 12, 4
+"""Steps of Gauss-Newton at most, and those of fits of which others follow. Measured (`flicker` and `light_stream` of
+`benchmarks/decoding.py`): steps fall below 0.001 px after six on average. At half of the first noisy frames stay off by
+hundredths of a pixel; the second changes only how soon the alternation settles."""
 MARGIN_PX = 6.0
 """Pixels beyond the blurred edge that take part: they hold amplitude and level. Chosen: six pixels on either side know
 level and amplitude better than their prior. At half worse, at twice other things come in."""
@@ -235,21 +239,45 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
     return good if good.sum() >= 5 else clear
 
 
-def fit_edges(strip: Strip, state: EdgeState) -> Floats:
+def fit_edges(strip: Strip, state: EdgeState, rounds: int = FIT_ROUNDS) -> Floats:
     """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`.
 
     Parameters
     ----------
     strip : along the axis.
-    state : where the search begins, and what lies before and after the edge.
+    state : where the search begins, NaN to leave a frame out, and what lies before and after the edge.
+    rounds : steps of Gauss-Newton at most.
 
     Returns
     -------
     a row a frame: edge, its sigma, misfit, amplitude − 1, level, pixels used.
     """
+    frames = np.flatnonzero(np.isfinite(state.edge))
+    out = np.full((len(state.edge), 6), np.nan)
+    out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds)
+    return out
+
+
+def search_edges(
+    strip: Strip, state: EdgeState, frames: NDArray[np.int_], starts: Floats, rounds: int = FIT_ROUNDS
+) -> Floats:
+    """Search the edge from one start after another, in whichever frames; see `edge_kernels.fit_edges`.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+    frames : frame of each search, shape (n_searches,).
+    starts : where each begins, shape (n_searches,), px.
+    rounds : steps of Gauss-Newton at most.
+
+    Returns
+    -------
+    a row a search, as in `fit_edges`.
+    """
     return kernels.fit_edges(
-        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
-        state.inflation, PRIOR_SD, MARGIN_PX, 12, _shading_as_wide(state, MARGIN_PX),
+        strip.values, strip.scale, strip.offset, starts, state.lengths, state.lag, state.blur, state.pictures,
+        state.inflation, PRIOR_SD, MARGIN_PX, rounds, _shading_as_wide(state, MARGIN_PX), frames,
     )  # fmt: skip
 
 
@@ -257,7 +285,10 @@ def _shading_as_wide(state: EdgeState, margin_px: float) -> Floats:
     """The shading of the tip with zeros about it, as wide as the compiled loops read."""
     longest = float(np.nanmax(state.lengths, initial=0.0))
     reach = math.ceil(cover_reach(longest, state.blur) + margin_px) + VECTOR + 4
-    return np.pad(state.shading, max(reach - SHADED_PX, 0))
+    more = max(reach - SHADED_PX, 0)
+    wide = np.zeros(len(state.shading) + 2 * more)
+    wide[more : len(wide) - more] = state.shading
+    return wide
 
 
 class Residuals(NamedTuple):

@@ -124,11 +124,13 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     later = np.arange(near[-1] + FILM_RANGE_PX[0], min(near[-1] + FILM_RANGE_PX[1], int(edge.max() - CLEAR_PX)))
     if len(exited) < FEWEST_REST_FRAMES or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < FILM_RANGE_PX[0]:
         return none
-    film_picture = _middle_picture(strip, exited)
+    beside = BORDER_GAP_PX + BORDER_SIDE_PX
+    film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
+    near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
     border_steps = np.stack([_border(film_picture, int(column)) for column in near])
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
-    film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in later)
+    film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in film_columns)
     contrast = np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
     least_step = max(BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast)))
@@ -203,15 +205,15 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(added_px, GUESSED_PX), added_px))
 
 
-def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float32]:
-    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker.
+def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
+    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns.
 
     The moving tail averages out.
     """
     rows = strip.values.shape[1]
     edge_rows = round((1 - MIDDLE_ROWS) / 2 * rows)
     chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
-    values = strip.values[chosen, edge_rows : rows - edge_rows].astype(np.float32)
+    values = strip.values[chosen, edge_rows : rows - edge_rows, columns].astype(np.float32)
     level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
     return np.asarray(np.median(level, axis=0), dtype=np.float32)
 

@@ -89,7 +89,7 @@ def _change_score(
             gain, level = np.float32(scale[t] / bunch), np.float32(offset[t])
             before, after = binned[t], binned[t + 1]
             for s in range(columns):
-                after[s] = before[s] + (total[s] * gain + level)
+                after[s] = before[s] + (np.float32(total[s]) * gain + level)
         for t in range(1, n):
             a, b = min(n, t + window), max(0, t - window)
             factor = np.float32((a - t) * (t - b) / (a - b))
@@ -242,7 +242,7 @@ def _votes(
         gain, level = np.float32(scale[t]), np.float32(offset[t])
         for u in range(rows):
             for s in range(columns):
-                value = strip[t, u, s] * gain + level
+                value = np.float32(strip[t, u, s]) * gain + level
                 out[t, s] += (abs(value - last[u, s]) - abs(value - first[u, s])) * weight[u, s]
     return out
 
@@ -287,7 +287,7 @@ def sides_of_front(
             for u in range(rows):
                 values, line = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
                 for s in range(high - low):
-                    line[s] += values[s] * gain + level
+                    line[s] += np.float32(values[s]) * gain + level
     for k in range(2):
         known = np.flatnonzero(counts[k] > 0)
         for s in range(end - begin):
@@ -340,7 +340,7 @@ def unexplained(
                 low, high = (begin, front) if k == 0 else (front, end)
                 values, picture = strip[t, u, low:high], pictures[k, u, low - begin : high - begin]
                 for s in range(high - low):
-                    off = (values[s] * gain + level - picture[s]) * unit
+                    off = (np.float32(values[s]) * gain + level - picture[s]) * unit
                     row_total += min(off * off, top)
             total += row_total
     return total

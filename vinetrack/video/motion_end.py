@@ -108,7 +108,7 @@ def growth_end_notes(
         return []
     import cv2
 
-    pairs = itertools.pairwise(np.ascontiguousarray(luma[:, ::3, ::3]))
+    pairs = itertools.pairwise(np.ascontiguousarray(luma[:, ::5, ::5]))
     change = np.array([cv2.absdiff(a, b).mean() for a, b in pairs])
     before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0

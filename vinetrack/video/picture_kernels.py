@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import BORROWED, MATHS, PHASES, VECTOR, cover_reach, cover_table, phase
+from vinetrack.video.edge_cover import BORROWED, MATHS, PHASES, SHORTEST_PX, VECTOR, cover_reach, cover_table, phase
 
 FORGOTTEN = 4.0
 """Frames further off than this many memories, e⁻⁴ = 2 %, are not read. Chosen for time; at half 14 % of the weight is
@@ -22,7 +22,11 @@ pixels never seen bare change."""
 COVERED = 0.98
 """Cover from which a pixel counts as film, and below 1 − COVERED as background. Chosen: 2 % of the contrast is less
 than the noise. By reasoning: at 1 hardly a pixel is bare; at 0.75 mixtures are taken for film."""
-
+MIXED_BLURS = 2.06
+"""Distance from the edge, in optical blurs, from which a pixel counts as bare or covered. Derived: Φ(2.054) = COVERED."""
+FAR_PX = 80
+"""Columns beyond all places of the edge that are gathered. Chosen: what is looked at about an edge lies within 60 px of
+it. At half the surroundings of the start are cut off; at twice time grows."""
 ROWS_AT_ONCE = 8
 """Rows whose sums are gathered together. Chosen for time alone: eleven sums of eight rows of 960 columns are 340 kB."""
 
@@ -75,10 +79,16 @@ def gather(
     seen, film = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
     limits = np.zeros((n, 2), np.int64)
     widest = 0.0
+    # Far from where the edge ever is nothing is asked.
+    low, high = columns, 0
+    for t in range(n):
+        if math.isfinite(edge[t]):
+            low, high = min(low, int(edge[t]) - FAR_PX), max(high, int(edge[t]) + FAR_PX)
+    low, high = max(low, 0), min(high, columns)
     for t in range(n):
         first, last = columns, 0
         if math.isfinite(edge[t]):
-            for s in range(columns):
+            for s in range(low, high):
                 d = max(early[s] - t, t - late[s], 0.0) / memory_frames
                 if d < FORGOTTEN:
                     seen[t, s] = math.exp(-d)
@@ -86,12 +96,20 @@ def gather(
                     first, last = min(first, s), s + 1
         limits[t, 0], limits[t, 1] = first, last
         if last > first:
-            widest = max(widest, cover_reach(max(lengths[t], 0.02), blur))
+            widest = max(widest, cover_reach(max(lengths[t], SHORTEST_PX), blur))
+    # Frames of rest share a table: all motion blurs up to SHORTEST_PX are taken for that.
     tables = np.zeros((n, PHASES + 1, 2 * math.ceil(widest) + 4 + VECTOR))
+    places, resting = np.empty(n, np.int64), -1
     for t in range(n):
+        places[t] = t
         if limits[t, 1] > limits[t, 0]:
-            table = cover_table(lengths[t], blur, cover_reach(max(lengths[t], 0.02), blur))
+            if lengths[t] <= SHORTEST_PX and resting >= 0:
+                places[t] = resting
+                continue
+            table = cover_table(lengths[t], blur, cover_reach(max(lengths[t], SHORTEST_PX), blur))
             tables[t, :, : table.shape[2]] = table[0]
+            if lengths[t] <= SHORTEST_PX:
+                resting = t
     bright = np.empty(columns, np.float32)
     # A few rows at a time, so that their sums stay near the processor.
     for block in range(0, rows, ROWS_AT_ONCE):
@@ -99,11 +117,12 @@ def gather(
             first, last = limits[t]
             if last <= first:
                 continue
-            middle = math.ceil(cover_reach(max(lengths[t], 0.02), blur)) + 1
-            table, bare_weight, film_weight = tables[t], seen[t], film[t]
+            middle = math.ceil(cover_reach(max(lengths[t], SHORTEST_PX), blur)) + 1
+            zone = min(math.ceil(0.5 * max(lengths[t], SHORTEST_PX) + MIXED_BLURS * blur) + 1, middle)
+            table, bare_weight, film_weight = tables[places[t]], seen[t], film[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
-                strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, first, last,
+                strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, zone, first, last,
                 bare_weight, film_weight, early, late, t, pictures, tight, shading, bright, sums,
             )  # fmt: skip
     return sums
@@ -112,7 +131,7 @@ def gather(
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _gather_rows(
     picture: np.ndarray, low: int, high: int, gain: np.float32, level: np.float32, edge: float, lag: np.ndarray,
-    table: np.ndarray, middle: int, first: int, last: int, bare_weight: np.ndarray, film_weight: np.ndarray,
+    table: np.ndarray, middle: int, zone: int, first: int, last: int, bare_weight: np.ndarray, film_weight: np.ndarray,
     early: np.ndarray, late: np.ndarray, t: int, pictures: np.ndarray, tight: np.float32,
     shading: np.ndarray, bright: np.ndarray, sums: np.ndarray,
 ) -> None:  # fmt: skip
@@ -121,11 +140,11 @@ def _gather_rows(
     for u in range(low, high):
         at = edge - lag[u]
         whole, j, f, _ = phase(at)
-        behind = min(max(whole - middle + 1, first), last)
-        ahead = min(max(whole + middle + 1, first), last)
-        values = picture[u]
-        for s in range(first, last):
-            bright[s] = values[s] * gain + level
+        behind = min(max(whole - zone + 1, first), last)
+        ahead = min(max(whole + zone + 1, first), last)
+        values, levelled = picture[u, first:last], bright[first:last]
+        for s in range(last - first):
+            levelled[s] = np.float32(values[s]) * gain + level
         centre = (len(shading) - 1) // 2
         fraction = at - whole
         for s in range(max(first, whole - centre + 1), min(last, whole + centre)):

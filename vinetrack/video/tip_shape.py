@@ -11,6 +11,7 @@ from vinetrack.core.records import Floats
 from vinetrack.video.edge_cover import cover_reach
 from vinetrack.video.edge_state import (
     MARGIN_PX,
+    ROUGH_ROUNDS,
     SHADED_PX,
     EdgeState,
     blur_lengths,
@@ -24,6 +25,8 @@ SHADING_KERNEL = (0.25, 0.5, 0.25)
 """Smoothing kernel of the tip's shading. Chosen: a pixel wide, no sharper than optics are. By reasoning: without it,
 noise of single pixels is taken for shading; over twice the width, a narrow rim is blurred."""
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
+NEAR_BLURS = np.array([0.7, 0.85, 1, 1.2, 1.4])
+"""Blurs that are tried near the last estimate, as a part of it. Chosen: steps like those of BLURS_PX, halved."""
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated. Chosen as usual for high-speed cameras; it is replaced after the
@@ -74,13 +77,25 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
         step = np.clip(step, -LARGEST_LAG_STEP_PX, LARGEST_LAG_STEP_PX)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
-    candidates = BLURS_PX if everywhere else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // BLUR_FRAMES)]
-    misfits = []
-    for blur in candidates:
-        # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
-        margin = MARGIN_PX + cover_reach(0.0, float(candidates.max())) - cover_reach(0.0, float(blur))
-        misfits.append(_misfit_refitted(strip, replace(state, blur=float(blur)), sampled, margin))
+    candidates = BLURS_PX if everywhere else state.blur * NEAR_BLURS
+    # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
+    widest = MARGIN_PX + cover_reach(0.0, float(candidates.max()))
+
+    def misfit(blur: float) -> float:
+        return _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - cover_reach(0.0, blur))
+
+    if everywhere:
+        misfits = [misfit(float(blur)) for blur in candidates]
+    else:
+        # The outer two are tried only where the least lies at the border of the inner three.
+        misfits = [np.inf, *(misfit(float(blur)) for blur in candidates[1:-1]), np.inf]
+        least = int(np.argmin(misfits))
+        if least in (1, len(candidates) - 2):
+            outer = 0 if least == 1 else len(candidates) - 1
+            misfits[outer] = misfit(float(candidates[outer]))
+        tried = np.isfinite(misfits)
+        candidates, misfits = candidates[tried], [value for value in misfits if np.isfinite(value)]
     return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
@@ -114,7 +129,7 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
     """Misfit of some frames after a new fit of their edges: a blur must not be judged by edges fitted with another."""
     edge = np.full(len(state.edge), np.nan)
     edge[frames] = state.edge[frames]
-    fit = fit_edges(strip, replace(state, edge=edge))
+    fit = fit_edges(strip, replace(state, edge=edge), ROUGH_ROUNDS)
     use = np.isfinite(fit[:, 0])
     edge[use] = fit[use, 0]
     return residuals(strip, replace(state, edge=edge), fit, use, margin_px).misfit
