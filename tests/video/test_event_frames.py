@@ -95,6 +95,29 @@ def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypat
 
 
 @pytest.mark.usefixtures("bracketed")
+def test_where_frames_at_rest_take_no_bytes_no_others_than_those_of_the_event_are_decoded(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest = np.ones((BEFORE, 1, 1), np.uint8)
+    still = np.concatenate([scene.frames[0] * rest, scene.frames, scene.frames[-1] * rest])
+    path = write_video(tmp_path / "still.mp4", still, options={"crf": "28", "g": "250"})
+    decode, looked_at = event_frames.decode_packets, []
+
+    def counted(*arguments):
+        for frame in decode(*arguments):
+            looked_at.append(frame)
+            yield frame
+
+    monkeypatch.setattr(event_frames, "decode_packets", counted)
+    frames = read_event(inspect_recording(path))
+    moving = np.flatnonzero(scene.moving) + BEFORE
+    assert len(looked_at) <= len(still) / 250 + 1
+    assert frames.first <= moving[0] - MARGIN_FRAMES / 2
+    assert moving[-1] + MARGIN_FRAMES / 2 < frames.first + len(frames) < moving[-1] + 3 * MARGIN_FRAMES
+    assert np.array_equal(frames.luma, read_frames(path).luma[frames.first : frames.first + len(frames)])
+
+
+@pytest.mark.usefixtures("bracketed")
 def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scene: Scene) -> None:
     wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
     frames = read_event(inspect_recording(film), wanted)

@@ -174,12 +174,13 @@ def _longer(held: NDArray[Any] | None, picture: NDArray[Any], expected: int | No
 class PacketIndex:
     """Every frame of a film in the order in which it is shown: `pts` in units of `base_s`, and whether it is a key one.
 
-    Shapes (n_frames,).
+    `size_bytes` is that of its packet. Shapes (n_frames,).
     """
 
     pts: NDArray[np.int64]
     key: Bools
     base_s: float
+    size_bytes: NDArray[np.int64]
 
     @property
     def times_s(self) -> Floats:
@@ -200,7 +201,7 @@ def packet_index(path: Path) -> PacketIndex | None:
     """
     import av
 
-    pts, key = [], []
+    pts, key, size = [], [], []
     with quiet_log(), contextlib.suppress(av.error.FFmpegError), av.open(str(path)) as container:
         stream = container.streams.video[0]
         base = float(stream.time_base) if stream.time_base else 1.0
@@ -211,11 +212,12 @@ def packet_index(path: Path) -> PacketIndex | None:
                 return None
             pts.append(packet.pts)
             key.append(packet.is_keyframe)
+            size.append(packet.size)
     order = np.argsort(pts)
     times = np.array(pts, dtype=np.int64)[order]
     if len(times) < 2 or np.any(np.diff(times) <= 0):
         return None
-    return PacketIndex(times, np.array(key, dtype=bool)[order], base)
+    return PacketIndex(times, np.array(key, dtype=bool)[order], base, np.array(size, dtype=np.int64)[order])
 
 
 def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:

@@ -3,7 +3,7 @@
 A recorder that is stopped by hand holds thousands of frames of which some tens or hundreds show the growth. Of a
 recording too large to hold, pictures far apart are looked at first: the key frames of a film, which decode by
 themselves, or every so many frames of other files. What differs from the first pictures, or from the last, is the
-event.
+event. Of a film with few key frames the sizes of packets tell more, where frames at rest take hardly any bytes.
 """
 
 from __future__ import annotations
@@ -43,6 +43,14 @@ count, at twice the first 20 px are missed, for which the margin is."""
 NOISE_PAIRS = 40
 """Pairs of pictures from which the noise is known. Chosen: to a tenth of itself in each pixel. At half to a seventh, at
 twice twice the memory."""
+EMPTY_BYTES = 100
+"""Packet of a frame that repeats the one before it, at most. Measured: 20 bytes (H.264, 960 x 540 px). Chosen with room
+for larger pictures and other codecs; at half some of those are decoded whole, at twice films of few bits pass, in which
+packets of moving frames stand out as well."""
+LOUD, LOUD_FRAMES = 2.0, 9
+"""Packets that are on average so many times as large as the smallest, over so many frames, show that something moves.
+Chosen: a frame with a tip of a few pixels takes three times as much. By reasoning: at half single blocks that are coded
+anew count, at twice slow beginnings do not, for which the margin is."""
 MARGIN_FRAMES, MARGIN_PART = 40, 0.15
 """Frames, and part of the event, that are added at either end. Chosen: rest and background are seen in them; slow
 beginnings change less than LEAST_GREY. By reasoning: at half little rest is left; at twice a short event takes
@@ -118,8 +126,7 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
         return None
     start = int(numbers[max(begun[0] - 1, 0)])
     stop = int(numbers[min(max(going[-1], begun[0]) + 1, len(numbers) - 1)])
-    margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
-    return max(start - margin, 0), min(stop + margin, count - 1)
+    return _with_margin(start, stop, count)
 
 
 def _film_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
@@ -128,6 +135,8 @@ def _film_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
     if index is None or len(index.pts) < SPARSEST:
         return read_frames(recording)
     count = len(index.pts)
+    if wanted is None:
+        wanted = _range_by_packets(recording, index)
     if wanted is None:
         pictures, numbers = _look_into_film(recording, index)
         wanted = event_range(pictures, numbers, count)
@@ -139,22 +148,76 @@ def _film_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
     return read_frames(recording, part=(wanted[0], min(wanted[1], count - 1), index))
 
 
+def _range_by_packets(recording: Recording, index: PacketIndex) -> tuple[int, int] | None:
+    """First and last frame of the event, with a margin, from the packets of a film with few key frames.
+
+    A frame that repeats the one before it takes a packet of some bytes, and one in which something moves takes more.
+    Key frames, which decode by themselves, must show that nothing changes before the event and nothing after it. None
+    where even the smallest packets are large, or key frames differ, and the film must be looked into.
+    """
+    count, keys = len(index.pts), np.flatnonzero(index.key)
+    if _keys_suffice(index) or len(keys) < 2:
+        return None
+    size = np.where(index.key, 0, index.size_bytes).astype(float)
+    smallest = float(size[~index.key].min(initial=np.inf))
+    mean = np.convolve(size, np.ones(LOUD_FRAMES), "same") / np.convolve(~index.key, np.ones(LOUD_FRAMES), "same")
+    loud = np.flatnonzero(mean > LOUD * smallest)
+    if smallest > EMPTY_BYTES or not len(loud):
+        return None
+    first, last = _with_margin(int(loud[0]), int(loud[-1]), count)
+    before, after = keys[keys <= loud[0]], keys[keys >= loud[-1]]
+    if not len(before) or not len(after):
+        return None
+    looked_at = [keys[:: max(1, -(-len(keys) // LOOKED_AT))] for keys in (before, after)]
+    pictures = _pictures_of(recording, index, np.concatenate(looked_at), alone=True)
+    sides = [[pictures[number] for number in numbers if number in pictures] for numbers in looked_at]
+    if not all(sides) or any(_differ(side[0], picture) for side in sides for picture in side[1:]):
+        return None
+    return first, last
+
+
+def _differ(still: NDArray[np.uint8], picture: NDArray[np.uint8]) -> bool:
+    """Whether two small pictures differ by more than noise, apart from their brightness."""
+    import cv2
+
+    first, second = (cv2.blur(seen.astype(np.float32), (3, 3)) for seen in (still, picture))
+    change = np.abs(second * (np.median(first + 1) / np.median(second + 1)) - first)
+    limit = max(CHANGED * 1.4826 * float(np.median(change)), LEAST_GREY)
+    return np.count_nonzero(change > limit) >= LEAST_PIXELS
+
+
+def _with_margin(start: int, stop: int, count: int) -> tuple[int, int]:
+    """First and last frame of an event, and as many more as the margin has."""
+    margin = max(MARGIN_FRAMES, round(MARGIN_PART * (stop - start)))
+    return max(start - margin, 0), min(stop + margin, count - 1)
+
+
+def _keys_suffice(index: PacketIndex) -> bool:
+    """Whether key frames are so close to each other that no event lies between two of them."""
+    keys = np.flatnonzero(index.key)
+    return len(keys) > 1 and max(int(np.diff(keys).max()), len(index.pts) - int(keys[-1])) <= SPARSEST
+
+
 def _look_into_film(recording: Recording, index: PacketIndex) -> tuple[list[NDArray[np.uint8]], NDArray[np.int_]]:
     """Small pictures of key frames, or, where those are too rare, of every so many frames of the whole film."""
-    count = len(index.pts)
-    keys = np.flatnonzero(index.key)
-    alone = len(keys) > 1 and max(int(np.diff(keys).max()), count - int(keys[-1])) <= SPARSEST
-    candidates = keys if alone else np.arange(count)
-    every = max(1, -(-len(candidates) // LOOKED_AT))
-    chosen = {int(index.pts[i]): int(i) for i in candidates[::every]}
-    pictures, numbers = [], []
+    alone = _keys_suffice(index)
+    candidates = np.flatnonzero(index.key) if alone else np.arange(len(index.pts))
+    pictures = _pictures_of(recording, index, candidates[:: max(1, -(-len(candidates) // LOOKED_AT))], alone)
+    numbers = sorted(pictures)
+    return [pictures[number] for number in numbers], np.array(numbers, dtype=int)
+
+
+def _pictures_of(
+    recording: Recording, index: PacketIndex, numbers: NDArray[np.int_], alone: bool
+) -> dict[int, NDArray[np.uint8]]:
+    """Small pictures of some frames by their number; of key frames `alone` no others are decoded."""
+    chosen = {int(index.pts[i]): int(i) for i in numbers}
+    pictures = {}
     for frame in decode_packets(recording.path, set(chosen) if alone else None, DECODER_THREADS):
         number = None if frame.pts is None else chosen.get(frame.pts)
         if number is not None and (frame.width, frame.height) == (recording.width, recording.height):
-            pictures.append(_shrunk(luma_plane(frame, recording.whole), recording.bit_depth))
-            numbers.append(number)
-    order = np.argsort(numbers)
-    return [pictures[i] for i in order], np.array(numbers, dtype=int)[order]
+            pictures[number] = _shrunk(luma_plane(frame, recording.whole), recording.bit_depth)
+    return pictures
 
 
 def _raw_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
