@@ -93,8 +93,9 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     start = edge + 1.4
     start[5] = np.nan
     fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12, NO_SHADING
-    )
+        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12, NO_SHADING,
+        np.arange(16),
+    )  # fmt: skip
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5
     assert np.abs(fit[sound, 0] - edge[sound]).max() < 0.08
@@ -109,7 +110,7 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     known, ignored = (
         kernels.fit_edges(
             strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-            shading,
+            shading, np.arange(16),
         )[:, 0] - edge
         for shading in (RIM, NO_SHADING)
     )  # fmt: skip

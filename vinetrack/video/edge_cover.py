@@ -19,7 +19,8 @@ Z_STEP, Z_LAST = 0.02, 8.0
 """Spacing and end of the table of the normal distribution. Derived: cubic interpolation errs by Z_STEP⁴/384 of the
 fourth derivative, 2e-10, and Φ(−8) = 6e-16."""
 SHORTEST_PX = 0.02
-"""Motion blur below which there is none. Derived: it moves covers by less than STEP does, p''·SHORTEST_PX²/24 < 1e-4."""
+"""Motion blur below which there is none. Derived: it changes covers by less than STEP does, by
+p''·SHORTEST_PX²/24 < 1e-4."""
 PHASES = round(1 / STEP)
 """Entries of a table of covers by pixel. Derived from STEP."""
 VECTOR = 8

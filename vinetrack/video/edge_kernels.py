@@ -18,8 +18,8 @@ BEHIND = 25
 """Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen.
 Chosen: nearly two lengths of MEMORY in `edge_state`. Half or twice changes only film that is never seen."""
 BEYOND = 50
-"""Columns ahead of the last passed one that are looked at. Chosen: no front that ended lies there. Half or twice changes
-only time."""
+"""Columns ahead of the last passed one that are looked at. Chosen: no front lies there. Half or twice changes only
+time."""
 FOREIGN = 1.7
 """How much farther than background film is from what resembles neither. Chosen above 1, so that what resembles neither
 hides background. By reasoning: nearer 1 a payload counts as film, farther a stain on the film does as background."""
@@ -139,8 +139,8 @@ def fit_edges(
             last = min(columns, int(y + half) + 1)
             # All rows of pixels behind one another first: sums over them are then one long loop.
             used = _line_up(
-                strip[t], np.float32(scale[t]), np.float32(offset[t]), pictures, y, lag, half, first, last, middle, table,
-                wider, shade, covers, slopes, steps, left, variances, falls,
+                strip[t], np.float32(scale[t]), np.float32(offset[t]), pictures, y, lag, half, first, last, middle,
+                table, wider, shade, covers, slopes, steps, left, variances, falls,
             )  # fmt: skip
             sums = _normal_sums(
                 covers[:used], slopes[:used], steps[:used], left[:used], variances[:used], falls[:used],
@@ -205,8 +205,8 @@ def _normal_sums(
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _line_up(
-    picture: np.ndarray, gain: np.float32, level: np.float32, pictures: np.ndarray, y: float, lag: np.ndarray, half: float,
-    first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray, shading: np.ndarray,
+    picture: np.ndarray, gain: np.float32, level: np.float32, pictures: np.ndarray, y: float, lag: np.ndarray,
+    half: float, first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray, shading: np.ndarray,
     covers: np.ndarray, slopes: np.ndarray, steps: np.ndarray, left: np.ndarray, variances: np.ndarray,
     falls: np.ndarray,
 ) -> int:  # fmt: skip

@@ -23,7 +23,7 @@ COVERED = 0.98
 """Cover from which a pixel counts as film, and below 1 − COVERED as background. Chosen: 2 % of the contrast is less
 than the noise. By reasoning: at 1 hardly a pixel is bare; at 0.75 mixtures are taken for film."""
 MIXED_BLURS = 2.06
-"""Distance from the edge, in optical blurs, from which a pixel counts as bare or covered. Derived: Φ(2.054) = COVERED."""
+"""Distance from the edge, in optical blurs, from which a pixel is bare or covered. Derived: Φ(2.054) = COVERED."""
 FAR_PX = 80
 """Columns beyond all places of the edge that are gathered. Chosen: what is looked at about an edge lies within 60 px of
 it. At half the surroundings of the start are cut off; at twice time grows."""
@@ -122,8 +122,8 @@ def gather(
             table, bare_weight, film_weight = tables[places[t]], seen[t], film[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
-                strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, zone, first, last,
-                bare_weight, film_weight, early, late, t, pictures, tight, shading, bright, sums,
+                strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, zone, first,
+                last, bare_weight, film_weight, early, late, t, pictures, tight, shading, bright, sums,
             )  # fmt: skip
     return sums
 
