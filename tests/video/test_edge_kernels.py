@@ -93,8 +93,8 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     start = edge + 1.4
     start[5] = np.nan
     fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12, NO_SHADING,
-        np.arange(16),
+        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
+        NO_SHADING, np.arange(16),
     )  # fmt: skip
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5

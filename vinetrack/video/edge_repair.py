@@ -276,10 +276,12 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
 
 def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
     """Median lead of each band over the core frames within BAND_OFFSET_PX, or the nearest few, (n_frames, n_bands)."""
-    out = np.empty_like(lead_px)
     fewest = min(BAND_OFFSET_FRAMES, len(core))
-    for t in range(len(edge)):
-        distance = np.abs(edge[core] - edge[t])
+    # Places a pixel apart have the same frames nearby but for one, and an edge at rest has one place.
+    places, frame_places = np.unique(np.rint(edge), return_inverse=True)
+    out = np.empty((len(places), lead_px.shape[1]))
+    for i, place in enumerate(places):
+        distance = np.abs(edge[core] - place)
         near = distance <= max(BAND_OFFSET_PX, float(np.partition(distance, fewest - 1)[fewest - 1]))
-        out[t] = np.median(lead_px[core[near]], axis=0)
-    return out
+        out[i] = np.median(lead_px[core[near]], axis=0)
+    return out[frame_places]

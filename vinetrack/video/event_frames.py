@@ -183,7 +183,7 @@ def _differ(still: NDArray[np.uint8], picture: NDArray[np.uint8]) -> bool:
     first, second = (cv2.blur(seen.astype(np.float32), (3, 3)) for seen in (still, picture))
     change = np.abs(second * (np.median(first + 1) / np.median(second + 1)) - first)
     limit = max(CHANGED * 1.4826 * float(np.median(change)), LEAST_GREY)
-    return np.count_nonzero(change > limit) >= LEAST_PIXELS
+    return bool(np.count_nonzero(change > limit) >= LEAST_PIXELS)
 
 
 def _with_margin(start: int, stop: int, count: int) -> tuple[int, int]:

@@ -166,7 +166,7 @@ def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[n
 
 def _noise_power(frames: NDArray[np.float32]) -> float:
     """Variance of the noise of a pixel, of a picture's quantisation at least."""
-    changes = np.abs(np.diff(frames[:: max(1, len(frames) // 30)], axis=0)).ravel()
+    changes = np.abs(np.diff(frames[:: max(1, len(frames) // 30), ::2, ::2], axis=0)).ravel()
     noise = 1.4826 * float(median(changes, np.ones(changes.size, np.int8), BINS_A_LEVEL)) / np.sqrt(2)
     return max(noise, 0.7) ** 2
 
