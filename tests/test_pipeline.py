@@ -295,7 +295,7 @@ def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_pa
     assert {name: row["status"] for name, row in read_rows(results / "trials.csv").items()} == {
         "a": "ok", "b": "ok", "c": "failed", "d": "failed",
     }  # fmt: skip
-    for given, said in (('["x"]', "'x' is no trial"), ("x", "is not JSON"), ('"a"', "is not a JSON list")):
+    for given, said in (('["x"]', "'x' is not a trial"), ("x", "is not JSON"), ('"a"', "is not a JSON list")):
         refused = invoke(["tracks", str(folder), str(results), "--trials", given])
         assert refused.exit_code == 2
         assert said in " ".join(refused.output.split())
