@@ -49,17 +49,19 @@ Report = Callable[[str], None]
 """Called with a few words on what is being done."""
 
 LINEAR_PREDICTION_LIMIT = 100.0
-"""Predicted Δχ² up to which linear predictions are good to a per cent, so that candidates are fitted without a subset
-fit. Measured in trials of the method: for weak effects the linear Δχ² predicts the refitted one to 0.1 %, for strong
-ones √LR 22 against 25, 65 against 17."""
+"""Largest predicted Δχ² at which linear predictions are still good to a per cent, so that no subset fits are needed.
+Measured in trials of the method: for weak effects the linear Δχ² predicts the refitted one to 0.1 %, for strong ones
+√LR 22 against 25, 65 against 17."""
 
 MIN_SHARE_OF_SUBSET_GAIN = 0.1
-"""Share of the subset fit's gain that the fit to all trials must reach, or it is repeated from other starts. Chosen: a
-fit to all trials gains a multiple of what a subset gains; at half fewer, at twice more fits are repeated (time)."""
+"""Share of the subset fit's gain that the fit to all trials must reach; otherwise it is repeated from other starts.
+Chosen: a fit to all trials gains a multiple of what a subset gains; at half fewer, at twice more fits are repeated
+(time)."""
 
 FAILED_FIT_DELTA_CHI2 = -1.0
-"""Δχ² of an added effect below which its fit has failed. Derived: a model cannot fit worse than one nested in it; 1
-allows for rounding and unsettled iterations."""
+"""Δχ² of an added effect below which its fit has failed. Derived: the maximum likelihood of a model is at least that of
+a model nested in it. 1 allows for rounding, for unsettled iterations and for the noise, which is estimated by the
+restricted likelihood and so does not maximise the one compared here."""
 
 SAME_MINIMUM_PER_POINT = 0.01
 """Δχ² per point below which two fits that are far off count as the same minimum. Derived: −2 ln L of n points with
@@ -67,11 +69,13 @@ noise s is n ln s², so their misfits agree to half a per cent; such fits end be
 starts are tried (time), at twice fewer."""
 
 LINEAR_REACH = 16.0
-"""Predicted −2 ln L by which an effect may be behind the best predicted one and still be fitted. Chosen: √16 is four
-standard deviations for the error of the linear prediction."""
+"""Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted: this value, or
+40 % of the best gain where that is more, but never more than 75 % of it. Chosen: nearly twice the difference within
+which a hypothesis belongs to the answer set, for linear predictions err; at half fewer, at twice more are fitted."""
 
 ALIKE_COSINE = 0.95
-"""Cosine from which two effects count as alike. Chosen: it leaves a tenth of the information (1 − 0.95²)."""
+"""Cosine from which two effects count as alike. Chosen: with one of them in the model, a tenth of the information on
+the other is left (1 − 0.95²)."""
 
 MIN_SHARE_OF_BEST_PREDICTION = 0.2
 """Share of the best predicted gain from which an effect is fitted. Chosen: at half more subset fits cost time, at twice
@@ -84,8 +88,10 @@ candidates."""
 
 SUBSET_REACH, SUBSET_REACH_SHARE, ALIKE_REACH_FACTOR = 40.0, 0.1, 5.0
 """−2 ln L by which a subset fit may end behind the best and still be fitted to all trials: this value or this share of
-the best one's gain, times the third number if the two effects are alike. Chosen: the subset holds a third of the
-trials, so 40 there may be 13 in all. At half a right answer may be dropped, at twice time grows."""
+the best one's gain, times the third number if the two effects are alike. Chosen: far more than chance explains (40 on
+a third of the trials is about 120 on all), because subset fits are short, with noise correlation and between-trial
+standard deviations fixed, and may end in a local minimum. At half a right answer may be dropped, at twice time
+grows."""
 
 MAX_FULL_FITS = 7
 """Candidates fitted to all trials after their subset fits, at most. Chosen for time."""
@@ -359,7 +365,7 @@ class CandidateFits:
         if name in self.fitted and from_subset:
             return
         self.report(f"fitting {name}")
-        # A hypothesis of incredible sizes, however well it fits, is no reason to abandon the others.
+        # A hypothesis whose sizes are not credible, however well it fits, is no reason to abandon the others.
         best = max((known.fit.log_likelihood for known in self.credible_fits), default=-math.inf)
         rescue = from_subset or not self.has_adequate_fit
         if not self._is_new_start(start, rescue=rescue):
@@ -379,7 +385,7 @@ class CandidateFits:
     def _restarted(
         self, start: SubsetFit, hypothesis: LikelihoodRatio, best: float, *, rescue: bool
     ) -> LikelihoodRatio:
-        """Return the best fit of a hypothesis from other starts, where the first start may have led it astray.
+        """Return the best fit of a hypothesis over this and other starts, in case the first start misled it.
 
         The first restart is from sizes at which it hardly acts, or from the same values with the state reset where it
         began there. If that ends in the same minimum, the start is not to blame, and no other start is tried.
@@ -405,7 +411,7 @@ class CandidateFits:
         return max(fits, key=lambda fitted: fitted.delta_chi2)
 
     def _is_new_start(self, start: SubsetFit, *, rescue: bool, reset: bool = False) -> bool:
-        """Whether no full fit began there yet; of a model far off the state is always reset, see `refit`."""
+        """Whether no full fit began there yet; where the model is far off, `refit` always resets the state."""
         key = start.names, repr(sorted(start.values.items())), reset or self.tests.fit.chi2_per_dof > POOR_FIT
         if key in self.started and (self.started[key] or not rescue):
             return False

@@ -27,18 +27,18 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
 MAX_EFFECTS = 5
-"""Effects of a set at most. Chosen: with six and more the sets outnumber what 48 trials can tell apart."""
+"""Largest number of effects in a set. Chosen: with six and more there are more sets than 48 trials can tell apart."""
 
 PAIR_BASES, PAIR_PARTNERS = 3, 4
 """Number of best single effects from which pairs are built, and of partners tried with each. A single effect needs
 MIN_SHARE_OF_BEST_GAIN of the best one's gain. Chosen for time."""
 
 LARGER_SET_BASES, LARGER_SET_PARTNERS = 2, 3
-"""The same for larger sets: the best sets of one effect fewer, and the best of credible sizes besides. Chosen for
-time."""
+"""The same for larger sets, built on the best sets of one effect fewer and, besides them, on the best whose sizes are
+credible. Chosen for time."""
 
 MIN_LOG_LIKELIHOOD_GAIN = 1.0
-"""Difference in ln L from which a fit counts as better. Chosen: iterations that have not settled differ by a tenth."""
+"""Difference in ln L from which a fit counts as better. Chosen: iterations that have not settled differ by 0.1."""
 
 Names = frozenset[str]
 
@@ -57,7 +57,7 @@ class EffectSets:
         self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
-        """Fitted sets of this many effects, the likeliest first.
+        """Fitted sets of this many effects, the highest likelihood first.
 
         Parameters
         ----------
@@ -80,7 +80,7 @@ class EffectSets:
         Returns
         -------
         list of LikelihoodRatio
-            All fitted sets of that size, the likeliest first.
+            All fitted sets of that size, the highest likelihood first.
         """
         n_partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
         for base in self._bases(size - 1):
@@ -143,7 +143,7 @@ class EffectSets:
         Returns
         -------
         LikelihoodRatio or None
-            Not refitted if a set of these effects is known that is no likelier than the larger set.
+            Not refitted if a fit of these effects is known whose likelihood is no higher than that of the larger set.
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
         names = frozenset(other.name for other in others)
@@ -184,6 +184,8 @@ class EffectSets:
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
         """Significance of a member of a set given the others, in standard deviations; 0 where it is not known.
 
+        It is √(Δχ² / inflation): one degree of freedom, also for an effect with several parameters.
+
         Parameters
         ----------
         hypothesis : a set.
@@ -223,12 +225,16 @@ class EffectSets:
         return ""
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
-        """Whether a set is better than a smaller one by more than the threshold of its additional effect.
+        """Whether a set is better than a smaller one by at least the threshold of its additional effect.
+
+        The smaller set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any
+        nested one that was fitted, so the criterion is then the stricter. The difference of −2 ln L is not divided by
+        the inflation.
 
         Parameters
         ----------
         hypothesis : a set of at least two effects.
-        smaller : a smaller set; by default the likeliest of one effect fewer.
+        smaller : a smaller set; by default that of highest likelihood with one effect fewer.
 
         Returns
         -------
@@ -259,7 +265,7 @@ class EffectSets:
         return tuple(step for step in steps if step is not None)
 
     def _keep_best(self, hypothesis: LikelihoodRatio) -> None:
-        """Keep a set if no likelier fit of the same effects is known, and drop curves that are not needed."""
+        """Keep a set unless a fit of the same effects with a higher likelihood is known; drop curves not needed."""
         names = frozenset(hypothesis.names)
         known = self.fitted.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:

@@ -1,9 +1,9 @@
 """Gain of a hypothesis if the film mass of each vine is a nuisance parameter.
 
-Which of two effects is likelier may depend on the mass of the film: a drag on film that is 1.5 % lighter than stated
-was less likely than a wrong scale, by Δχ² 27. A hypothesis is therefore not excluded if it is as likely as the best
-with the film mass of every vine free within its usual error. The tests of whether anything is missing use the stated
-mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
+Which of two effects has the higher likelihood may depend on the mass of the film: where the truth was a drag on film
+that is 1.5 % lighter than stated, a wrong scale was ahead of it by Δχ² 27. A hypothesis is therefore not excluded if it
+fits as well as the best once the film mass of every vine is free within its usual error. The tests of whether anything
+is missing use the stated mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from vinetrack.inference.systematics import film_errors
 
 
 def film_gain(fit: Fit) -> float:
-    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`) of each vine's film mass, by linear algebra.
+    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`²) of each vine's film mass, by linear algebra.
+
+    ε takes its best value, with its prior as a penalty; it is not integrated out.
 
     Parameters
     ----------
@@ -40,7 +42,7 @@ def film_gain(fit: Fit) -> float:
 
 
 def _deviance(solution: Solution, base: Solution) -> float:
-    """−2 ln L of a solution, maximised over its parameters and the between-trial standard deviations of `base`."""
+    """−2 ln L, minimised over the parameters and over the between-trial standard deviations that `base` estimates."""
     part, problem, state = (
         marginal(solution.cross_products, solution.problem, solution.state),
         solution.problem,

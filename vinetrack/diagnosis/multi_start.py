@@ -1,8 +1,8 @@
 """Fits of hypotheses from several starts: a short fit to a subset of the trials, then a full fit to all of them.
 
-A subset fit takes one trial of every condition. Its between-trial standard deviations are those of a typical batch of
-vines, and its noise is as correlated as the noise of the tracks. If they were free they would absorb the misfit and
-stall the optimiser.
+A subset fit takes one trial of every condition. Its between-trial standard deviations are fixed at those of a typical
+batch of vines, and the correlation of its noise at that of the tracks: if free, they would absorb the misfit and stall
+the optimiser.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ FULL_FIT_FIRST_ITERATIONS, FULL_FIT_MAX_ITERATIONS, ABANDONED_BEHIND = 14, 40, 5
 continued. Chosen for time."""
 
 MIN_SHARE_OF_BEST_GAIN = 0.3
-"""Share of the best hypothesis's gain from which larger sets are built on a hypothesis. A fit that is far off and
-cannot reach it need not be completed. Chosen for time: effects that share a misfit evenly explain a third of it each;
-at half weaker ones are built on too (time), at twice two that explain half each may not be."""
+"""Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it. A fit that is far off
+and cannot reach it need not be completed. Chosen for time: effects that share a misfit evenly explain a third of it
+each; at half weaker ones are built on too (time), at twice two that explain half each may not be."""
 
 MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
 """Fall of −2 ln L of a subset fit from which its start is worth a full fit. Chosen: iterations that have not settled

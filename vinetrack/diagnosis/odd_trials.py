@@ -37,8 +37,8 @@ USUAL_EXPONENT = 0.37
 """Starting value of the exponent. PHYSICS: published for vines of 6 to 24 mm."""
 
 USUAL_SCATTER = 0.05
-"""Residual of ln F from which the robust fit reduces the weight of a trial. Chosen: B of one vine scatters by 1 to 4 %
-and the pressure by 1 to 2 %; at half and twice only the efficiency of the fit changes."""
+"""Residual of ln F at which the robust fit halves the weight of a trial. Chosen: B of one vine scatters by 1 to 4 % and
+the pressure by 1 to 2 %; at half and twice mainly the efficiency of the fit changes."""
 
 LEAST_SCATTER = 0.02
 """Lower limit of the scatter of ln F: the scatter of careful trials. Chosen; at half and twice only campaigns of a few
@@ -49,13 +49,13 @@ CHANCE = 1e-4
 the verdict is `unexplained`; at ten times the limit falls from 10 to 8 standard deviations for 24 trials."""
 
 EFFICIENCY = 0.37
-"""Efficiency of a standard deviation from the median absolute deviation, relative to the mean square. Derived for the
-normal distribution."""
+"""Efficiency of a standard deviation from the median absolute deviation, relative to that from the mean square. Derived
+for the normal distribution; so many degrees of freedom per trial are assumed, none lost to the fitted curves."""
 
 FEWEST_TRIALS, LARGEST_SHARE = 8, 0.125
 """Number of trials from which outliers are looked for, and the largest fraction that may be outliers (at least two, for
-rows get exchanged). Chosen: with eight, most trials define the usual; where more than an eighth deviate, they are no
-slips but a group of their own."""
+rows get exchanged). Chosen: with eight, most trials define what is usual; where more than an eighth deviate, they are
+not slips but a group of their own."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     Returns
     -------
     list of OddTrial
-        In the order of the trials; empty where there would be many, or too few trials to define the usual.
+        In the order of the trials; empty where there would be many, or too few trials to define what is usual.
     """
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
@@ -88,18 +88,18 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
     speed = np.array([middle_speed(trial_data) for trial_data in data])
     stated = [_stated_Pa(trial_data) for trial_data in data]
     force = np.array([_force_N(trial, pressure_Pa) for trial, pressure_Pa in zip(trials, stated, strict=True)])
-    moved = force > 0
-    if np.count_nonzero(moved) < FEWEST_TRIALS:
+    driven = force > 0
+    if np.count_nonzero(driven) < FEWEST_TRIALS:
         return []
     names = [trial.vine for trial in trials]
     vines, vine_index = np.unique(
-        [name for name, is_moved in zip(names, moved, strict=True) if is_moved], return_inverse=True
+        [name for name, is_driven in zip(names, driven, strict=True) if is_driven], return_inverse=True
     )
-    curves = _fit_curves(np.log(force[moved]), np.log(speed[moved]), vine_index)
+    curves = _fit_curves(np.log(force[driven]), np.log(speed[driven]), vine_index)
     index_of = {vine: k for k, vine in enumerate(vines)}
     residual = np.full(len(data), -np.inf)
-    residual[moved] = np.log(force[moved]) - curves(np.log(speed[moved]), vine_index)
-    scatter = max(float(np.median(np.abs(residual[moved]))) / 0.6745, LEAST_SCATTER)
+    residual[driven] = np.log(force[driven]) - curves(np.log(speed[driven]), vine_index)
+    scatter = max(float(np.median(np.abs(residual[driven]))) / 0.6745, LEAST_SCATTER)
     allowed = _limit(len(data)) * scatter
     replicates = [[j for j, other in enumerate(trials) if other.condition == trial.condition and j != k]
              for k, trial in enumerate(trials)]  # fmt: skip

@@ -6,8 +6,9 @@ each trial, release, origin and the deviations of pressure and B, are integrated
 projected off. Each candidate then has a score, an information, and a cosine with every other.
 
 The standard error is computed twice: from the noise and the between-trial standard deviations of the fit, and from the
-scatter of the scores of single trials (White, Econometrica 48, 817, 1980, with trials as clusters), which is valid
-whatever the noise within a trial is like. Tests use the larger of the two.
+scatter of the scores of single trials (White, Econometrica 48, 817, 1980, with trials as clusters), which is valid for
+many independent trials whatever the noise within a trial is like. Tests use the larger of the two; of few trials
+(`robust_covariance.FEWEST_CLUSTERS`) there is only the first.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ class Scores:
     """Score statistics of every shape given the fit, per unit of its size.
 
     `score`, shape (n_shapes,), and `information`, shape (n_shapes, n_shapes), are sums over trials of `trial_scores`,
-    shape (n_trials, n_shapes), and `trial_informations`, shape (n_trials, n_shapes, n_shapes). `degrees` is the number
-    of trials less that of the free parameters.
+    shape (n_trials, n_shapes), and `trial_informations`, shape (n_trials, n_shapes, n_shapes), and of contributions of
+    priors, which belong to no trial. `degrees` is the number of trials less that of the estimated parameters, at least
+    1.
     """
 
     score: Floats
@@ -75,7 +77,10 @@ class Scores:
 
     @property
     def robust_sigma(self) -> Floats:
-        """Cluster-robust standard error, from the scatter of trial scores after the size has explained its part."""
+        """Cluster-robust standard error, from the scatter of trial scores about what the size predicts.
+
+        0 for few trials, see `cluster_variance`.
+        """
         diagonal = np.diag(self.information)
         residual = self.trial_scores - np.einsum("njj->nj", self.trial_informations) * self.size
         scatter = np.sqrt(cluster_variance(residual, self.degrees))
@@ -160,7 +165,9 @@ def _sum_of_blocks(blocks: Floats, places: NDArray[np.int_], size: int) -> Float
 
 
 def levers_of(fit: Fit, products: Products) -> Floats:
-    """Decrease of each parameter of a fit per unit of an omitted effect's size (omitted-variable bias), linear.
+    """Bias of each parameter per unit of an omitted effect's size (omitted-variable bias), by the linear model.
+
+    A parameter falls by this much when the effect is added.
 
     Parameters
     ----------
@@ -330,8 +337,9 @@ def _at_bound(fit: Fit) -> NDArray[np.bool_]:
 def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floats]:
     """Predicted fall of −2 ln L with each shape, and the size at which it is reached, in the linear model.
 
-    The noise has the correlation of the tracks' noise, and its variance is estimated from the residuals: where a model
-    is far off, the noise of its fit has absorbed part of the misfit.
+    The noise has the correlation of the tracks' noise and one variance for all trials, estimated from the residuals:
+    where a model is far off, the noise of its fit has absorbed part of the misfit. The between-trial standard
+    deviations are 1 % of pressure and 3 % of B.
 
     Parameters
     ----------

@@ -59,12 +59,12 @@ is shown."""
 LEADING_TERMS, LEADING_TERM_SHARE = ("lens", "perspective"), 0.95
 """Effects that are the leading term of a series in the image position, and the share of a set's gain that such a term
 must gain alone for the rest of the set to count as possibly its next term. Derived: at the edge of the picture the
-fifth order of a lens is up to a fifth of its third, 4 % of the squares. At half, physics that is a few times weaker
-than a lens is named only after the lens was corrected; at twice (0.975) a strong lens is taken for a lens and
-physics."""
+fifth order of a lens is up to a fifth of its third, 4 % of the squares, so that up to 5 % of the gain is left to the
+rest of the set. With 10 % (0.9), physics that is a few times weaker than a lens is named only after the lens was
+corrected; with 2.5 % (0.975), a strong lens is taken for a lens and physics."""
 
 NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)
-"""Kinds of hypotheses that are no physics."""
+"""Kinds of hypotheses that are not physics: faults of the measurement, and differences between trials."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,10 @@ class SelectionStep:
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, restarts: int = 0) -> list[SelectionStep]:
     """Select the effects that a model lacks.
 
-    At a local minimum any effect seems to help. A fit that is far off is therefore refitted from other starts first,
-    and the model is also refitted from where the best hypothesis ended. If it then fits better without the effect, the
-    selection is repeated from there, twice at most.
+    If the model's fit is only a local optimum, any added effect seems to help. A fit that is far off is therefore
+    refitted from other starts first, and the model, without any effect added, is also refitted from where the best
+    hypothesis ended. If its likelihood is then higher than before, the selection is repeated from that fit, twice at
+    most.
 
     Parameters
     ----------
@@ -174,10 +175,10 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, resta
 
 
 def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
-    """Whether a better hypothesis than the best may exist: it is far off, or its trial effects absorb a misfit.
+    """Whether a better hypothesis may exist: the best one so far is far off, or its trial effects absorb a misfit.
 
-    A hypothesis whose residuals are at the noise of the tracks, with trials that scatter no more than careful work
-    allows, leaves nothing to be gained.
+    Nothing is left to gain once the residuals are no larger than the noise of the tracks and trials scatter no more
+    than careful work allows.
     """
     if not hypotheses:
         return True
@@ -186,7 +187,7 @@ def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
 
 
 def _is_better(hypotheses: Sequence[LikelihoodRatio], reference: LikelihoodRatio) -> bool:
-    """Whether the best of these hypotheses is likelier than the reference."""
+    """Whether the best of these hypotheses has a clearly higher likelihood than the reference."""
     if not hypotheses:
         return False
     return best_of(hypotheses).fit.log_likelihood > reference.fit.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN

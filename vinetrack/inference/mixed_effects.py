@@ -11,8 +11,8 @@ f : position of the leading edge that the equation of motion predicts, m, by tim
     stated error²) where the sheet states an error, and for coefficients of groups that are random; otherwise flat
     between the bounds.
 u_i = (r_i, o_i, p_i, b_i) : random effects of the trial, called trial effects: release, s; origin, m; relative
-deviation
-    of the pressure; deviation of ln B. Normal, independent of each other and between trials, with standard deviations
+    deviation of the pressure; deviation of ln B. Normal, independent of each other and between trials, with standard
+    deviations
     r_i : RELEASE_PRIOR_FRAMES frames about the initial estimate where frames at rest are recorded, three durations of
           the track where they are not, `fit_problem.KNOWN_RELEASE_S` where the tube was pressurised in the recording;
     o_i : ORIGIN_PRIOR_SIGMAS of the noise where frames at rest are recorded, else three spans of the track;
@@ -31,10 +31,10 @@ About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + 
    (`marginal_likelihood.estimate_between_trial_sd`; Patterson & Thompson, Biometrika 58, 545, 1971). A standard
    deviation that applies to too few trials keeps its stated value.
 3. ρ and v_i by the restricted likelihood of the residuals after u_i has been fitted, each v_i shrunk towards their
-common
-   value by as much as their differences are due to chance (`marginal_likelihood.estimate_noise`).
-4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ, σ_P and σ_B at its maximum: the
-   restricted likelihood cannot compare models with different θ (`assemble.log_likelihood`).
+   common value by as much as their differences are due to chance (`marginal_likelihood.estimate_noise`).
+4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ, σ_P and σ_B at its maximum, ρ
+   and v_i as estimated in step 3: the restricted likelihood cannot compare models with different θ
+   (`assemble.log_likelihood`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from vinetrack.inference.whitening import at_correlation
 
 LEAST_BETWEEN_TRIAL_SD = 1e-5
 """Least between-trial standard deviation. Chosen far below the repeatability of any experiment, so that its logarithm
-stays finite."""
+and its inverse stay finite."""
 
 DEVIATION_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
@@ -64,7 +64,7 @@ class FitState:
     `theta`, shape (n_free,), are the free parameters, scaled; `trial_effects`, shape (n_trials, 4), are release, origin
     and deviations, see `vinetrack.inference.sensitivity`; `spread` are the between-trial standard deviations of
     pressure (relative) and of ln B; `rho` is the lag-one correlation of the noise and `variance`, shape (n_trials,),
-    that of its innovations, m².
+    the variance of its innovations, m².
     """
 
     theta: Floats
@@ -83,8 +83,8 @@ class MixedProblem:
     ln B. `gauge_error`, shape (n_trials,), is the relative error of a measured pressure, 0 for a set pressure.
     `release_origin_mean` and `release_origin_precision`, shape (n_trials, 2), are the prior of release and origin, so
     wide that it matters only where a track leaves them undetermined. `free` marks the parameters that are estimated;
-    `points` and `stretches` count those of each trial. `random` marks parameters that are random effects of a group of
-    trials; their prior is the distribution of the groups.
+    `points` and `stretches` count the points of each trial and its stretches between gaps. `random` marks parameters
+    that are random effects of a group of trials; their prior is the distribution of the groups.
     """
 
     index: NDArray[np.int_]
@@ -229,14 +229,14 @@ def levenberg_marquardt_step(
     problem : the constant part of the fit.
     state : where the fit stands.
     damping : float
-        Factor by which the diagonal is raised (Levenberg–Marquardt); 0 for a Gauss–Newton step.
+        The diagonal is multiplied by 1 plus this (Levenberg–Marquardt); 0 for a Gauss–Newton step.
 
     Returns
     -------
     step : array, shape (n_free,)
     trial_effect_step : array, shape (n_trials, 4)
     predicted_decrease : float
-        Decrease of the penalised sum of squares by the linear model.
+        Of the penalised sum of squares by the linear model; usually too small if damped or stopped by a bound.
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     centre, precision = trial_effect_prior(problem, state)
@@ -292,7 +292,7 @@ def trial_effect_step(
 def bounded_solve(
     square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Minimise a quadratic form within bounds by an active-set method, and return the step to the minimum.
+    """Step towards the minimum of a quadratic form within bounds; a parameter that meets its bound stays there.
 
     Parameters
     ----------

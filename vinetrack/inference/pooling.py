@@ -1,8 +1,9 @@
-"""Pooling of few trials that disagree: a between-trial variance of the shared parameters that determines their weights.
+"""Pooling of few trials that disagree: a between-trial variance of the shared parameters sets the weights of trials.
 
-A fit gives every trial a noise of its own, and some a deviation of B and pressure. Where trials differ in a parameter
-that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the smaller noise
-determines it, and the misfit of the others passes for their noise, which reduces their weights further. So:
+A fit gives every trial a noise of its own, and some trials a deviation of B and pressure. Where trials differ in a
+parameter that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the
+smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights further.
+So:
 
 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too.
 2. The parameters θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M). Assumed: the between-trial covariance is
@@ -13,8 +14,9 @@ determines it, and the misfit of the others passes for their noise, which reduce
    large for the others. With A_i the information and g_i the score of a trial at the current parameters, its estimate
    has the covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood of several parameters at once (multivariate
    random-effects meta-analysis by REML: van Houwelingen, Arends & Stijnen, Statistics in Medicine 21, 589, 2002, and
-   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one parameter: DerSimonian & Laird,
-   Controlled Clinical Trials 7, 177, 1986, and Viechtbauer, J. Educ. Behav. Stat. 30, 261, 2005).
+   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one parameter: Viechtbauer, J.
+   Educ. Behav. Stat. 30, 261, 2005, who compares REML with the moments of DerSimonian & Laird, Controlled Clinical
+   Trials 7, 177, 1986).
 3. A step in θ with these weights, new trajectories, and so on to convergence.
 
 With τ² = 0 the weights are those of the noise; with a large τ² all trials have nearly equal weights.
@@ -49,12 +51,12 @@ MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05
 twentieth of an error; the two drops of the tests take four steps."""
 
 LARGEST_TAU2 = 1e6
-"""Largest τ², in variances of one trial by its noise. Chosen: trials a thousand of their errors apart have equal
-weights."""
+"""Largest τ², in variances of one trial by its noise. Chosen: trials that lie a thousand standard errors apart have
+practically equal weights."""
 
 LONGEST_STEP = 3.0
-"""Longest step of a parameter, in standard deviations of the scatter of trials. Chosen: the linear model is inaccurate
-beyond it; half takes a few more steps."""
+"""Longest step of a parameter, in units of √(its variance + the variance between trials). Chosen: the linear model is
+inaccurate beyond it; half takes a few more steps."""
 
 LEAST_RELATIVE_INFORMATION = 1e-12
 """Least information of a trial on a direction that counts, relative to its largest. Derived: ten thousand roundings of
@@ -67,7 +69,8 @@ class Pooled:
 
     `solution` is the state at these parameters, with the smooth errors of position as further ones. `information`,
     shape (n_trials, n_free, n_free), and `scores`, shape (n_trials, n_free), are those of the trials with τ² included;
-    `between`, shape (n_free, n_free), is τ² M, the covariance of a trial's parameters about the shared ones.
+    `covariance`, shape (n_free, n_free), is that of the shared parameters; `between`, of the same shape, is τ² M, the
+    covariance of a trial's parameters about the shared ones.
     """
 
     solution: Solution
@@ -165,7 +168,7 @@ def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitS
 
 
 def _with_weights(solution: Solution, shared: int) -> Pooled:
-    """The pooled fit at a state, with τ² at its most likely value."""
+    """The pooled fit at a state, with τ² at the maximum of its restricted likelihood."""
     problem, state = solution.problem, solution.state
     size = problem.prior_mean.size
     information, scores = trial_information(solution)

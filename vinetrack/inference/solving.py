@@ -1,4 +1,4 @@
-"""Solve a fit from several starting values, and repeat it with fixed noise where the solution is poor.
+"""Solve for the parameters from several starting values; where the solution is poor, again with fixed noise.
 
 A fit estimates the noise together with its parameters. From poor starting values it may absorb the whole misfit as slow
 noise: the likelihood is then high and the parameters are wrong. `is_poor_fit` recognises such a solution by its
@@ -34,8 +34,8 @@ time: most converge in half of them; at half some do not converge and say so, at
 time."""
 
 BAD_START_CHI2 = 1.5
-"""χ² per point, at the noise of the previous fit, above which starting values are bad. Chosen: below it the likelihood
-is nearly quadratic and one descent suffices; it affects time, not results."""
+"""χ² per point, at the noise of the previous fit, above which starting values are bad. Chosen: below it ln L is nearly
+quadratic in the parameters and one descent suffices; it is meant to affect time, not results."""
 
 SLOW_NOISE = 0.99
 """Noise correlation above which a fit has absorbed misfit as noise. Chosen: a correlation time of a hundred frames."""
@@ -47,13 +47,13 @@ for time; a fit given up here is started from other values."""
 TRACK_CORRELATION_SD, TRACK_NOISE_SD = (5e-4, 1e-3), (0.01, 0.03)
 """Between-trial standard deviations of pressure and ln B that are fixed while the noise is: nearly zero where only the
 correlation is fixed, those of a typical batch of vines (1 % of pressure, 3 % of B) where the noise is. Chosen: they
-only steer the descent and are estimated afterwards."""
+only steer the descent and are estimated afterwards, unless the fit ends there."""
 
 
 def solve_from_scratch(
     predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
 ) -> Solution:
-    """Solve from the likeliest starting values and return the best solution.
+    """Solve from the starting values of least misfit and return the best solution.
 
     Later starting values are tried only until a fit converges; a poor best solution is repeated at the noise
     correlation of the tracks.
@@ -110,8 +110,8 @@ def _with_noise_refitted(
     """The solution, or a better one found at the noise of the tracks if its noise is slow.
 
     As long as parameters are slightly wrong, all trials share a smooth misfit of a fraction of a per cent. Taken for
-    slow noise, it stops the parameters from moving on. The likelihood decides: it is far higher where nothing is
-    misfit.
+    slow noise, it stops the parameters from moving on. The likelihood decides: it is far higher where no misfit is
+    left.
     """
     if best.state.rho < SLOW_NOISE:
         return best
@@ -122,8 +122,9 @@ def _with_noise_refitted(
 def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation: list[Solution]) -> Solution:
     """The best solution at track correlation, preferably one that is not poor; without any, the one at free noise.
 
-    A poor solution at free noise may have absorbed its misfit as slow noise, and noise of correlation near 1 makes
-    anything likely. So it never competes by likelihood with those whose noise is as correlated as that of the tracks.
+    A poor solution at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any
+    misfit has a high likelihood. So it never competes by likelihood with those whose noise is as correlated as that of
+    the tracks.
     """
     good = [solution for solution in at_track_correlation if not is_poor_fit(predictor, solution)]
     return min(good or at_track_correlation or [free], key=_deviance)
