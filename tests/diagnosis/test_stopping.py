@@ -24,6 +24,7 @@ from vinetrack.diagnosis.result import (
     Candidate,
     Diagnosis,
     Round,
+    limit_reason,
 )
 from vinetrack.diagnosis.stopping import GO_ON, STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.pipeline import sequence_stage
@@ -81,11 +82,22 @@ def test_a_smaller_risk_requires_a_larger_ratio() -> None:
     assert look_at(diagnosis(rival=1e-3), 12, 0.001).decision == GO_ON
 
 
-def test_a_richer_form_of_the_same_effect_is_no_rival() -> None:
+@pytest.mark.parametrize(
+    ("reason", "decision"),
+    [
+        (limit_reason("leak"), STOP),
+        # As earlier versions stored it, and as the answer set states it.
+        ("it contains leak as a limit", STOP),
+        ("it contains leak as a limit and fits no better", STOP),
+        (limit_reason("air_drag"), GO_ON),
+        ("", GO_ON),
+    ],
+)
+def test_a_richer_form_of_the_same_effect_is_no_rival(reason: str, decision: str) -> None:
     given = diagnosis()
-    richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason="it contains leak as a limit")
+    richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason=reason)
     first = replace(given.rounds[0], ranking=(*given.rounds[0].ranking, richer))
-    assert look_at(replace(given, rounds=(first, given.rounds[1])), 12, 0.03).decision == STOP
+    assert look_at(replace(given, rounds=(first, given.rounds[1])), 12, 0.03).decision == decision
 
 
 def test_monitoring_after_every_observation_keeps_the_stated_risk() -> None:

@@ -12,6 +12,7 @@ import pytest
 from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 from vinetrack.diagnosis.result import Round
+from vinetrack.figures import registry
 from vinetrack.figures.registry import draw
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_tables import (
@@ -119,6 +120,16 @@ def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, v
     tables = figure_tables(found)
     assert {"ladder", "before_after", "where", "candidates", "cosines"} <= set(tables)
     assert "drift" not in tables
+
+
+def test_a_registered_figure_of_the_diagnosis_without_a_table_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
+    added = {**registry.DIAGNOSIS_FIGURES, "pie": registry.RegisteredFigure("pie", "where", "Pie", "Pie")}
+    monkeypatch.setattr(registry, "DIAGNOSIS_FIGURES", added)
+    with pytest.raises(RuntimeError, match="pie: not both in"):
+        figure_tables(found)
 
 
 @pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])

@@ -37,6 +37,7 @@ from vinetrack.diagnosis.result import (
     Candidate,
     Diagnosis,
     Round,
+    limit_reason,
 )
 from vinetrack.diagnosis.selection import SelectionStep, select_effects
 from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK
@@ -322,7 +323,7 @@ def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:
 def _contains_answer(effect: Effect, step: SelectionStep) -> str:
     """Say that an effect contains one of the answer set: it can fit no worse, and need not be fitted."""
     contained = [name for name in effect.replaces if name in step.answer_names]
-    return f"it contains {contained[0]} as a limit" if contained else ""
+    return limit_reason(contained[0]) if contained else ""
 
 
 def _subset_fit_behind(step: SelectionStep, name: str) -> str:

@@ -15,7 +15,7 @@ from scipy.special import gammaincc, ndtri_exp
 from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.film_allowance import film_gain
 from vinetrack.diagnosis.plausibility_prior import log_evidence, posterior_weights, prior_penalty
-from vinetrack.diagnosis.result import BETWEEN_TRIALS
+from vinetrack.diagnosis.result import BETWEEN_TRIALS, limit_reason
 from vinetrack.effects import Effect
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit, Number
@@ -339,7 +339,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             )
         ]
         if simpler:
-            rejected[ratio.label] = f"it contains {simpler[0].names[-1]} as a limit and fits no better"
+            rejected[ratio.label] = f"{limit_reason(simpler[0].names[-1])} and fits no better"
         else:
             members.append(ratio)
     credible = [hypothesis for hypothesis in members if hypothesis.credible]

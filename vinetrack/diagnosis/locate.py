@@ -22,8 +22,8 @@ from vinetrack.diagnosis.drift import Drift, drift
 from vinetrack.diagnosis.ladder import excess
 from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, replicate_z, stretch_covariance
 from vinetrack.diagnosis.replicates import replicates_of
+from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.diagnosis.stretches import (
-    MAX_STRETCHES,
     ResidualCourse,
     common_edges,
     common_stretches,

@@ -37,6 +37,11 @@ REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"
 DROPPED_FRAMES = "dropped_frames"
 """Member of an answer set where a recording has dropped frames: a fault of the measurement without a formula."""
 
+MAX_STRETCHES = 8
+"""Most stretches of the growth over which a diagnosis and its figures average residuals. Chosen: a trial has two or
+three independent errors, and a page shows eight side by side. At half, a misfit confined to the start is averaged out;
+at twice, neighbours share their errors and each mean has few frames."""
+
 BETWEEN_TRIALS = "between_trials"
 """Kind of a hypothesis that trials differ: neither missing physics nor a fault of camera or gauge."""
 
@@ -49,6 +54,22 @@ BETWEEN_SUMMARIES = {
     DAY: "B or the zero of the gauge differs from day to day",
 }
 """Hypotheses that trials differ, by their names in an answer set."""
+
+
+def limit_reason(name: str) -> str:
+    """Return the beginning of `Candidate.reason` of a richer form: a candidate that equals another in a limit.
+
+    `Candidate.is_richer_form_of` recognises it in a stored diagnosis.
+
+    Parameters
+    ----------
+    name : of the effect that it contains.
+
+    Returns
+    -------
+    str
+    """
+    return f"it contains {name} as a limit"
 
 
 @dataclass(frozen=True)
@@ -79,6 +100,19 @@ class Candidate:
     posterior_weight: float = math.nan
     confounded_by: tuple[Confounder, ...] = ()
     log_bayes: float = math.nan
+
+    def is_richer_form_of(self, name: str) -> bool:
+        """Whether it was set aside because it contains another effect as a limit.
+
+        Parameters
+        ----------
+        name : of the other effect.
+
+        Returns
+        -------
+        bool
+        """
+        return self.reason.startswith(limit_reason(name))
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""

@@ -180,8 +180,7 @@ def _rivals(step: Round, best: Candidate) -> list[tuple[float, str]]:
     """
     ratios = []
     for rival in step.ranking:
-        contains_best = rival.reason.startswith(f"it contains {best.effect} as a limit")
-        if rival.effect == best.effect or rival.status == NOT_TESTABLE or contains_best:
+        if rival.effect == best.effect or rival.status == NOT_TESTABLE or rival.is_richer_form_of(best.effect):
             continue
         if rival.status == REFITTED and rival.posterior_weight > 0:
             ratios.append((math.log(best.posterior_weight / rival.posterior_weight), rival.effect))

@@ -22,12 +22,9 @@ from vinetrack.diagnosis.replicate_scatter import (
     stretch_covariance,
 )
 from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
-
-MAX_STRETCHES = 8
-"""Most stretches of the growth over which residuals are averaged. Chosen: a trial has two or three independent errors;
-more stretches share their errors."""
 
 MIN_FRAMES_PER_STRETCH = 2
 """Least frames of a stretch: a shorter recording is cut into fewer. Derived: one frame has no neighbour to average

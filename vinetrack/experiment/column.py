@@ -24,7 +24,10 @@ class Column:
     excludes `low` itself). `slips` are units that users write by mistake. An allowed value outside `usual` gets the
     warning `unusual_hint`. `unit_key` is given where the name does not end in the unit. `shared` columns may be set in
     `experiment.yaml` for all trials. `limit` is the form in which `limits` of `experiment.yaml` constrains the column
-    in further trials: `range` or `choice`, blank where it cannot.
+    in further trials: `range` or `choice`, blank where it cannot. `condition_part` is given for a column that defines a
+    condition: the form in which the condition's name contains the value where it differs within the experiment, such as
+    `inlet{}mm`. Trials that differ only in columns without it are replicates (sizes, pressure, yield pressure and
+    payload apart, which `vinetrack.experiment.naming` always compares).
     """
 
     name: str
@@ -42,6 +45,7 @@ class Column:
     unusual_hint: str = ""
     shared: bool = True
     limit: str = ""
+    condition_part: str = ""
 
     @property
     def scale(self) -> Unit | None:

@@ -7,10 +7,12 @@ condition.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from vinetrack.core.records import Trial
+from vinetrack.experiment.column import Column
+from vinetrack.experiment.schema import COLUMNS
 
 
 def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
@@ -28,7 +30,7 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     -------
     the trials, in the same order.
     """
-    shown = [further for further in _OPTIONAL_PARTS if len({further(trial) for trial in trials}) > 1]
+    shown = [column for column in _OPTIONAL_PARTS if len({_part(column, trial) for trial in trials}) > 1]
     yields: dict[str, set[str]] = {}
     for trial in trials:
         yields.setdefault(_vine(trial), set()).add(_yield_pressure(trial))
@@ -38,7 +40,7 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
         parts = [vine, f"{_digits(trial.pressure_Pa / 1000)}kPa", f"{_digits(trial.payload_kg * 1000)}g"]
         if len(yields[vine]) > 1:
             parts.append(_yield_pressure(trial))
-        parts += filter(None, (further(trial) for further in shown))
+        parts += filter(None, (_part(column, trial) for column in shown))
         named.append(replace(trial, vine=vine, condition="_".join(parts)))
     return tuple(named)
 
@@ -63,17 +65,17 @@ def _yield_pressure(trial: Trial) -> str:
     return f"yield{_digits(trial.yield_pressure_Pa / 1000)}kPa"
 
 
-def _bends(trial: Trial) -> str:
-    bends = ("x".join(_digits(1000 * m) for m in (bend.start_m, bend.arc_m, bend.radius_m)) for bend in trial.bends)
-    return f"bends{'-'.join(bends)}" if trial.bends else ""
+def _part(column: Column, trial: Trial) -> str:
+    """Return the part of a condition's name that shows a column; blank where the trial has no value."""
+    if column.kind == "bends":
+        value = "-".join("x".join(_digits(1000 * m) for m in (b.start_m, b.arc_m, b.radius_m)) for b in trial.bends)
+    else:
+        number = column.of_trial(trial)
+        value = _digits(number) if math.isfinite(number) else ""
+    return column.condition_part.format(value) if value else ""
 
 
-_OPTIONAL_PARTS: tuple[Callable[[Trial], str], ...] = (
-    lambda trial: f"{_digits(math.degrees(trial.growth_angle_rad))}deg",
-    lambda trial: f"chamber{_digits(trial.chamber_m3 * 1000)}l" if math.isfinite(trial.chamber_m3) else "",
-    lambda trial: f"inlet{_digits(trial.inlet_m * 1000)}mm" if math.isfinite(trial.inlet_m) else "",
-    lambda trial: f"film{_digits(trial.film_density_kg_m3)}",
-    lambda trial: f"ratio{_digits(trial.travel_ratio)}",
-    _bends,
+_OPTIONAL_PARTS = sorted(
+    (column for column in COLUMNS.values() if column.condition_part), key=lambda column: column.kind == "bends"
 )
-"""Parts of a condition's name that appear only if they differ within the experiment."""
+"""Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last."""

@@ -1,7 +1,7 @@
 """Every figure of a results folder, declared once: file name, label, title, section of the report, data and drawing.
 
 The workflow uses the file names, its report label, category and caption, the figures stage the drawing function, and
-the page title, caption and data. A new figure is an entry of `FIGURES`, an entry of `_drawing` and a caption
+the page title, caption and data. A new figure is an entry of `_ALL`, an entry of `_drawing` and a caption
 `<name>.rst` in `CAPTIONS` (files, because Snakemake's report reads captions from files). Does not import matplotlib.
 """
 

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
-N_SECTIONS = 8
-"""Sections of the growth in which misfits are averaged if the diagnosis contains no such averages. Chosen: as many as a
-page shows side by side. At half a misfit confined to the start is averaged out; at twice each mean has few frames."""
-
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
@@ -185,8 +181,15 @@ def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
     Returns
     -------
     dict of DataFrame
+
+    Raises
+    ------
+    RuntimeError
+        If this function and the registry do not name the same figures: one would be left out without a word.
     """
     import pandas as pd
+
+    from vinetrack.figures.registry import DIAGNOSIS_FIGURES
 
     if diagnosed is None:
         return {}
@@ -201,6 +204,8 @@ def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
         "cosines": diagnosed.cells,
         "drift": diagnosed.drift,
     }
+    if unmatched := sorted(set(tables) ^ set(DIAGNOSIS_FIGURES)):
+        raise RuntimeError(f"{', '.join(unmatched)}: not both in figures.registry and in figure_tables")
     return {name: table for name, table in tables.items() if len(table)}
 
 
@@ -326,10 +331,12 @@ def _located_sections(of_condition: pd.DataFrame, located: pd.DataFrame, members
 
 def _measured_sections(members: pd.DataFrame) -> list[dict[str, Any]]:
     """Return equal sections of the measured growth; the scatter is the standard error of the mean over trials."""
+    from vinetrack.diagnosis.result import MAX_STRETCHES
+
     whole_m = float(members["lead_position_m"].max())
     if not whole_m > 0:
         return []
-    edges = np.linspace(0.0, whole_m, N_SECTIONS + 1)
+    edges = np.linspace(0.0, whole_m, MAX_STRETCHES + 1)
     count = int(members["trial"].nunique())
     rows = []
     for low, high in itertools.pairwise(edges):
