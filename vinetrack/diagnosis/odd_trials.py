@@ -46,7 +46,7 @@ very careful trials change."""
 
 CHANCE = 1e-4
 """Probability that normal scatter makes any trial of a campaign an outlier. Chosen: small, since outliers matter where
-the verdict is `unexplained`; at ten times the limit falls from 10 to 8 standard deviations for 24 trials."""
+the verdict is `unexplained`; at ten times the limit falls from 9.9 to 7.5 standard deviations for 24 trials."""
 
 EFFICIENCY = 0.37
 """Efficiency of a standard deviation from the median absolute deviation, relative to that from the mean square. Derived
