@@ -25,9 +25,9 @@ def jittered(sd_px, seed=311):
         np.rint(values * 200).astype(np.uint16), np.full(N, 1 / 200), np.zeros(N), np.zeros((N, 2)), 1.0,
         Axis((0.0, 0.0), (COLUMNS - 1.0, 0.0), float(ROWS)), False,
     )  # fmt: skip
-    pictures = np.ones((4, ROWS, COLUMNS), np.float32)
-    pictures[0], pictures[1] = 160, 60
-    return strip, EdgeState(edge, np.zeros(N), np.zeros(ROWS), BLUR, pictures, np.ones(3)), own
+    appearance = np.ones((4, ROWS, COLUMNS), np.float32)
+    appearance[0], appearance[1] = 160, 60
+    return strip, EdgeState(edge, np.zeros(N), np.zeros(ROWS), BLUR, appearance, np.ones(3)), own
 
 
 def test_each_band_finds_its_own_edge():
@@ -50,7 +50,7 @@ def test_disagreement_is_the_error_of_the_mean(sd_px):
 def test_a_band_that_always_lags_adds_no_error():
     strip, state, _ = jittered(0.0)
     lagging = np.repeat([0.0, 0.0, 1.5, 0.0], ROWS // BANDS)
-    tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.pictures, state.inflation)
+    tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.appearance, state.inflation)
     error_px, slow_px = band_disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool))
     assert error_px.max() < 0.1
     assert slow_px < 0.05

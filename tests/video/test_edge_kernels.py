@@ -18,7 +18,7 @@ from vinetrack.video.resample import sample
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
 def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(length: float, blur: float) -> None:
     half = 6.0 + 0.5 * length + 4 * blur
-    table = edge_cover.cover_table(length, blur, half)
+    table = edge_cover.coverage_table(length, blur, half)
     middle = math.ceil(half) + 1
     x = middle - np.arange(table.shape[2]) + edge_cover.STEP * np.arange(edge_cover.PHASES + 1)[:, None]
     # A box of many Gaussian steps, summed one by one.
@@ -59,7 +59,7 @@ def test_evidence_of_film_is_the_difference_of_clipped_distances() -> None:
     strip, _, pictures = stepping()
     scale, offset = np.linspace(0.9, 1.1, 16), np.linspace(-2, 2, 16)
     level = strip * scale[:, None, None] + offset[:, None, None]
-    a = np.minimum((level - pictures[0]) ** 2 / (pictures[2] + 25.0), kernels.FOREIGN * 6.25)
+    a = np.minimum((level - pictures[0]) ** 2 / (pictures[2] + 25.0), kernels.FILM_CLIP_RATIO * 6.25)
     b = np.minimum((level - pictures[1]) ** 2 / (pictures[3] + 25.0), 6.25)
     found = kernels.film_evidence(strip, scale, offset, pictures, 5.0, 2.5)
     assert np.allclose(found, (a - b - kernels.FILM_BIAS).sum(axis=1), atol=1e-3)
@@ -143,7 +143,7 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     found = kernels.residual_sums(
         strip, np.ones(16), np.zeros(16), fit, np.zeros(16), LAG, blur, pictures, margin, use, 0.5 * RIM
     )
-    half = edge_cover.cover_reach(0.0, blur) + margin
+    half = edge_cover.coverage_reach(0.0, blur) + margin
     by_distance, by_row, by_place, logs = np.zeros_like(found[0]), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
         sums: dict[int, np.ndarray] = {}

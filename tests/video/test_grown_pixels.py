@@ -15,8 +15,8 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.curve_search import find_growth_axis
-from vinetrack.video.first_path import grown_path
-from vinetrack.video.kymograph import changing_path
+from vinetrack.video.first_path import initial_front_path
+from vinetrack.video.kymograph import path_by_change
 from vinetrack.video.measure import measure_recording
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Strip, cut_strip
@@ -159,9 +159,9 @@ def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path() -> Non
     strip = Strip(
         np.clip(values, 0, 255).astype(np.uint8), np.ones(80), np.zeros(80), np.zeros((80, 2)), 2.0, axis, False
     )
-    by_change, _ = changing_path(strip)
+    by_change, _ = path_by_change(strip)
     assert np.abs(by_change - tip)[20:40].max() > 20
-    path, passed = grown_path(strip)
+    path, passed = initial_front_path(strip)
     assert np.abs(path - tip)[18:60].max() <= 6
     assert abs(passed[0] - 40) <= 8
     assert abs(passed[1] - 290) <= 3

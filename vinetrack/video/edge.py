@@ -1,9 +1,10 @@
-"""The leading edge in a strip: where it was at mid-exposure in every frame, and how well that is known.
+"""Tracking of the leading edge through a strip: its position at mid-exposure in every frame, and the standard error.
 
-Alternating least squares. Given the edge, every pixel's brightness before and after its passing follows from a
-2 by 2 system (no frame need be free of motion); given those, the edge of every frame follows by maximum likelihood
-from a step blurred by optics and by its own motion. Tip shape, optical blur, exposure and what of light and shade the
-tip carries along are estimated on the way.
+The tracker alternates between two estimates. Given the edge, the brightness of film and background at every pixel
+follows from weighted least squares (a 2 by 2 system per pixel, so that no frame need be free of motion). Given film and
+background, the edge in every frame follows by maximum likelihood: a step between the two, blurred by the optics (a
+Gaussian) and by its own motion during the exposure (a box), is fitted by Gauss-Newton. The shape of the tip, the
+optical blur, the exposure and the light and shade that the tip carries with it are estimated along the way.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import ASTRAY_PX, band_disagreement, dwell_error_px, repair_jumps
 from vinetrack.video.edge_state import (
+    EARLY_FIT_ROUNDS,
     FIT_ROUNDS,
-    ROUGH_ROUNDS,
     EdgeState,
     blur_lengths,
     core_frames,
-    first_state,
+    estimate_appearance,
     fit_edges,
-    frames_that_tell,
-    held_at_rest,
+    hold_at_rest,
+    informative_frames,
+    initial_state,
     moving_frames,
-    repicture,
     residuals,
 )
-from vinetrack.video.first_path import grown_by_change, grown_path, sides_of_path
+from vinetrack.video.first_path import appearance_about_path, front_path_by_change, initial_front_path
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
@@ -45,64 +46,69 @@ from vinetrack.video.tip_shape import (
     seen_exposure,
 )
 
-START_PX = 0.08
-"""Error near the start, where background is seen briefly or never. Chosen: twice FLOOR_PX of `point_quality`. At half
-or twice the stated errors of the first 25 px halve or double."""
-START_REACH_PX = 25.0
+START_ERROR_PX = 0.08
+"""Extra error near the start, where the background is visible only briefly or never. Chosen: twice FLOOR_PX of
+`point_quality`. At half or twice, the stated errors over the first 25 px halve or double."""
+START_ERROR_REACH_PX = 25.0
 """Growth over which that error falls to 1/e. Chosen: about the length of the tip, which hides the background there. At
-half or twice the reach changes so."""
-DOOR_PX = 0.5
-"""What is added to that where a door crosses everything before the start and the picture departs from the model.
-Chosen: half a pixel. At half or twice stated errors behind doors halve or double."""
-SETTLED_PX = 0.2
-"""Largest change of any moving edge from one round to the next at which they are done. Chosen below the error of
-blurred frames at the fastest; at half more rounds are made, at twice fewer."""
+half or twice, the affected stretch is half or twice as long."""
+DOOR_ERROR_PX = 0.5
+"""Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the
+model. Chosen: half a pixel. At half or twice, stated errors behind doors halve or double."""
+CONVERGED_PX = 0.2
+"""The iteration has converged once no edge of a moving frame changes by more than this. Chosen below the error of the
+fastest, blurred frames; at half more iterations are made, at twice fewer."""
 SAME_PATH_PX = 1.0
-"""Largest difference of two paths that are one. Derived: a path is of whole pixels."""
-MANY_ROWS = 48
-"""Rows from which every second one is enough for all rounds but the last. Chosen: 24 rows show the shape of a tip; only
-time depends on it, since the last rounds take all. At half thin vines would be followed by 12 rows at first."""
-UNFIT = 3.0
-"""Factor of the bands' disagreement where no blur within reason fits: all rows err together then. Chosen: pictures out
-of focus then state errors of a pixel. At half or twice they state half or twice as much."""
-LARGEST_RATIO = 100.0
-"""Misfit over the usual one at most. Chosen: errors end at ASTRAY_PX long before."""
-NEAR_START = 0.1
-"""Part of the error of the start to which frames count as near it. Derived: e^−2.3, within 2.3 START_REACH_PX."""
-FULL_TROUBLE = 0.7
-"""Excess of the mean misfit ratio near the start from which a door counts in full. Chosen below 1, where the misfit is
-twice the usual one. By reasoning: at half faint doors count in full, at twice common ones by half."""
-SIDES_PX = 1.0
-"""Error of a width between two sides that are each known to a blur of about 0.7 px. Derived: √2 · 0.7 px."""
-FAINT, FAINT_PART = 25.0, 0.15
-"""Grey levels of contrast below which the sides of a tube fade away, and the error of its width then, a part of it.
-Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is seen at 16 levels, 0.96 and more at 70."""
-LEAST_NOVELTY = 0.05
-"""Weight of a frame that shows nothing new. Chosen: twenty frames of rest weigh as one of motion. At half or twice so
-many more or fewer do."""
+"""Two paths are the same if they nowhere differ by more than this. Derived: paths are in whole pixels."""
+SUBSAMPLED_ROWS = 48
+"""Strips of at least this many rows are fitted with every second row until the final iterations. Chosen: 24 rows
+resolve the shape of a tip; only computing time depends on it, since the final iterations use all rows. At half, thin
+vines would start with 12 rows."""
+OUT_OF_FOCUS_FACTOR = 3.0
+"""Factor on the disagreement of the bands when the fitted blur is at its upper bound: the errors of all rows are then
+correlated. Chosen: out-of-focus recordings then state errors of a pixel. At half or twice they state half or twice as
+much."""
+MAX_MISFIT_RATIO = 100.0
+"""Upper limit of a frame's misfit relative to the median. Chosen: errors reach their limit ASTRAY_PX long before."""
+NEAR_START_WEIGHT = 0.1
+"""Frames in which the error of the start is at least this part of its full value count as near the start. Derived:
+e^−2.3, that is within 2.3 START_ERROR_REACH_PX."""
+FULL_DOOR_EXCESS = 0.7
+"""Excess of the mean misfit ratio near the start at which the error of a door is added in full. Chosen below 1, where
+the misfit is twice the median. By reasoning: at half faint doors count in full, at twice common doors count by half."""
+WIDTH_ERROR_PX = 1.0
+"""Error of a width between two sides that are each located to within a blur of about 0.7 px. Derived: √2 · 0.7 px."""
+LOW_CONTRAST, LOW_CONTRAST_WIDTH_ERROR = 25.0, 0.15
+"""Contrast, in grey levels, below which the sides of a tube fade into the background; and the relative error of its
+width in that case. Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is visible at 16 levels,
+0.96 and more at 70."""
+MIN_FRAME_WEIGHT = 0.05
+"""Weight of a frame identical to the one before it. Chosen: twenty frames at rest weigh as much as one in motion. At
+half or twice, it takes twice or half as many."""
 EVIDENCE_CLIP = 2.5
-"""Widths beyond which a pixel is as unlike film (or background) as can be. Chosen as the usual bend of robust
-estimates, 2 to 3 standard deviations. By reasoning: at half contrast hardly counts, at twice a bright door outvotes
-the film."""
+"""Distance, in standard deviations, at which the difference of a pixel from film or background is clipped. Chosen as
+usual in robust estimation, 2 to 3 standard deviations. By reasoning: at half contrast hardly counts, at twice a bright
+door outvotes the film."""
 
 
 @dataclass(frozen=True)
 class EdgeFit:
-    """Leading edge in strip pixels, all arrays of shape (n_frames,).
+    """Leading edge in strip pixels; arrays have shape (n_frames,).
 
-    `edge_px` at mid-exposure, `sigma_px` its random error by the likelihood, `apart_sigma_px` what is to be added to
-    it in square: by the disagreement of bands, and near the start (see START_PX). `bands_sigma_px` is the part of that
-    which differs from frame to frame, and `slow_px` the error that neighbouring frames share. `misfit` is the mean
-    squared residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it
-    passes; `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `passed` the first and
-    last column passed; `hidden` marks frames in which a door or the mouth of a launcher may hide the tip.
-    `seen_exposure_frames` is what the blur shows where it contradicts a stated exposure, else NaN, and
-    `fast_px_per_frame` the speed at which it does.
+    `edge_px` is the position at mid-exposure and `sigma_px` its standard error from the likelihood. `extra_sigma_px` is
+    added in quadrature: it comes from the disagreement of bands of rows and, near the start, from START_ERROR_PX.
+    `bands_sigma_px` is the part of it that is independent from frame to frame, `slow_px` the error shared by
+    neighbouring frames. `misfit` is the mean squared residual in units of the noise variance (1 for a perfect fit),
+    `amplitude` the contrast of the edge relative to that of the pixels it passes. `contrast`, shape (n_along,), is the
+    mean signed contrast of each column, NaN where unknown; `passed` the first column that the edge passed and the one
+    behind the last; `hidden` marks frames in which a door or the mouth of a launcher may hide the tip.
+    `seen_exposure_frames` is the exposure inferred from the motion blur where that contradicts the stated exposure,
+    otherwise NaN, and `fast_px_per_frame` the speed at which it was inferred.
     """
 
     edge_px: Floats
     sigma_px: Floats
-    apart_sigma_px: Floats
+    extra_sigma_px: Floats
     misfit: Floats
     amplitude: Floats
     contrast: Floats
@@ -121,85 +127,89 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
 
     Parameters
     ----------
-    strip : along the axis, growth towards higher columns.
-    exposure_frames : exposure over frame period; NaN to estimate it from the blur.
-    rounds : at least so many, at most three times as many until the edges settle.
-    sides : `outline` of this very strip where it is known, which spares a first path.
+    strip : pixels along the axis; growth is towards higher columns.
+    exposure_frames : exposure time over frame period; NaN to estimate it from the motion blur.
+    rounds : minimum number of iterations; at most three times as many are made until the edges converge.
+    sides : `outline` of this same strip, if already computed; its path is then the initial path.
 
     Returns
     -------
-    edge, errors and flags of every frame, px.
+    edge, standard errors and flags of every frame, px.
 
     Raises
     ------
     ValueError
-        Where nothing in the strip changes as a passing front does.
+        If nothing in the strip changes the way a passing front does.
     """
-    path, passed = grown_path(strip) if sides is None else (sides.path_px, sides.passed)
+    path, passed = initial_front_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
-    whole, strip = strip, _every_other_row(strip)
-    state = first_state(strip, path, exposure)
+    full_strip, strip = strip, _every_other_row(strip)
+    state = initial_state(strip, path, exposure)
     change = _frame_changes(strip)
-    for turn in range(3):
-        before, path = path, _second_path(strip, state, passed, change)
-        if turn > 0 and np.abs(before - path).max() <= SAME_PATH_PX:
+    for iteration in range(3):
+        before, path = path, _path_from_appearance(strip, state, passed, change)
+        if iteration > 0 and np.abs(before - path).max() <= SAME_PATH_PX:
             break
-        state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
-    fit = _fit_some(strip, state, frames_that_tell(state.edge))
-    for turn in range(3 * rounds):
+        state = estimate_appearance(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
+    fit = _fit_frames(strip, state, informative_frames(state.edge))
+    for iteration in range(3 * rounds):
         before = fit[:, 0]
-        if turn == rounds - 1:
-            strip, state = whole, _on_all_rows(state, whole)
-        state = _restate(strip, state, fit, exposure)
-        seen = frames_that_tell(state.edge)
-        if turn == 1 and not np.isfinite(exposure_frames):
+        if iteration == rounds - 1:
+            strip, state = full_strip, _expand_to_all_rows(state, full_strip)
+        state = _update_state(strip, state, fit, exposure)
+        informative = informative_frames(state.edge)
+        if iteration == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
-        state = find_shape(strip, state, fit, turn == 0)
-        if turn > 0:
+        state = find_shape(strip, state, fit, iteration == 0)
+        if iteration > 0:
             state = find_shading(strip, state, fit)
-        steps = FIT_ROUNDS if turn >= rounds - 1 else ROUGH_ROUNDS
-        fit = repair_jumps(strip, state, _fit_some(strip, state, seen, steps), seen)
-        if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
+        steps = FIT_ROUNDS if iteration >= rounds - 1 else EARLY_FIT_ROUNDS
+        fit = repair_jumps(strip, state, _fit_frames(strip, state, informative, steps), informative)
+        if (
+            iteration >= rounds - 1
+            and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < CONVERGED_PX
+        ):
             break
-    alone = _fit_some(strip, state, ~seen)
-    fit = repair_jumps(strip, state, np.where(seen[:, None], fit, alone), np.ones(len(fit), dtype=bool))
-    finished = _finish(strip, state, fit, exposure, passed)
+    resting_fit = _fit_frames(strip, state, ~informative)
+    fit = repair_jumps(strip, state, np.where(informative[:, None], fit, resting_fit), np.ones(len(fit), dtype=bool))
+    finished = _with_errors(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
         return finished
-    shown, speed = seen_exposure(strip, state, fit, exposure)
-    return replace(finished, seen_exposure_frames=shown, fast_px_per_frame=speed)
+    blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
+    return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
 
 
 def _every_other_row(strip: Strip) -> Strip:
-    """Every second row of a strip of MANY_ROWS or more, which tell as much of a smooth tip; the strip itself else."""
-    if strip.values.shape[1] < MANY_ROWS:
+    """Return every second row of a strip of at least SUBSAMPLED_ROWS rows; otherwise the strip itself."""
+    if strip.values.shape[1] < SUBSAMPLED_ROWS:
         return strip
     return replace(strip, values=np.ascontiguousarray(strip.values[:, ::2]))
 
 
-def _on_all_rows(state: EdgeState, strip: Strip) -> EdgeState:
-    """The state for all rows of a strip, where it was that of every second one; its pictures are to be made anew."""
+def _expand_to_all_rows(state: EdgeState, strip: Strip) -> EdgeState:
+    """Expand a state fitted to every second row to all rows of a strip; its appearance has yet to be re-estimated."""
     rows = strip.values.shape[1]
     if len(state.lag) == rows:
         return state
     lag = np.interp(np.arange(rows), np.arange(0, rows, 2), state.lag)
-    return replace(state, lag=lag, pictures=np.repeat(state.pictures, 2, axis=1)[:, :rows])
+    return replace(state, lag=lag, appearance=np.repeat(state.appearance, 2, axis=1)[:, :rows])
 
 
-def _fit_some(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
-    """Most likely edge of the chosen frames, shape (n_frames, 6), NaN in the others."""
+def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
+    """Fit the edge of the chosen frames; shape (n_frames, 6), NaN in the other frames."""
     return fit_edges(strip, replace(state, edge=np.where(chosen, state.edge, np.nan)), rounds)
 
 
 @dataclass(frozen=True)
 class Outline:
-    """What the front leaves behind: a centreline and a width, px.
+    """Outline of the tube that the front leaves behind: its centreline and width, px.
 
-    `shift_px` and `slope` (px a px) are of the centreline across the strip; `half_px` is half of what holds all of the
-    width, with room for its blur; `width_px` the width between the sides and `width_sigma_px` its standard error.
-    `path_px`, shape (n_frames,), is a first path of the front and `passed` the first and last column passed.
-    `middles_px`, shape (n_parts,), is where the middle lies across at `places_px` along, of the parts of usual width.
+    `shift_px` and `slope` (px per px) describe the centreline across the strip. `half_px` is half the height that
+    contains the whole width with a margin for its blur; `width_px` is the width between the sides and `width_sigma_px`
+    its standard error. `path_px`, shape (n_frames,), is an initial path of the front; `passed` the first column that it
+    passes and the one behind the last. `middles_px`, shape (n_parts,), is the position of the centre across at
+    `places_px` along, for the stretches of typical width.
     """
 
     shift_px: float
@@ -214,111 +224,114 @@ class Outline:
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
-    """Centreline and width of what the front leaves behind.
+    """Measure the centreline and width of the tube that the front leaves behind.
 
-    From the contrast by row in `parts` stretches along the way: a given axis two degrees off would otherwise cut the
-    tube obliquely.
+    The contrast of each row between film and background gives the sides in `parts` stretches along the axis. This
+    corrects a given axis that is, say, two degrees off and would cut the tube obliquely.
 
     Parameters
     ----------
-    strip : along a roughly known axis.
-    parts : stretches along the way.
+    strip : pixels along a roughly known axis.
+    parts : number of stretches along the axis.
 
     Returns
     -------
-    centreline, width and the standard error of that, px.
+    centreline, width and standard error of the width, px.
 
     Raises
     ------
     ValueError
-        Where nothing in the strip changes as a passing front does.
+        If nothing in the strip changes the way a passing front does.
     """
-    path, passed = grown_path(strip)
-    film, background = sides_of_path(strip, path, passed)
+    path, passed = initial_front_path(strip)
+    film, background = appearance_about_path(strip, path, passed)
     power = (film - background).astype(float) ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
         profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
-        low, high = _bright_run(profile - max(0.4 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
+        low, high = _max_sum_run(profile - max(0.4 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
         sides.append((rows[0] + low, rows[0] + high))
         contrasts.append(float(np.quantile(profile, 0.75)))
         places.append(passed[0] + float(piece.mean()))
     side, place = np.array(sides), np.array(places)
     width = side[:, 1] - side[:, 0]
-    alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
-    alike |= ~alike.any()  # two kinds of width, as many of each: neither is the usual one
-    place, centre = place[alike], side[alike].mean(axis=1)
-    slope, begin = _robust_line(place, centre)
-    middle = float(np.median(width))
-    scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
-    faint = FAINT_PART * middle if float(np.median(contrasts)) < FAINT else 0.0
-    sigma = float(np.linalg.norm([scatter, SIDES_PX, faint]))
-    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed, place, centre)
+    typical = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
+    typical |= ~typical.any()  # two widths, equally frequent: neither is typical, so all are used
+    place, centre = place[typical], side[typical].mean(axis=1)
+    slope, intercept = _robust_line(place, centre)
+    median_width = float(np.median(width))
+    width_error = 1.4826 * float(np.median(np.abs(width - median_width))) / np.sqrt(len(width))
+    faint = LOW_CONTRAST_WIDTH_ERROR * median_width if float(np.median(contrasts)) < LOW_CONTRAST else 0.0
+    sigma = float(np.linalg.norm([width_error, WIDTH_ERROR_PX, faint]))
+    return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, path, passed, place, centre)
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:
-    """Estimate growth and speed from the first path of the front, without a fit.
+    """Estimate growth and speed from the initial path of the front, without fitting.
 
     Parameters
     ----------
-    strip : along the axis, growth towards higher columns.
+    strip : pixels along the axis; growth is towards higher columns.
 
     Returns
     -------
-    columns that the front passes, px, and its mean speed over the middle of them, px a frame.
+    number of columns that the front passes, px, and its mean speed over the middle of them, px per frame.
 
     Raises
     ------
     ValueError
-        Where nothing in the strip changes as a passing front does.
+        If nothing in the strip changes the way a passing front does.
     """
-    path, passed = grown_by_change(strip)
+    path, passed = front_path_by_change(strip)
     growth = float(passed[1] - passed[0])
     early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
     return growth, 0.7 * growth / max(late - early, 1)
 
 
-def _bright_run(excess: Floats) -> tuple[float, float]:
-    """Where the run of greatest sum begins and ends, to a fraction of a row: short gaps and glints do not end it."""
-    best, total, start, limits = -np.inf, 0.0, 0, (0, len(excess) - 1)
+def _max_sum_run(excess: Floats) -> tuple[float, float]:
+    """Return the ends of the run with the greatest sum, interpolated to a fraction of a row (maximum-subarray search).
+
+    Short gaps do not end the run and isolated glints do not extend it.
+    """
+    best, run_sum, start, limits = -np.inf, 0.0, 0, (0, len(excess) - 1)
     for i, value in enumerate(excess):
-        if total <= 0:
-            total, start = 0.0, i
-        total += value
-        if total > best:
-            best, limits = total, (start, i)
-    return _crossing(excess, limits[0], -1), _crossing(excess, limits[1], 1)
+        if run_sum <= 0:
+            run_sum, start = 0.0, i
+        run_sum += value
+        if run_sum > best:
+            best, limits = run_sum, (start, i)
+    return _zero_crossing(excess, limits[0], -1), _zero_crossing(excess, limits[1], 1)
 
 
-def _crossing(excess: Floats, row: int, outwards: int) -> float:
-    """Where the line from `row` to its neighbour outwards meets zero; `row` itself at the border."""
+def _zero_crossing(excess: Floats, row: int, outwards: int) -> float:
+    """Return where the line from `row` to its outer neighbour crosses zero; `row` itself at the border."""
     if not 0 <= row + outwards < len(excess) or excess[row] <= 0:
         return float(row)
     return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
 
 
 def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
-    """Slope and value at zero by the median of pairwise slopes (Theil and Sen)."""
+    """Fit a line by the median of pairwise slopes (Theil-Sen); return slope and intercept."""
     i, j = np.triu_indices(len(x), 1)
     slope = float(np.median((y[j] - y[i]) / (x[j] - x[i]))) if len(i) else 0.0
     return slope, float(np.median(y - slope * x))
 
 
-def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
-    """Front by what every pixel resembles, film or background."""
-    contrast = np.abs(state.pictures[0] - state.pictures[1])[:, passed[0] : passed[1]]
+def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
+    """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
+    contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
     evidence = kernels.film_evidence(
-        strip.values, strip.scale, strip.offset, state.pictures, width, EVIDENCE_CLIP
+        strip.values, strip.scale, strip.offset, state.appearance, width, EVIDENCE_CLIP
     )  # fmt: skip
-    evidence[:, : max(passed[0] - kernels.BEHIND, 0)] = evidence[:, passed[1] + kernels.BEYOND :] = 0.0
-    path = ky.evident_path(evidence * _novelty(change, state.edge)[:, None])
-    return np.clip(path - 0.5, passed[0] - kernels.BEHIND, passed[1] + 2)
+    evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
+    path = ky.dividing_path(evidence * _frame_weights(change, state.edge)[:, None])
+    return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
 
 
 def _frame_changes(strip: Strip) -> Floats:
-    """How much each frame of a strip differs from the one before it, shape (n_frames,)."""
+    """Return the mean absolute difference of each frame from the one before it, shape (n_frames,)."""
     import cv2
 
     change = np.zeros(len(strip.values))
@@ -328,57 +341,61 @@ def _frame_changes(strip: Strip) -> Floats:
     return change
 
 
-def _novelty(change: Floats, edge: Floats) -> NDArray[np.float32]:
-    """How much each frame has to say that the one before it had not, 0.05 to 1, shape (n_frames,).
+def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
+    """Weight each frame by how much it differs from the one before it, MIN_FRAME_WEIGHT to 1, shape (n_frames,).
 
-    While the tip rests behind a closed door that looks like film, a hundred frames are no better than one.
+    While the tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
     """
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
-    return np.clip((change - floor) / max(usual - floor, 1e-6), LEAST_NOVELTY, 1.0).astype(np.float32)
+    return np.clip((change - floor) / max(usual - floor, 1e-6), MIN_FRAME_WEIGHT, 1.0).astype(np.float32)
 
 
-def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
-    """Take over the fitted edges and renew blur lengths, pictures and how far noise adds up about the edge."""
-    edge = held_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), frames_that_tell(state.edge))
+def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
+    """Take over the fitted edges; re-estimate blur lengths, film and background, and the correlation of the noise.
+
+    `inflation` is the variance of a column's mean residual over that of white noise, by distance from the edge.
+    """
+    edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
-    state = repicture(strip, state, 4 * strip.noise + 4)
+    state = estimate_appearance(strip, state, 4 * strip.noise + 4)
     by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
-    seen = by_distance[:, 1] > 4
-    ratio = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
-    smooth = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
+    counted = by_distance[:, 1] > 4
+    ratio = np.where(counted, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
+    smoothed = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    return replace(state, inflation=np.clip(smoothed, 0.3, 50.0))
 
 
-def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
+def _with_errors(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
+    """Add to a converged fit the errors of bands, start, doors and leaps, and refer the edge to mid-exposure."""
     core = core_frames(state, fit)
-    # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
-    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, LARGEST_RATIO)
+    # Where a frame departs from the model (a door, a glint), the error exceeds that from the curvature of ln L.
+    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, MAX_MISFIT_RATIO)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * misfit_ratio, ASTRAY_PX)
-    # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
-    bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
-    edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24
-    contrast = (state.pictures[0] - state.pictures[1]).mean(axis=0).astype(float)
+    # The fitted box assumes constant speed: its centre is the mean position, which leads mid-exposure by aτ²/24.
+    acceleration = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
+    edge = edge - np.clip(acceleration, -50, 50) * exposure**2 / 24
+    contrast = (state.appearance[0] - state.appearance[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
-    close = (near_start > NEAR_START) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
-    trouble = float(np.clip((np.mean(misfit_ratio[close]) - 1) / FULL_TROUBLE, 0, 1)) if close.any() else 0.0
-    door = DOOR_PX * disturbed_start(strip, state) * trouble
-    start_error = (START_PX + door) * near_start
+    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_ERROR_REACH_PX)
+    near = (near_start > NEAR_START_WEIGHT) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
+    door_weight = float(np.clip((np.mean(misfit_ratio[near]) - 1) / FULL_DOOR_EXCESS, 0, 1)) if near.any() else 0.0
+    door = DOOR_ERROR_PX * disturbed_start(strip, state) * door_weight
+    start_error = (START_ERROR_PX + door) * near_start
     bands, shared = band_disagreement(strip, state, edge_now, core)
     bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
-    seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
-    apart = hidden_errors(fit, misfit_ratio, edge_now, seen)
+    visible_error = np.hypot(bands * (OUT_OF_FOCUS_FACTOR if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
+    extra = hidden_errors(fit, misfit_ratio, edge_now, visible_error)
     mouth = find_mouth(strip, state, edge_now)
-    apart = np.where(mouth.before, np.maximum(apart, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), apart)
-    # A door adds more to the error than any start has: the tip is half behind it, or was a moment before.
-    hidden = (door * near_start > START_PX) | mouth.before
-    apart = np.maximum(apart, leap_error_px(edge_now, hidden))
-    bands, lasting = noise_and_slow(bands, seen, apart)
-    slow = np.hypot(lasting, slow_error_px(edge_now, contrast, shared))
+    extra = np.where(mouth.before, np.maximum(extra, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), extra)
+    # A door that adds more than START_ERROR_PX: the tip is half behind it, or was a moment before.
+    hidden = (door * near_start > START_ERROR_PX) | mouth.before
+    extra = np.maximum(extra, leap_error_px(edge_now, hidden))
+    bands, slow_bands = noise_and_slow(bands, visible_error, extra)
+    slow = np.hypot(slow_bands, slow_error_px(edge_now, contrast, shared))
     return EdgeFit(
-        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, passed, hidden,
+        edge, sigma, extra, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, passed, hidden,
         bands, slow,
     )  # fmt: skip

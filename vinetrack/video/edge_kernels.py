@@ -1,8 +1,8 @@
-"""Compiled loops of the edge tracker, over strips of shape (n_frames, n_across, n_along).
+"""Compiled loops of the edge tracker, for strips of shape (n_frames, n_across, n_along).
 
-A strip is kept as the camera wrote it; `scale[t] * value + offset[t]` is its brightness freed of flicker. An edge
-`y` blurred by optics (Gaussian of width `blur`) and by motion (a box of `length`) covers the pixel at `s` by
-p(y − s), see `edge_cover`.
+A strip holds the values as the camera wrote them; `scale[t] * value + offset[t]` is the brightness without flicker. An
+edge at `y`, blurred by the optics (a Gaussian of standard deviation `blur`) and by motion (a box of `length`), covers
+the fraction p(y − s) of the pixel at `s`; see `edge_cover`.
 """
 
 from __future__ import annotations
@@ -12,63 +12,75 @@ import math
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import BORROWED, MATHS, SHORTEST_PX, VECTOR, cover_reach, cover_table, phase
+from vinetrack.video.edge_cover import (
+    FASTMATH,
+    MIN_MOTION_BLUR_PX,
+    NO_REFCOUNT,
+    VECTOR,
+    coverage_reach,
+    coverage_table,
+    subpixel_index,
+)
 
-BEHIND = 25
-"""Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen.
-Chosen: nearly two lengths of MEMORY in `edge_state`. Half or twice changes only film that is never seen."""
-BEYOND = 50
-"""Columns ahead of the last passed one that are looked at. Chosen: no front lies there. Half or twice changes only
-time."""
-FOREIGN = 1.7
-"""How much farther than background film is from what resembles neither. Chosen above 1, so that what resembles neither
-hides background. By reasoning: nearer 1 a payload counts as film, farther a stain on the film does as background."""
+COLUMNS_BEHIND = 25
+"""Columns behind the first passed one that are used: they stand in for film that is never visible itself. Chosen:
+nearly two decay lengths of NEIGHBOUR_DECAY in `edge_state`. Half or twice changes only film that is never visible."""
+COLUMNS_AHEAD = 50
+"""Columns ahead of the last passed one that are used. Chosen: the front never gets there. Half or twice changes only
+computing time."""
+FILM_CLIP_RATIO = 1.7
+"""Ratio of the clipped squared distance from film to that from background. Chosen above 1, so that a pixel that
+resembles neither counts as an object in front of the background. By reasoning: nearer 1 a payload counts as film, with
+a larger ratio a stain on the film counts as background."""
 FILM_BIAS = 0.1
-"""By how much a pixel that could be either is called film: one that never changed was film from the start. Chosen
-small beside the clip of 6: only pixels without contrast are decided by it."""
+"""Evidence in favour of film in every pixel: a pixel that never changed was film from the start. Chosen small beside
+the clip of 6: it decides only pixels without contrast."""
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def film_evidence(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, pictures: np.ndarray, width: float, clip: float
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, appearance: np.ndarray, width: float, clip: float
 ) -> np.ndarray:
-    """How much less like film than like background each column looks in each frame; shape (n_frames, n_along).
+    """Score each column of each frame: negative where it looks like film, positive where like background.
 
-    The sum over rows of min(a², FOREIGN clip²) − min(b², clip²), a and b the distances from film and background in
-    units of `width` and their own variances. A pixel like neither (door, payload) rather hides background: what film
-    looks like is known from the frames after, what may come before the background is not.
+    The score is the sum over rows of min(a², FILM_CLIP_RATIO clip²) − min(b², clip²), with a and b the distances from
+    film and background in standard deviations (`width` and the pixel's own variance). A pixel that resembles neither (a
+    door, a payload) rather counts as hiding the background: how film looks is known from later frames, what may pass in
+    front of the background is not.
 
     Parameters
     ----------
     strip, scale, offset : as in `gather`.
-    pictures : from `solve`, shape (4, n_across, n_along).
-    width : further standard deviation of a pixel, grey levels.
-    clip : widths beyond which a difference counts no more.
+    appearance : film and background from `solve`, shape (4, n_across, n_along).
+    width : additional standard deviation of a pixel, grey levels.
+    clip : standard deviations at which distances are clipped.
 
     Returns
     -------
-    negative where a column looks like film.
+    scores, shape (n_frames, n_along).
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
-    unity, bias, wide = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
-    top, far = np.float32(clip * clip), np.float32(FOREIGN * clip * clip)
-    weight = unity / (pictures[2:] + wide)
+    unit, film_bias, extra_variance = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
+    background_clip, film_clip = np.float32(clip * clip), np.float32(FILM_CLIP_RATIO * clip * clip)
+    weight = unit / (appearance[2:] + extra_variance)
     for t in range(n):
         gain, level = np.float32(scale[t]), np.float32(offset[t])
         line = out[t]
         for u in range(rows):
-            values, after, before = strip[t, u], pictures[0, u], pictures[1, u]
+            values, after, before = strip[t, u], appearance[0, u], appearance[1, u]
             after_weight, before_weight = weight[0, u], weight[1, u]
             for s in range(columns):
                 value = np.float32(values[s]) * gain + level
                 a, b = value - after[s], value - before[s]
                 a, b = a * a * after_weight[s], b * b * before_weight[s]
-                line[s] += (a if a < far else far) - (b if b < top else top) - bias
+                line[s] += (
+                    (a if a < film_clip else film_clip) - (b if b < background_clip else background_clip) - film_bias
+                )
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def fit_edges(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -77,7 +89,7 @@ def fit_edges(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    pictures: np.ndarray,
+    appearance: np.ndarray,
     inflation: np.ndarray,
     prior_sd: float,
     margin: float,
@@ -85,66 +97,75 @@ def fit_edges(
     shading: np.ndarray,
     frames: np.ndarray,
 ) -> np.ndarray:
-    """Most likely edge by Gauss-Newton, of one search after another; shape (n_searches, 6).
+    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6).
 
-    Columns: edge, its Fisher sigma, mean squared weighted residual, amplitude − 1, level, pixels used. Amplitude and
-    level of the contrast are free within `prior_sd`. `inflation[i]` multiplies the variance of pixels i − len/2 px
-    ahead of the edge: how far their noise adds up.
+    Columns of the result: edge, its standard error from the Fisher information, mean squared weighted residual,
+    amplitude − 1, level, number of pixels. Relative amplitude and level of the contrast are nuisance parameters with a
+    Gaussian prior. `inflation[i]` multiplies the variance of pixels i − len/2 px ahead of the edge: it accounts for
+    noise that is correlated between rows.
 
     Parameters
     ----------
     strip, scale, offset, lengths, lag, blur : as in `gather`.
-    start : where each search begins, shape (n_searches,), px.
-    pictures : from `solve`, shape (4, n_across, n_along).
-    inflation : shape (n_bins,), about its middle.
-    prior_sd : standard deviation of relative amplitude and level.
-    margin : pixels beyond the blurred edge that take part.
-    rounds : steps at most.
-    shading : brightness of the tip beyond that of film and background, by distance ahead of the edge, 1 px apart about
-        its middle, shape (n_distances,); VECTOR + 4 px wider than what takes part, grey levels.
+    start : initial edge of each search, shape (n_searches,), px.
+    appearance : film and background from `solve`, shape (4, n_across, n_along).
+    inflation : factor on the variance by distance from the edge, 1 px per bin, edge at the middle bin; shape (n_bins,).
+    prior_sd : prior standard deviation of relative amplitude and level.
+    margin : pixels beyond the blurred edge that are used on either side.
+    rounds : maximum number of Gauss-Newton steps.
+    shading : brightness of the tip in excess of film and background, by distance ahead of the edge, 1 px per bin, edge
+        at the middle bin; shape (n_distances,), VECTOR + 4 px wider than the pixels used; grey levels.
     frames : frame of each search, shape (n_searches,).
 
     Returns
     -------
-    a row a search, NaN where it has no start.
+    one row per search, NaN where `start` is NaN.
     """
     _, rows, columns = strip.shape
     out = np.full((len(frames), 6), np.nan)
-    deepest = lag.max()
-    longest = 0.0
+    max_lag = lag.max()
+    max_length = 0.0
     for t in frames:
-        longest = max(longest, lengths[t])
-    most = rows * (2 * math.ceil(cover_reach(longest, blur) + margin) + 4) + VECTOR
-    covers, slopes, steps = np.empty(most, np.float32), np.empty(most, np.float32), np.empty(most, np.float32)
-    left, variances, falls = np.empty(most, np.float32), np.empty(most, np.float32), np.empty(most, np.float32)
-    half, middle, tabled = 0.0, 0, -1.0
-    table, wider = np.empty((0, 0, 0), np.float32), np.empty(0, np.float32)
-    shade = shading.astype(np.float32)
+        max_length = max(max_length, lengths[t])
+    capacity = rows * (2 * math.ceil(coverage_reach(max_length, blur) + margin) + 4) + VECTOR
+    coverages, slopes, contrasts = (
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.float32),
+    )
+    excesses, variances, shading_slopes = (
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.float32),
+    )
+    half, middle, table_length = 0.0, 0, -1.0
+    table, bin_inflation = np.empty((0, 0, 0), np.float32), np.empty(0, np.float32)
+    shading32 = shading.astype(np.float32)
     for i in range(len(frames)):
         t, y = frames[i], start[i]
         if not math.isfinite(y):
             continue
-        length = max(lengths[t], SHORTEST_PX)
-        if length != tabled:
-            tabled = length
-            half = cover_reach(length, blur) + margin
-            table = cover_table(length, blur, half).astype(np.float32)
+        length = max(lengths[t], MIN_MOTION_BLUR_PX)
+        if length != table_length:
+            table_length = length
+            half = coverage_reach(length, blur) + margin
+            table = coverage_table(length, blur, half).astype(np.float32)
             middle = math.ceil(half) + 1
-            wider = np.empty(table.shape[2] + 1, np.float32)
-            for k in range(len(wider)):
-                wider[k] = inflation[min(max(len(inflation) // 2 - middle + k - 1, 0), len(inflation) - 1)]
+            bin_inflation = np.empty(table.shape[2] + 1, np.float32)
+            for k in range(len(bin_inflation)):
+                bin_inflation[k] = inflation[min(max(len(inflation) // 2 - middle + k - 1, 0), len(inflation) - 1)]
         amplitude, level = 0.0, 0.0
         for _ in range(rounds):
-            first = max(0, math.ceil(y - half - deepest))
+            first = max(0, math.ceil(y - half - max_lag))
             last = min(columns, int(y + half) + 1)
-            # All rows of pixels behind one another first: sums over them are then one long loop.
-            used = _line_up(
-                strip[t], np.float32(scale[t]), np.float32(offset[t]), pictures, y, lag, half, first, last, middle,
-                table, wider, shade, covers, slopes, steps, left, variances, falls,
+            # Pixels of all rows are stored in one array first: sums over them are then one long loop.
+            used = _gather_pixels(
+                strip[t], np.float32(scale[t]), np.float32(offset[t]), appearance, y, lag, half, first, last, middle,
+                table, bin_inflation, shading32, coverages, slopes, contrasts, excesses, variances, shading_slopes,
             )  # fmt: skip
             sums = _normal_sums(
-                covers[:used], slopes[:used], steps[:used], left[:used], variances[:used], falls[:used],
-                np.float32(1 + amplitude), np.float32(level),
+                coverages[:used], slopes[:used], contrasts[:used], excesses[:used], variances[:used],
+                shading_slopes[:used], np.float32(1 + amplitude), np.float32(level),
             )  # fmt: skip
             yy, yg, yl, gg, gl, ll, ry, rg, rl, chi = sums
             yy, gg, ll = yy + 1e-12, gg + prior_sd**-2, ll + prior_sd**-2
@@ -170,23 +191,24 @@ def fit_edges(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
 def _normal_sums(
-    covers: np.ndarray, slopes: np.ndarray, steps: np.ndarray, left: np.ndarray, variances: np.ndarray,
-    falls: np.ndarray, strength: np.float32, level: np.float32,
+    coverages: np.ndarray, slopes: np.ndarray, contrasts: np.ndarray, excesses: np.ndarray, variances: np.ndarray,
+    shading_slopes: np.ndarray, gain: np.float32, level: np.float32,
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
-    """Sums of the normal equations for place, amplitude and level, and the weighted square of the residuals.
+    """Sums of the normal equations for edge, amplitude and level, and the weighted sum of squared residuals.
 
-    In single precision, sixteen pixels at a time: a relative error of 1e-6 is far below that of a place.
+    Weights are those of Student's t with variance + r²/9. In single precision, sixteen pixels at a time: a relative
+    error of 1e-6 is far below that of the edge.
     """
-    nothing, unity, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
-    yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = nothing
-    for k in range(len(covers)):
-        contrast = steps[k]
-        dg = contrast * covers[k]
-        dy = contrast * strength * slopes[k] + falls[k]
-        r = left[k] - strength * dg - contrast * level
-        w = unity / (variances[k] + r * r * ninth)
+    zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
+    yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = zero
+    for k in range(len(coverages)):
+        contrast = contrasts[k]
+        dg = contrast * coverages[k]
+        dy = contrast * gain * slopes[k] + shading_slopes[k]
+        r = excesses[k] - gain * dg - contrast * level
+        w = unit / (variances[k] + r * r * ninth)
         wy, wg, wl = w * dy, w * dg, w * contrast
         yy += wy * dy
         yg += wy * dg
@@ -203,48 +225,61 @@ def _normal_sums(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
-def _line_up(
-    picture: np.ndarray, gain: np.float32, level: np.float32, pictures: np.ndarray, y: float, lag: np.ndarray,
-    half: float, first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray, shading: np.ndarray,
-    covers: np.ndarray, slopes: np.ndarray, steps: np.ndarray, left: np.ndarray, variances: np.ndarray,
-    falls: np.ndarray,
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _gather_pixels(
+    picture: np.ndarray, gain: np.float32, level: np.float32, appearance: np.ndarray, y: float, lag: np.ndarray,
+    half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray, shading: np.ndarray,
+    coverages: np.ndarray, slopes: np.ndarray, contrasts: np.ndarray, excesses: np.ndarray, variances: np.ndarray,
+    shading_slopes: np.ndarray,
 ) -> int:  # fmt: skip
-    """What each pixel about an edge at `y` says, row behind row, into the last six arrays; how many there are."""
-    columns, unity = picture.shape[1], np.float32(1.0)
+    """Write the terms of the fit for each pixel near the edge into the last six arrays; return the number of pixels.
+
+    The terms are the coverage and its slope, the contrast of film and background, the brightness less background and
+    shading, the variance, and the slope of the shading; pixels are stored row after row.
+    """
+    columns, unit = picture.shape[1], np.float32(1.0)
     used = 0
     for u in range(picture.shape[0]):
         at = y - lag[u]
-        whole, j, part, even = phase(at)
+        whole_px, j, table_fraction, on_grid = subpixel_index(at)
         a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
         if b <= a:
             continue
-        k, m = a - whole + middle, b - a
-        # Whole vectors; what is too much of the last one is overwritten by the next row, or not looked at.
+        k, m = a - whole_px + middle, b - a
+        # Whole vectors are computed; the excess of the last one is overwritten by the next row, or never read.
         full = m + (-m) % VECTOR if b + VECTOR <= columns else m
-        b, to = a + full, used + full
+        b, stop = a + full, used + full
         low, high = table[0, j, k : k + full], table[0, j + 1, k : k + full]
         low_slope, high_slope = table[1, j, k : k + full], table[1, j + 1, k : k + full]
-        factor = wider[k + even : k + even + full]
-        values, after, before = picture[u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
-        after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
-        cover, slope, step_of = covers[used:to], slopes[used:to], steps[used:to]
-        rest_of, variance_of, fall_of = left[used:to], variances[used:to], falls[used:to]
-        f, fraction, shaded = np.float32(part), np.float32(at - whole), a - whole + (len(shading) - 1) // 2
-        shade_before, shade_after = shading[shaded - 1 : shaded - 1 + full], shading[shaded : shaded + full]
+        inflation = bin_inflation[k + on_grid : k + on_grid + full]
+        values, after, before = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+        after_variance, before_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+        coverage, slope, contrast_of = coverages[used:stop], slopes[used:stop], contrasts[used:stop]
+        excess_of, variance_of, shading_slope = excesses[used:stop], variances[used:stop], shading_slopes[used:stop]
+        f, fraction, first_bin = (
+            np.float32(table_fraction),
+            np.float32(at - whole_px),
+            a - whole_px + (len(shading) - 1) // 2,
+        )
+        shade_before, shade_after = (
+            shading[first_bin - 1 : first_bin - 1 + full],
+            shading[first_bin : first_bin + full],
+        )
         for i in range(full):
             p = low[i] + f * (high[i] - low[i])
-            cover[i] = p
+            coverage[i] = p
             slope[i] = low_slope[i] + f * (high_slope[i] - low_slope[i])
-            step_of[i] = after[i] - before[i]
-            fall_of[i] = shade_before[i] - shade_after[i]
-            rest_of[i] = np.float32(values[i]) * gain + level - before[i] - shade_after[i] - fraction * fall_of[i]
-            variance_of[i] = (p * p * after_variance[i] + (unity - p) * (unity - p) * before_variance[i]) * factor[i]
+            contrast_of[i] = after[i] - before[i]
+            shading_slope[i] = shade_before[i] - shade_after[i]
+            excess_of[i] = (
+                np.float32(values[i]) * gain + level - before[i] - shade_after[i] - fraction * shading_slope[i]
+            )
+            variance_of[i] = (p * p * after_variance[i] + (unit - p) * (unit - p) * before_variance[i]) * inflation[i]
         used += m
     return used
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def residual_sums(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -253,33 +288,34 @@ def residual_sums(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    pictures: np.ndarray,
+    appearance: np.ndarray,
     margin: float,
     use: np.ndarray,
     shading: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """What the fit leaves: by distance ahead of the edge, by row, and in all.
+    """Sum the residuals of a fit: by distance from the edge, by row, over all pixels, and for the shading.
 
-    First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, z = Σ C r / v over
-    all rows of a column, and the count: 1 on average for white noise, more where noise adds up across
-    neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
-    slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean
-    of the two variances: a robust misfit for comparing blurs. Fourth: shape (n_distances, 2), Σ w r and Σ w by
-    distance ahead of the row's own edge, places as those of `shading`.
+    First result, shape (n_bins, 2), 1 px per bin, edge at the middle: the sum over frames of z² / var z, with z = Σ C r
+    / v over the rows of a column (C the contrast, r the residual, v the variance), and the number of terms. Their ratio
+    is 1 on average for white noise, more where noise is correlated between rows (grain of the film, the tail moving
+    inside). Second, shape (n_across, 2): Σ g r and Σ g², with g the derivative of the model with respect to the row's
+    lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean of the variances of film and background: a robust misfit for
+    comparing blurs. Fourth, shape (n_distances, 2): Σ w r and Σ w by distance from the row's own edge, in the bins of
+    `shading`.
 
     Parameters
     ----------
-    strip, scale, offset, lengths, lag, blur, pictures, margin, shading : as in `fit_edges`.
+    strip, scale, offset, lengths, lag, blur, appearance, margin, shading : as in `fit_edges`.
     fit : from `fit_edges`, shape (n_frames, 6).
-    use : mask of frames, shape (n_frames,).
+    use : mask of the frames to sum over, shape (n_frames,).
 
     Returns
     -------
-    four sums, as above.
+    the four results described above.
     """
     n, rows, columns = strip.shape
     bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
-    centre = bins // 2
+    centre_bin = bins // 2
     by_distance = np.zeros((bins, 2))
     by_row = np.zeros((rows, 2))
     by_place = np.zeros((len(shading), 2))
@@ -288,64 +324,67 @@ def residual_sums(
         if not use[t]:
             continue
         y = fit[t, 0]
-        half = cover_reach(lengths[t], blur) + margin
-        table = cover_table(lengths[t], blur, half)
+        half = coverage_reach(lengths[t], blur) + margin
+        table = coverage_table(lengths[t], blur, half)
         middle = math.ceil(half) + 1
         first = max(0, math.ceil(y - half - lag.max()))
         last = min(columns, int(y + half) + 1)
-        # By k, the place in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
-        column = np.zeros((2, table.shape[2] + 1))
-        odds = np.empty(table.shape[2])
+        # Indexed by k, the position in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
+        column_sums = np.zeros((2, table.shape[2] + 1))
+        log_terms = np.empty(table.shape[2])
         for u in range(rows):
             at = y - lag[u]
-            whole, j, f, even = phase(at)
+            whole_px, j, f, on_grid = subpixel_index(at)
             a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
             if b <= a:
                 continue
-            k = a - whole + middle
+            k = a - whole_px + middle
             m = b - a
             count += m
             low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
             low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-            values, after, before = strip[t, u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
-            after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
-            tops, squares = column[0, k + even : k + even + m], column[1, k + even : k + even + m]
-            fraction, shaded = at - whole, a - whole + (len(shading) - 1) // 2
-            top, square = 0.0, 0.0
+            values, after, before = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+            after_variance, before_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+            numerators, denominators = (
+                column_sums[0, k + on_grid : k + on_grid + m],
+                column_sums[1, k + on_grid : k + on_grid + m],
+            )
+            fraction, first_bin = at - whole_px, a - whole_px + (len(shading) - 1) // 2
+            gradient_sum, curvature_sum = 0.0, 0.0
             for i in range(m):
                 p = low[i] + f * (high[i] - low[i])
                 slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
                 contrast = after[i] - before[i]
                 r = values[i] * scale[t] + offset[t] - before[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
-                d = shaded + i
+                d = first_bin + i
                 r -= shading[d] + fraction * (shading[d - 1] - shading[d])
                 v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
                 w = 1 / (v + r * r / 9)
-                tops[i] += w * contrast * r
-                squares[i] += w * contrast * contrast
+                numerators[i] += w * contrast * r
+                denominators[i] += w * contrast * contrast
                 by_place[d, 0] += w * (1 - fraction) * r
                 by_place[d, 1] += w * (1 - fraction)
                 by_place[d - 1, 0] += w * fraction * r
                 by_place[d - 1, 1] += w * fraction
                 g = -contrast * slope
-                top += w * g * r
-                square += w * g * g
-                # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
-                odds[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
-            by_row[u, 0] += top
-            by_row[u, 1] += square
-            misfit += _log_of_product(odds[:m])
-        for k in range(column.shape[1]):
-            if column[1, k] > 0:
-                i = min(max(centre - middle + k - 1, 0), bins - 1)
-                by_distance[i, 0] += column[0, k] * column[0, k] / column[1, k]
+                gradient_sum += w * g * r
+                curvature_sum += w * g * g
+                # The variance does not depend on the blur: otherwise a wider blur would lower its own misfit.
+                log_terms[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
+            by_row[u, 0] += gradient_sum
+            by_row[u, 1] += curvature_sum
+            misfit += _log_of_product(log_terms[:m])
+        for k in range(column_sums.shape[1]):
+            if column_sums[1, k] > 0:
+                i = min(max(centre_bin - middle + k - 1, 0), bins - 1)
+                by_distance[i, 0] += column_sums[0, k] * column_sums[0, k] / column_sums[1, k]
                 by_distance[i, 1] += 1
     return by_distance, by_row, misfit / max(count, 1), by_place
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _log_of_product(factors: np.ndarray) -> float:
-    """Sum of the logarithms of factors from 1 to 1e18: of sixteen at a time, whose product is a finite number."""
+    """Sum the logarithms of factors between 1 and 1e18, sixteen at a time: their product is still a finite number."""
     total = 0.0
     for start in range(0, len(factors), 16):
         product = 1.0

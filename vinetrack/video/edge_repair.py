@@ -255,7 +255,7 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
     edge and its standard error, each of shape (n_frames, n_bands), px.
     """
     rows = strip.values.shape[1]
-    contrast = np.sum((state.pictures[0] - state.pictures[1]) ** 2, axis=1).astype(float)
+    contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)
     contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
     cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
     limits = np.concatenate([[0], cuts, [rows]])
@@ -266,7 +266,7 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
         part = replace(strip, values=np.ascontiguousarray(strip.values[:, low:high]))
         state_of_rows = replace(
             state, edge=edge, lag=np.ascontiguousarray(state.lag[low:high]),
-            pictures=np.ascontiguousarray(state.pictures[:, low:high]),
+            appearance=np.ascontiguousarray(state.appearance[:, low:high]),
         )  # fmt: skip
         fit = fit_edges(part, state_of_rows)
         edges.append(fit[:, 0])

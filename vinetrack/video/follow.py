@@ -41,7 +41,7 @@ twice none is."""
 class Positions:
     """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,).
 
-    `sigma_px` is the random error by the likelihood, `apart_sigma_px` what is added to it in quadrature (disagreement
+    `sigma_px` is the random error by the likelihood, `extra_sigma_px` what is added to it in quadrature (disagreement
     of bands, start of growth), `bands_sigma_px` the part of that which is independent between frames, `slow_px` the
     error that neighbouring frames share; `unsure` marks poor fits. `reach_px` is how much of the strip must be visible
     ahead of a position; `end` says how the motion of a body ended. `width_px` is the width of a tube and its standard
@@ -55,7 +55,7 @@ class Positions:
     blur_px: float
     exposure_frames: float
     reach_px: float
-    apart_sigma_px: Floats | float = 0.0
+    extra_sigma_px: Floats | float = 0.0
     bands_sigma_px: Floats | float = 0.0
     slow_px: Floats | float = SLOW_PX
     end: BodyEnd | None = None
@@ -121,7 +121,7 @@ def _edge(
     reach = 3 * fit.blur_px + 1
     return strip, Positions(
         fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames, reach,
-        fit.apart_sigma_px, fit.bands_sigma_px, fit.slow_px, width_px=(tube.width_px, tube.width_sigma_px),
+        fit.extra_sigma_px, fit.bands_sigma_px, fit.slow_px, width_px=(tube.width_px, tube.width_sigma_px),
         seen_exposure=(fit.seen_exposure_frames, fit.fast_px_per_frame),
     )  # fmt: skip
 
@@ -143,6 +143,6 @@ def _unsure(fit: EdgeFit) -> Bools:
     median_misfit = float(np.nanmedian(fit.misfit))
     poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > LARGEST_AMPLITUDE)
     poor = poor | (fit.misfit > MISFIT_RATIO * max(median_misfit, LEAST_MISFIT))
-    poor |= (fit.apart_sigma_px > DISAGREEMENT_PX) | fit.hidden
+    poor |= (fit.extra_sigma_px > DISAGREEMENT_PX) | fit.hidden
     uncertain = fit.sigma_px > np.maximum(UNCERTAIN_PX, UNCERTAIN_RATIO * np.nanmedian(fit.sigma_px))
     return np.asarray(poor | uncertain)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
 from vinetrack.video.edge_repair import ASTRAY_PX
-from vinetrack.video.edge_state import CLEAR_PX, EdgeState, clear_of_start, moving_frames
+from vinetrack.video.edge_state import START_CLEARANCE_PX, EdgeState, clear_of_start, moving_frames
 from vinetrack.video.strip import Strip
 
 HIDDEN_MISFIT = 3.2
@@ -118,10 +118,12 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     if first < FEWEST_REST_FRAMES:
         return none
     rest_px = float(np.median(edge[:first]))
-    exited = np.flatnonzero((edge > rest_px + CLEAR_PX) & (np.arange(len(edge)) >= first))
+    exited = np.flatnonzero((edge > rest_px + START_CLEARANCE_PX) & (np.arange(len(edge)) >= first))
     near = np.arange(round(rest_px) - SEARCH_PX, round(rest_px) + SEARCH_PX + 1)
     # Not where the tip comes to rest: it is round.
-    later = np.arange(near[-1] + FILM_RANGE_PX[0], min(near[-1] + FILM_RANGE_PX[1], int(edge.max() - CLEAR_PX)))
+    later = np.arange(
+        near[-1] + FILM_RANGE_PX[0], min(near[-1] + FILM_RANGE_PX[1], int(edge.max() - START_CLEARANCE_PX))
+    )
     if len(exited) < FEWEST_REST_FRAMES or near[0] < BORDER_GAP_PX + BORDER_SIDE_PX or len(later) < FILM_RANGE_PX[0]:
         return none
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
@@ -131,7 +133,7 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
     film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in film_columns)
-    contrast = np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))[later]
+    contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
     least_step = max(BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast)))
     if straight < STRAIGHT_PART or abs(border_step) < least_step:
@@ -155,13 +157,13 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
     0 to 1.
     """
     begin, columns = state.edge[0], strip.values.shape[2]
-    column_range = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + CLEAR_PX), columns - 1))
+    column_range = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
     moving = np.flatnonzero(moving_frames(state.edge))
     if len(column_range) < DOOR_COLUMNS[1] or moving[0] < 2:
         return 0.0
     first = max(0, int(moving[0]) - DOOR_FRAMES)
     rising = np.maximum.accumulate(state.edge)
-    contrast = float(np.median(np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))))
+    contrast = float(np.median(np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))))
     changed = 0
     for column in column_range:
         arrival = int(np.searchsorted(rising, column - 5.0))
@@ -189,7 +191,7 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
     -------
     `added_px`, larger where the tip is hidden, shape (n_frames,), px.
     """
-    near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
+    near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
     large, raised = misfit > HIDDEN_MISFIT, misfit > HIDDEN_MISFIT / 2
     no_edge = (misfit > COVERED_MISFIT) | raised & (amplitude < LEAST_AMPLITUDE)

@@ -1,6 +1,7 @@
-"""What lies before and after an edge at every pixel: sums over the frames that show it, and their solution.
+"""Weighted least squares for the brightness of film and background at every pixel.
 
-Compiled loops over strips of shape (n_frames, n_across, n_along); see `edge_kernels`.
+Compiled loops over strips of shape (n_frames, n_across, n_along): sums over frames, and their solution; see
+`edge_kernels`.
 """
 
 from __future__ import annotations
@@ -10,28 +11,39 @@ import math
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import BORROWED, MATHS, PHASES, SHORTEST_PX, VECTOR, cover_reach, cover_table, phase
+from vinetrack.video.edge_cover import (
+    FASTMATH,
+    MIN_MOTION_BLUR_PX,
+    NO_REFCOUNT,
+    SUBPIXEL_STEPS,
+    VECTOR,
+    coverage_reach,
+    coverage_table,
+    subpixel_index,
+)
 
-FORGOTTEN = 4.0
-"""Frames further off than this many memories, e⁻⁴ = 2 %, are not read. Chosen for time; at half 14 % of the weight is
-left out, at twice time grows."""
-PARTIAL = 0.05
-"""Weight of a half-covered pixel: what it says of film and background depends on where the edge was thought to be.
-Chosen: a pixel seen half covered in 20 frames weighs as one seen bare once. By reasoning: at half or twice the few
-pixels never seen bare change."""
-COVERED = 0.98
-"""Cover from which a pixel counts as film, and below 1 − COVERED as background. Chosen: 2 % of the contrast is less
-than the noise. By reasoning: at 1 hardly a pixel is bare; at 0.75 mixtures are taken for film."""
+MEMORY_CUTOFF = 4.0
+"""Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 %. Chosen for speed; at half 14 %
+of the weight is left out, at twice computing time grows."""
+PARTIAL_WEIGHT = 0.05
+"""Weight of a half-covered pixel: its contribution to film and background depends on where the edge was assumed to be.
+Chosen: a pixel half covered in 20 frames weighs as much as one fully visible once. By reasoning: at half or twice, the
+few pixels that are never fully visible change."""
+COVERED_FRACTION = 0.98
+"""Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background. Chosen: 2 % of the contrast
+is less than the noise. By reasoning: at 1 hardly any pixel is pure; at 0.75 mixtures are taken for film."""
 MIXED_BLURS = 2.06
-"""Distance from the edge, in optical blurs, from which a pixel is bare or covered. Derived: Φ(2.054) = COVERED."""
+"""Distance from the edge, in optical blurs, from which a pixel is pure film or background. Derived: Φ(2.054) =
+COVERED_FRACTION."""
 FAR_PX = 80
-"""Columns beyond all places of the edge that are gathered. Chosen: what is looked at about an edge lies within 60 px of
-it. At half the surroundings of the start are cut off; at twice time grows."""
-ROWS_AT_ONCE = 8
-"""Rows whose sums are gathered together. Chosen for time alone: eleven sums of eight rows of 960 columns are 340 kB."""
+"""Columns beyond the range of the edge that are gathered. Chosen: pixels within 60 px of the edge are used. At half,
+the neighbourhood of the start is cut off; at twice computing time grows."""
+ROWS_PER_BLOCK = 8
+"""Rows processed together, so that their sums stay in the cache. Chosen for speed alone: eleven sums of eight rows of
+960 columns are 340 kB."""
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def gather(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -43,30 +55,31 @@ def gather(
     early: np.ndarray,
     late: np.ndarray,
     memory_frames: float,
-    pictures: np.ndarray,
+    appearance: np.ndarray,
     clip: float,
     shading: np.ndarray,
 ) -> np.ndarray:
-    """Sums for the least squares of (before, after) at every pixel; shape (11, n_across, n_along).
+    """Accumulate the sums of the least squares for background and film at every pixel; shape (11, n_across, n_along).
 
-    The edge is over column s from frame `early[s]` to `late[s]`. Background counts before, film after, by a weight
-    that falls as exp(−frames / memory_frames): what was seen last before and first after counts most. Half-covered
-    pixels count in between, hardly. In the answer: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p) of those, then
-    weight, sum and sum of squares of V where only background, and where only film, is seen.
-    With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
+    The edge is over column s from frame `early[s]` to `late[s]`. A pixel counts as background before and as film after,
+    with the weight exp(−frames / memory_frames), so that the frames nearest to the passage count most. Half-covered
+    pixels in between count with PARTIAL_WEIGHT. The sums are Σwq², Σwqp, Σwp², ΣwqV, ΣwpV for half-covered pixels (p
+    the coverage, q = 1 − p, V the brightness), then weight, Σ and Σ of squares of V for pure background, and the same
+    for pure film. With `clip` > 0, a value with the residual r from the previous solution is down-weighted by 1/(1 +
+    (r/clip)²).
 
     Parameters
     ----------
     strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
     scale, offset : brightness = scale · value + offset, shape (n_frames,).
-    edge, lengths : place of the edge and length of its motion blur, shape (n_frames,), px; NaN where unknown.
-    lag : by how much each row of the tip lags behind its foremost point, shape (n_across,), px.
+    edge, lengths : position of the edge and length of its motion blur, shape (n_frames,), px; NaN where unknown.
+    lag : distance by which each row of the tip lags behind its foremost point, shape (n_across,), px.
     blur : standard deviation of the optical blur, px.
     early, late : first and last frame with the edge over a column, shape (n_along,).
     memory_frames : frames after which weights fall to 1/e.
-    pictures : the last solution of `solve`; unused where `clip` is 0.
-    clip : grey levels.
-    shading : as in `edge_kernels.fit_edges`; taken off what is seen.
+    appearance : previous solution of `solve`; unused if `clip` is 0.
+    clip : residual from which values are down-weighted, grey levels; 0 for none.
+    shading : as in `edge_kernels.fit_edges`; subtracted from the brightness.
 
     Returns
     -------
@@ -74,12 +87,12 @@ def gather(
     """
     n, rows, columns = strip.shape
     sums = np.zeros((11, rows, columns), np.float32)
-    tight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
-    # What is the same for all rows: weights of columns, first and behind the last that counts, covers by distance.
-    seen, film = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
+    clip_weight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
+    # Common to all rows: weights of columns, the first column that counts and the one behind the last, coverage tables.
+    bare_weights, film_weights = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
     limits = np.zeros((n, 2), np.int64)
-    widest = 0.0
-    # Far from where the edge ever is nothing is asked.
+    max_reach = 0.0
+    # Columns far from every position of the edge are skipped.
     low, high = columns, 0
     for t in range(n):
         if math.isfinite(edge[t]):
@@ -90,89 +103,89 @@ def gather(
         if math.isfinite(edge[t]):
             for s in range(low, high):
                 d = max(early[s] - t, t - late[s], 0.0) / memory_frames
-                if d < FORGOTTEN:
-                    seen[t, s] = math.exp(-d)
-                    film[t, s] = seen[t, s] if t >= late[s] else 0.0
+                if d < MEMORY_CUTOFF:
+                    bare_weights[t, s] = math.exp(-d)
+                    film_weights[t, s] = bare_weights[t, s] if t >= late[s] else 0.0
                     first, last = min(first, s), s + 1
         limits[t, 0], limits[t, 1] = first, last
         if last > first:
-            widest = max(widest, cover_reach(max(lengths[t], SHORTEST_PX), blur))
-    # Frames of rest share a table: all motion blurs up to SHORTEST_PX are taken for that.
-    tables = np.zeros((n, PHASES + 1, 2 * math.ceil(widest) + 4 + VECTOR))
-    places, resting = np.empty(n, np.int64), -1
+            max_reach = max(max_reach, coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur))
+    # Frames at rest (motion blur up to MIN_MOTION_BLUR_PX) share a table.
+    tables = np.zeros((n, SUBPIXEL_STEPS + 1, 2 * math.ceil(max_reach) + 4 + VECTOR))
+    table_index, rest_table = np.empty(n, np.int64), -1
     for t in range(n):
-        places[t] = t
+        table_index[t] = t
         if limits[t, 1] > limits[t, 0]:
-            if lengths[t] <= SHORTEST_PX and resting >= 0:
-                places[t] = resting
+            if lengths[t] <= MIN_MOTION_BLUR_PX and rest_table >= 0:
+                table_index[t] = rest_table
                 continue
-            table = cover_table(lengths[t], blur, cover_reach(max(lengths[t], SHORTEST_PX), blur))
+            table = coverage_table(lengths[t], blur, coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur))
             tables[t, :, : table.shape[2]] = table[0]
-            if lengths[t] <= SHORTEST_PX:
-                resting = t
-    bright = np.empty(columns, np.float32)
-    # A few rows at a time, so that their sums stay near the processor.
-    for block in range(0, rows, ROWS_AT_ONCE):
+            if lengths[t] <= MIN_MOTION_BLUR_PX:
+                rest_table = t
+    brightness = np.empty(columns, np.float32)
+    # A few rows at a time, so that their sums stay in the cache.
+    for block in range(0, rows, ROWS_PER_BLOCK):
         for t in range(n):
             first, last = limits[t]
             if last <= first:
                 continue
-            middle = math.ceil(cover_reach(max(lengths[t], SHORTEST_PX), blur)) + 1
-            zone = min(math.ceil(0.5 * max(lengths[t], SHORTEST_PX) + MIXED_BLURS * blur) + 1, middle)
-            table, bare_weight, film_weight = tables[places[t]], seen[t], film[t]
+            middle = math.ceil(coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur)) + 1
+            mixed = min(math.ceil(0.5 * max(lengths[t], MIN_MOTION_BLUR_PX) + MIXED_BLURS * blur) + 1, middle)
+            table, bare_weight, film_weight = tables[table_index[t]], bare_weights[t], film_weights[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
-                strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, zone, first,
-                last, bare_weight, film_weight, early, late, t, pictures, tight, shading, bright, sums,
+                strip[t], block, min(block + ROWS_PER_BLOCK, rows), gain, level, edge[t], lag, table, middle, mixed,
+                first, last, bare_weight, film_weight, early, late, t, appearance, clip_weight, shading, brightness, sums,
             )  # fmt: skip
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
 def _gather_rows(
     picture: np.ndarray, low: int, high: int, gain: np.float32, level: np.float32, edge: float, lag: np.ndarray,
-    table: np.ndarray, middle: int, zone: int, first: int, last: int, bare_weight: np.ndarray, film_weight: np.ndarray,
-    early: np.ndarray, late: np.ndarray, t: int, pictures: np.ndarray, tight: np.float32,
-    shading: np.ndarray, bright: np.ndarray, sums: np.ndarray,
+    table: np.ndarray, middle: int, mixed: int, first: int, last: int, bare_weight: np.ndarray,
+    film_weight: np.ndarray, early: np.ndarray, late: np.ndarray, t: int, appearance: np.ndarray,
+    clip_weight: np.float32, shading: np.ndarray, brightness: np.ndarray, sums: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add what rows `low` to `high` of one frame show to `sums`; see `gather`."""
-    unity = np.float32(1.0)
+    """Add rows `low` to `high` of one frame to `sums`; see `gather`."""
+    unit = np.float32(1.0)
     for u in range(low, high):
         at = edge - lag[u]
-        whole, j, f, _ = phase(at)
-        behind = min(max(whole - zone + 1, first), last)
-        ahead = min(max(whole + zone + 1, first), last)
-        values, levelled = picture[u, first:last], bright[first:last]
+        whole_px, j, f, _ = subpixel_index(at)
+        behind = min(max(whole_px - mixed + 1, first), last)
+        ahead = min(max(whole_px + mixed + 1, first), last)
+        values, brightness_of = picture[u, first:last], brightness[first:last]
         for s in range(last - first):
-            levelled[s] = np.float32(values[s]) * gain + level
+            brightness_of[s] = np.float32(values[s]) * gain + level
         centre = (len(shading) - 1) // 2
-        fraction = at - whole
-        for s in range(max(first, whole - centre + 1), min(last, whole + centre)):
-            d = s - whole + centre
-            bright[s] -= np.float32(shading[d] + fraction * (shading[d - 1] - shading[d]))
-        _count(bright[first:behind], film_weight[first:behind], pictures[0, u, first:behind], tight,
-               sums[8, u, first:behind], sums[9, u, first:behind], sums[10, u, first:behind])  # fmt: skip
-        _count(bright[ahead:last], bare_weight[ahead:last], pictures[1, u, ahead:last],
-               tight, sums[5, u, ahead:last], sums[6, u, ahead:last], sums[7, u, ahead:last])  # fmt: skip
+        fraction = at - whole_px
+        for s in range(max(first, whole_px - centre + 1), min(last, whole_px + centre)):
+            d = s - whole_px + centre
+            brightness[s] -= np.float32(shading[d] + fraction * (shading[d - 1] - shading[d]))
+        _add_pure_pixels(brightness[first:behind], film_weight[first:behind], appearance[0, u, first:behind],
+               clip_weight, sums[8, u, first:behind], sums[9, u, first:behind], sums[10, u, first:behind])  # fmt: skip
+        _add_pure_pixels(brightness[ahead:last], bare_weight[ahead:last], appearance[1, u, ahead:last],
+               clip_weight, sums[5, u, ahead:last], sums[6, u, ahead:last], sums[7, u, ahead:last])  # fmt: skip
         for s in range(behind, ahead):
-            k = s - whole + middle
+            k = s - whole_px + middle
             p = np.float32(table[j, k] + f * (table[j + 1, k] - table[j, k]))
-            q = unity - p
-            value = bright[s]
+            q = unit - p
+            value = brightness[s]
             w = bare_weight[s]
-            if p > COVERED:
+            if p > COVERED_FRACTION:
                 w = film_weight[s]
-            elif p > 1 - COVERED:
+            elif p > 1 - COVERED_FRACTION:
                 if t < early[s] or t > late[s]:
                     continue
-                w *= np.float32(PARTIAL)
-            r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
-            w /= unity + r * r * tight
-            if q > COVERED:
+                w *= np.float32(PARTIAL_WEIGHT)
+            r = value - appearance[1, u, s] * q - appearance[0, u, s] * p
+            w /= unit + r * r * clip_weight
+            if q > COVERED_FRACTION:
                 sums[5, u, s] += w
                 sums[6, u, s] += w * value
                 sums[7, u, s] += w * value * value
-            elif p > COVERED:
+            elif p > COVERED_FRACTION:
                 sums[8, u, s] += w
                 sums[9, u, s] += w * value
                 sums[10, u, s] += w * value * value
@@ -184,86 +197,86 @@ def _gather_rows(
                 sums[4, u, s] += w * p * value
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
-def _count(
-    values: np.ndarray, weight: np.ndarray, picture: np.ndarray, tight: np.float32,
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _add_pure_pixels(
+    values: np.ndarray, weight: np.ndarray, picture: np.ndarray, clip_weight: np.float32,
     count: np.ndarray, total: np.ndarray, squares: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add the pixels of a row that are bare, or covered, to their weight, sum and sum of squares."""
-    unity = np.float32(1.0)
+    """Add pixels of pure film, or pure background, to their weight, sum and sum of squares."""
+    unit = np.float32(1.0)
     for k in range(len(values)):
         value = values[k]
         r = value - picture[k]
-        w = weight[k] / (unity + r * r * tight)
+        w = weight[k] / (unit + r * r * clip_weight)
         count[k] += w
         total[k] += w * value
         squares[k] += w * value * value
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
-def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise: float, texture: float) -> np.ndarray:
-    """Brightness after and before the edge at every pixel, and the variance about each; shape (4, n_across, n_along).
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
+    """Solve for the brightness of film and background at every pixel, and the variance about each.
 
-    A pixel that never shows unity of the two, or whose background changes (a door swings there), takes it from its row:
-    film from the columns behind it, background from those ahead, with weights falling as `memory`^distance; its
-    variance is then `texture`², a tenth more where it changes.
+    A pixel at which one of the two is never visible, or whose background changes (a door swings there), takes it from
+    its row: film from the columns behind it, background from those ahead, with weights that fall as `decay`^distance.
+    Its variance is then `texture`², with a factor of 1.1 where the background changes.
 
     Parameters
     ----------
     sums : from `gather`, shape (11, n_across, n_along).
-    ridge : weight of the row's guess where a pixel was seen itself, frames.
-    memory : factor by which weights of neighbours fall from column to column.
-    fallback : brightness where nothing is known.
+    ridge : weight of the row's estimate where the pixel itself was visible, frames.
+    decay : factor by which the weight of neighbours falls from column to column.
+    fallback : brightness used where nothing is known.
     noise, texture : standard deviation of a value, and of a pixel about its neighbours, grey levels.
 
     Returns
     -------
-    after, before, variance after, variance before.
+    film, background, variance of film, variance of background; shape (4, n_across, n_along).
     """
     _, rows, columns = sums.shape
     out = np.empty((4, rows, columns), np.float32)
-    guess = np.empty(columns)
-    unsteady = (1.5 * texture) ** 2
+    background_guess = np.empty(columns)
+    variance_limit = (1.5 * texture) ** 2
     for u in range(rows):
-        total, count, level = 0.0, 0.0, fallback
+        total, count, film_guess = 0.0, 0.0, fallback
         for s in range(columns - 1, -1, -1):
             if count > 1e-3:
-                level = total / count
-            guess[s] = level
-            steady = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) < unsteady
-            total = total * memory + (sums[6, u, s] if steady else 0.0)
-            count = count * memory + (sums[5, u, s] if steady else 0.0)
+                film_guess = total / count
+            background_guess[s] = film_guess
+            is_steady = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) < variance_limit
+            total = total * decay + (sums[6, u, s] if is_steady else 0.0)
+            count = count * decay + (sums[5, u, s] if is_steady else 0.0)
         for s in range(columns - 1, -1, -1):
-            if guess[s] != fallback:
+            if background_guess[s] != fallback:
                 break
-            guess[s] = sums[6, u, s] / sums[5, u, s] if sums[5, u, s] > 0 else fallback
-        total, count, level = 0.0, 0.0, fallback
+            background_guess[s] = sums[6, u, s] / sums[5, u, s] if sums[5, u, s] > 0 else fallback
+        total, count, film_guess = 0.0, 0.0, fallback
         for s in range(columns):
             if count > 1e-3:
-                level = total / count
+                film_guess = total / count
             elif sums[8, u, s] > 0:
-                level = sums[9, u, s] / sums[8, u, s]
-            total = total * memory + sums[9, u, s]
-            count = count * memory + sums[8, u, s]
-            # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
+                film_guess = sums[9, u, s] / sums[8, u, s]
+            total = total * decay + sums[9, u, s]
+            count = count * decay + sums[8, u, s]
+            # Background never fully visible: the estimate from half-covered pixels would follow any error of the edge.
             bare_variance = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise)
-            bare, film = sums[5, u, s] > 0.1 and bare_variance < unsteady, sums[8, u, s] > 0.1
+            bare, film = sums[5, u, s] > 0.1 and bare_variance < variance_limit, sums[8, u, s] > 0.1
             qq, qp, pp = sums[0, u, s] + sums[5, u, s], sums[1, u, s], sums[2, u, s] + sums[8, u, s]
             vq, vp = sums[3, u, s] + sums[6, u, s], sums[4, u, s] + sums[9, u, s]
             rq = ridge if bare else 1e4 * (1 + qq)
             rp = ridge if film else 1e4 * (1 + pp)
-            qq, pp, vq, vp = qq + rq, pp + rp, vq + rq * guess[s], vp + rp * level
+            qq, pp, vq, vp = qq + rq, pp + rp, vq + rq * background_guess[s], vp + rp * film_guess
             det = qq * pp - qp * qp
             out[0, u, s] = (vp * qq - vq * qp) / det
             out[1, u, s] = (vq * pp - vp * qp) / det
             out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
-            out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= unsteady else 1.0) * texture**2
+            out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= variance_limit else 1.0) * texture**2
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _variance(weight: float, total: float, squares: float, noise: float) -> float:
-    """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
+    """Variance of the values of a pixel, at least that of the noise, shrunk towards it if there are few frames."""
     if weight <= 0:
         return noise**2
     seen = max(squares / weight - (total / weight) ** 2, 0.0)

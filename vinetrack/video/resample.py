@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_cover import BORROWED
+from vinetrack.video.edge_cover import NO_REFCOUNT
 
 SHARPNESS = np.float32(-0.75)
 """Slope of the cubic at its first zero. Defined by OpenCV's INTER_CUBIC, whose values these are but for rounding."""
@@ -117,7 +117,7 @@ def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np
         _interpolate_one(picture, rows, top, parts, runs, most, made)
 
 
-@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", **BORROWED)
+@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", **NO_REFCOUNT)
 def _interpolate_one(
     picture: np.ndarray, rows: np.ndarray, top: int, parts: np.ndarray, runs: np.ndarray, most: np.float32,
     made: np.ndarray,

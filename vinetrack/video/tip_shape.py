@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.edge_cover import cover_reach
+from vinetrack.video.edge_cover import coverage_reach
 from vinetrack.video.edge_state import (
     MARGIN_PX,
     ROUGH_ROUNDS,
-    SHADED_PX,
+    SHADING_REACH_PX,
     EdgeState,
     blur_lengths,
     core_frames,
@@ -80,10 +80,10 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     sampled = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // BLUR_FRAMES)]
     candidates = BLURS_PX if everywhere else state.blur * NEAR_BLURS
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
-    widest = MARGIN_PX + cover_reach(0.0, float(candidates.max()))
+    widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
 
     def misfit(blur: float) -> float:
-        return _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - cover_reach(0.0, blur))
+        return _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
 
     if everywhere:
         misfits = [misfit(float(blur)) for blur in candidates]
@@ -119,7 +119,7 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     for _ in range(2):
         by_place = residuals(strip, state, fit, core).by_place
         middle = len(by_place) // 2
-        residual, weight = by_place[middle - SHADED_PX : middle + SHADED_PX + 1].T
+        residual, weight = by_place[middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1].T
         step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
         state = replace(state, shading=np.convolve(state.shading + step, SHADING_KERNEL, mode="same"))
     return state

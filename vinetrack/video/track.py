@@ -250,7 +250,7 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     moving = np.gradient(edge_px) > MOVING_PX if len(edge_px) > 1 else np.ones(len(edge_px), bool)
     largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
     random_px = calibrated_sigma(edge_px, followed.sigma_px, moving & np.isfinite(edge_px), largest=largest)
-    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.apart_sigma_px, FLOOR_PX))
+    total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
     return random_px, np.hypot(total_px, STABILISED_PX if strip.steadied else 0.0)
 
 
