@@ -20,14 +20,20 @@ def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(l
     half = 6.0 + 0.5 * length + 4 * blur
     table = edge_cover.coverage_table(length, blur, half)
     middle = math.ceil(half) + 1
-    x = middle - np.arange(table.shape[2]) + edge_cover.STEP * np.arange(edge_cover.PHASES + 1)[:, None]
+    x = (
+        middle
+        - np.arange(table.shape[2])
+        + edge_cover.TABLE_STEP_PX * np.arange(edge_cover.SUBPIXEL_STEPS + 1)[:, None]
+    )
     # A box of many Gaussian steps, summed one by one.
     places = np.linspace(-0.5, 0.5, 401) * max(length, 0.02)
     expected = np.zeros_like(x)
     for place in places[1:-1:2]:
         expected += np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))((x - place) / blur) / 200
     assert np.abs(table[0] - expected).max() < 2e-5
-    assert np.abs(table[1, :, 1:-1] - np.gradient(expected, edge_cover.STEP, axis=0)[:, 1:-1]).max() < 0.01 / blur
+    assert (
+        np.abs(table[1, :, 1:-1] - np.gradient(expected, edge_cover.TABLE_STEP_PX, axis=0)[:, 1:-1]).max() < 0.01 / blur
+    )
 
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2

@@ -136,7 +136,8 @@ def gather(
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
                 strip[t], block, min(block + ROWS_PER_BLOCK, rows), gain, level, edge[t], lag, table, middle, mixed,
-                first, last, bare_weight, film_weight, early, late, t, appearance, clip_weight, shading, brightness, sums,
+                first, last, bare_weight, film_weight, early, late, t, appearance, clip_weight, shading, brightness,
+                sums,
             )  # fmt: skip
     return sums
 

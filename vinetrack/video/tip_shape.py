@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.edge_cover import coverage_reach
 from vinetrack.video.edge_state import (
+    EARLY_FIT_ROUNDS,
     MARGIN_PX,
-    ROUGH_ROUNDS,
     SHADING_REACH_PX,
     EdgeState,
     blur_lengths,
@@ -129,7 +129,7 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
     """Misfit of some frames after a new fit of their edges: a blur must not be judged by edges fitted with another."""
     edge = np.full(len(state.edge), np.nan)
     edge[frames] = state.edge[frames]
-    fit = fit_edges(strip, replace(state, edge=edge), ROUGH_ROUNDS)
+    fit = fit_edges(strip, replace(state, edge=edge), EARLY_FIT_ROUNDS)
     use = np.isfinite(fit[:, 0])
     edge[use] = fit[use, 0]
     return residuals(strip, replace(state, edge=edge), fit, use, margin_px).misfit
