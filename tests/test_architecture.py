@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -134,6 +135,14 @@ def test_importing_a_file_does_no_work(path: Path) -> None:
         if not isinstance(node, ast.FunctionDef | ast.ClassDef | ast.If):
             forbidden += [call for call in calls if call.split(".")[-1] in ("open", "mkdir", "read_text", "write_text")]
     assert not forbidden
+
+
+def test_the_page_on_the_architecture_lists_the_rooms_from_the_bottom_to_the_top() -> None:
+    table = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## Data flow")[0]
+    rows = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines() if line.startswith("| `")]
+    listed = [name for row in rows for name in row]
+    assert sorted(listed) == sorted(name for floor in FLOORS for name in floor)
+    assert [floor_of(name) for name in listed] == sorted(floor_of(name) for name in listed)
 
 
 def test_the_floors_name_every_room() -> None:

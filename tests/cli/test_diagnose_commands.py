@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow, write_experiment
 from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.pipeline.run_folders import command_for_results
 
 LADDER = (
     "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
@@ -102,6 +103,7 @@ def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experimen
     code, output = run("add", "reservoir_depletion", results, "--save")
     assert code == 0, output
     assert "reservoir_depletion" in (experiment / "experiment.yaml").read_text()
+    assert command_for_results(experiment, results) in output.replace("\n", " ")
     code, output = run("add", "reservoir_depletion", results)
     assert code == 1
     assert "in the model already" in output

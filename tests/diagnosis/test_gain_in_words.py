@@ -53,3 +53,23 @@ def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
 
     row = Candidate("tail_stretch", "physical", "refitted", 1.0, SIGNIFICANT_SIGMA - 0.1, (number(1.0, 0.6),))
     assert estimates_text(row).endswith(": not significant")
+
+
+@pytest.mark.parametrize(
+    ("others", "words"),
+    [
+        ((), "refitted, posterior weight 50 %"),
+        (("slow_leak",), "refitted, posterior weight 50 %, shared with slow_leak, which contains it"),
+        (("a_leak", "b_leak"), "refitted, posterior weight 50 %, shared with a_leak and b_leak, which contain it"),
+    ],
+)
+def test_a_weight_shared_with_a_richer_form_is_said_to_be(others: tuple[str, ...], words: str) -> None:
+    from vinetrack.diagnosis.result import MISSING, REFITTED, Candidate, Diagnosis, Round, limit_reason
+    from vinetrack.narrative.diagnosis_text import diagnosis_text
+
+    found = Candidate("leak", "physical", REFITTED, 80.0, 8.9, in_answer_set=True, posterior_weight=0.5)
+    reason = f"{limit_reason('leak')} and fits no better"
+    richer = [Candidate(name, "physical", REFITTED, 80.1, 8.9, reason=reason, posterior_weight=0.5) for name in others]
+    step = Round(("gravity",), MISSING, ("leak",), (found, *richer), "")
+    lines = diagnosis_text(Diagnosis((step,), ("leak",), "")).splitlines()
+    assert next(line for line in lines if line.startswith("* leak")).endswith(f"  {words}")

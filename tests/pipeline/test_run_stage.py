@@ -14,7 +14,7 @@ from lsoda_vine import grown_position, vine_trial
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import run_stage
-from vinetrack.pipeline.run_folders import claim_results
+from vinetrack.pipeline.run_folders import claim_results, command_for_results
 from vinetrack.pipeline.run_stage import RunError, RunPaths, check_before_run, run_chain, run_lines, run_paths
 from vinetrack.pipeline.workflow import make_plan
 
@@ -32,6 +32,23 @@ def test_results_lie_beside_the_experiment_or_under_the_folder_named(tmp_path: P
     folder = experiment(tmp_path / "week" / "vines")
     assert run_paths(folder, None) == RunPaths(folder, tmp_path / "week" / "results" / "vines")
     assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "vines"
+
+
+def test_the_command_that_renews_results_writes_them_where_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = experiment(tmp_path / "week" / "my vines")
+    monkeypatch.chdir(tmp_path)
+    given = folder.relative_to(tmp_path)
+    for base, command in (
+        (None, "vinetrack run 'week/my vines'"),
+        (Path("results"), "vinetrack run 'week/my vines' --results results"),
+    ):
+        results = run_paths(given, base).results
+        assert command_for_results(given, results) == command
+        assert command_for_results(given, Path(os.path.relpath(results))) == command
+    elsewhere = command_for_results(given, Path("results/other"))
+    assert elsewhere == "snakemake --config 'experiment=week/my vines' results=results/other"
 
 
 def test_the_folder_one_is_in_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,11 +93,12 @@ def _add(
         with _progress_line() as report:
             lines = add_effect(read, results, effect, report)
         if save:
+            from vinetrack.pipeline.run_folders import command_for_results
             from vinetrack.pipeline.source_experiment import save_model
 
             name = effect if own_file is None else own_file.stem
             path = save_model(read.folder, [*read.settings.model, name], [] if own_file is None else [own_file.name])
-            lines.append(f"Saved to {path}; run vinetrack run or snakemake again to update all results.")
+            lines.append(f"Saved to {path}; to update all results: {command_for_results(read.folder, results)}")
         print_result(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
 
 

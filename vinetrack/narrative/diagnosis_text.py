@@ -143,7 +143,7 @@ def _ranking(step: Round) -> list[str]:
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
                 estimates_text(candidate),
-                candidate.reason or _status(candidate),
+                candidate.reason or _status(candidate, step),
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
@@ -151,10 +151,14 @@ def _ranking(step: Round) -> list[str]:
     return lines + ([f"{NOT_TESTABLE}: {', '.join(untestable)}"] if untestable else [])
 
 
-def _status(candidate: Candidate) -> str:
-    """How a candidate was tested, with its posterior weight where it shares the answer set."""
-    shared = candidate.in_answer_set and candidate.posterior_weight < 0.995
-    return f"{candidate.status}, weight {100 * candidate.posterior_weight:.0f} %" if shared else candidate.status
+def _status(candidate: Candidate, step: Round) -> str:
+    """How a candidate was tested, with its posterior weight and its richer forms where those share that weight."""
+    if not (candidate.in_answer_set and candidate.posterior_weight < 0.995):
+        return candidate.status
+    text = f"{candidate.status}, posterior weight {100 * candidate.posterior_weight:.0f} %"
+    weighed = [row for row in step.ranking if row.posterior_weight > 0]
+    richer = [row.effect for row in weighed if row.is_richer_form_of(candidate.effect)]
+    return f"{text}, shared with {joined(richer)}, which contain{'s' * (len(richer) == 1)} it" if richer else text
 
 
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:

@@ -10,6 +10,7 @@ from vinetrack.core.numbers import decimals
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.candidates import slip_of
 from vinetrack.diagnosis.confounder import Confounder, left_open
+from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -332,10 +333,11 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
         names = tests.sensitivities.effects
         thresholds = [tests.family.threshold(name) for name in names]
         best = int((tests.one_sided_z - thresholds).argmax())
+        stricter = " (the level once an effect was added)" if tests.level < FALSE_ALARM_LEVEL_FIRST_ROUND else ""
         text += (
             f" The most significant of {_count_testable(tests)} candidates, {names[best]}, reaches "
             f"{tests.one_sided_z[best]:.1f} σ; its threshold is {thresholds[best]:.1f} σ. Where nothing is missing, "
-            f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns."
+            f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns{stricter}."
         )
         kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
         if kind == MEASUREMENT and tests.one_sided_z[best] >= WORTH_A_CHECK_SIGMA:

@@ -6,6 +6,7 @@ import difflib
 import json
 import os
 import re
+import shlex
 from pathlib import Path
 
 from vinetrack.core.problems import ExperimentError, Problem
@@ -53,6 +54,25 @@ def find_experiment(folder: Path) -> Path:
 
 def _shown(path: Path) -> str:
     return os.path.relpath(path)
+
+
+def command_for_results(experiment: Path, results: Path) -> str:
+    """Return the command that writes the results of an experiment to the folder where they are.
+
+    Parameters
+    ----------
+    experiment, results : the two folders.
+
+    Returns
+    -------
+    str
+    """
+    name, where = experiment.absolute().name, results.absolute()
+    if where.name != name:
+        return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
+    command = ["vinetrack", "run", str(experiment)]
+    beside = experiment.absolute().parent / "results"
+    return shlex.join(command if where.parent == beside else [*command, "--results", _shown(where.parent)])
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
