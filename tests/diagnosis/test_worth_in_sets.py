@@ -40,6 +40,12 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
     return [of(tuple(n for n in NAMES if n != out), TRIPLE - falls[out] ** 2 / 2) for out in NAMES]
 
 
+@pytest.fixture(autouse=True)
+def no_refit_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The likelihoods are given; tests of refits replace this."""
+    monkeypatch.setattr(EffectSets, "_refitted", lambda *_: None)
+
+
 @pytest.mark.parametrize(("worth", "enough"), [(3.0, False), (5.9, False), (6.1, True)])
 def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others(worth: float, enough: bool) -> None:
     triple, sets = of(NAMES, TRIPLE), sets_of(pairs(worth))
@@ -71,7 +77,8 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
 
 def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the pairs one was known; the best comes of taking the first effect out of the three."""
-    found = {frozenset(NAMES[1:]): TRIPLE - 2.0, frozenset((NAMES[0], NAMES[2])): TRIPLE - 90.0}
+    fits = {NAMES[1:]: TRIPLE - 2.0, (NAMES[0], NAMES[2]): TRIPLE - 90.0, NAMES[:2]: TRIPLE - 45.0}
+    found = {frozenset(names): log_likelihood for names, log_likelihood in fits.items()}
 
     def refitted(_sets: EffectSets, _fit: Any, effects: tuple[Any, ...]) -> Any:
         return SimpleNamespace(log_likelihood=found[frozenset(effect.name for effect in effects)], model=())
@@ -86,3 +93,21 @@ def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypat
     assert set(sets.of_size(2)[0].names) == set(NAMES[1:])
     assert not sets.prune(of(NAMES, TRIPLE))
     assert math.isclose(sets.of_size(2)[0].fit.log_likelihood, TRIPLE - 2.0)
+
+
+@pytest.mark.parametrize(("refit", "needed"), [(TRIPLE - 450.0, True), (TRIPLE - 2.0, False)])
+def test_a_known_pair_in_a_local_minimum_does_not_make_the_third_look_needed(
+    monkeypatch: pytest.MonkeyPatch, refit: float, needed: bool
+) -> None:
+    """All pairs are known, 30 σ below the triple; the last one ends higher when it is fitted from the triple."""
+
+    def refitted(_sets: EffectSets, _fit: Any, effects: tuple[Any, ...]) -> Any:
+        last = {effect.name for effect in effects} == set(NAMES[:2])
+        return SimpleNamespace(log_likelihood=refit if last else TRIPLE - 450.0, model=())
+
+    def ratio(_before: Any, effects: tuple[Any, ...], fit: Any) -> LikelihoodRatio:
+        return of(tuple(effect.name for effect in effects), fit.log_likelihood)
+
+    monkeypatch.setattr(EffectSets, "_refitted", refitted)
+    monkeypatch.setattr(effect_sets, "likelihood_ratio", ratio)
+    assert bool(sets_of(pairs(30.0)).superfluous(of(NAMES, TRIPLE))) != needed

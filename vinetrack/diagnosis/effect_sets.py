@@ -54,6 +54,7 @@ class EffectSets:
         for single in singles:
             self._keep_best(single)
         self.extended: set[Names] = set()
+        self.left_out: set[tuple[str, str]] = set()
         self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
@@ -133,7 +134,10 @@ class EffectSets:
         return self.of_size(size)[0].fit.log_likelihood > best + MIN_LOG_LIKELIHOOD_GAIN
 
     def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
-        """Fit a set without one of its members; None where the fit fails.
+        """Fit a set without one of its members, from where the set ended; None where no fit succeeds.
+
+        A fit of the smaller set that is known already may have ended in a local minimum, which would make the member
+        look needed: the better of the two counts.
 
         Parameters
         ----------
@@ -143,17 +147,15 @@ class EffectSets:
         Returns
         -------
         LikelihoodRatio or None
-            Not refitted if a fit of these effects is known whose likelihood is no higher than that of the larger set.
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
-        names = frozenset(other.name for other in others)
-        known = self.fitted.get(names)
-        if known is None or known.fit.log_likelihood > hypothesis.fit.log_likelihood:
+        if (hypothesis.label, effect.name) not in self.left_out:
+            self.left_out.add((hypothesis.label, effect.name))
             self.report(f"taking out {effect.name}")
             fit = self._refitted(hypothesis.fit, others)
             if fit is not None:
                 self._keep_best(likelihood_ratio(self.before, others, fit))
-        return self.fitted.get(names)
+        return self.fitted.get(frozenset(other.name for other in others))
 
     def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
         """Some members of a set alone, refitted from the set unless known already; None where the fit fails.
