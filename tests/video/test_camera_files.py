@@ -69,7 +69,7 @@ def test_time_stamps_show_missing_frames(tmp_path):
     assert read.slot.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     assert read.recording.capture_fps == 5000
     assert read.recording.exposure_s == pytest.approx(40e-6, rel=1e-4)
-    assert "1 frames are missing by the timestamps" in read.notes[0]
+    assert "1 frames are missing according to the timestamps" in read.notes[0]
 
 
 def test_frames_saved_one_in_four_have_their_own_rate(tmp_path):
@@ -120,7 +120,7 @@ def test_a_truncated_cine_gives_its_whole_frames(tmp_path):
     path.write_bytes(path.read_bytes()[:-1500])
     read = read_frames(path)
     assert np.array_equal(read.luma, EIGHT[:7])
-    assert "7 frames are there where the file declares 9: cut short" in read.notes[-1]
+    assert "the file holds 7 frames but declares 9: cut short" in read.notes[-1]
 
 
 @pytest.mark.parametrize("side", [".cih", ".cihx"])
@@ -180,7 +180,7 @@ def test_a_truncated_mraw_gives_its_whole_frames(tmp_path):
     path.write_bytes(path.read_bytes()[:-10])
     read = read_frames(path)
     assert np.array_equal(read.luma, DEEP[:8])
-    assert "8 frames are there where the file declares 9" in read.notes[0]
+    assert "the file holds 8 frames but declares 9" in read.notes[0]
 
 
 def test_a_stack_has_rate_and_exposure_of_its_side_file(tmp_path):

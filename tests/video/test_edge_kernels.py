@@ -10,7 +10,7 @@ import pytest
 from vinetrack.video import edge_cover, picture_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
-from vinetrack.video.order_kernels import fan_gains, median
+from vinetrack.video.order_kernels import median, monotone_path_sums
 from vinetrack.video.registration import _pixels, reference_pixels
 from vinetrack.video.resample import sample
 
@@ -195,7 +195,7 @@ def test_paths_across_a_fan_collect_what_a_plain_search_collects() -> None:
             for s in range(1, len(best)):
                 best[s] = max(best[s], best[s - 1] + line[s - 1])
         expected.append(best[-1])
-    assert np.allclose(fan_gains(along, across, time, weight, bins, length, n_times), expected, rtol=1e-5)
+    assert np.allclose(monotone_path_sums(along, across, time, weight, bins, length, n_times), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4999, 5000])

@@ -50,7 +50,7 @@ def film(request: pytest.FixtureRequest, long_frames: np.ndarray, tmp_path_facto
 @pytest.fixture
 def bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every recording counts as a long one."""
-    monkeypatch.setattr(event_frames, "HELD_BYTES", 0)
+    monkeypatch.setattr(event_frames, "MAX_BYTES_WHOLE", 0)
 
 
 def track(path: Path, **stated: object) -> Track:
@@ -79,7 +79,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scen
 
 def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = track(film)
-    monkeypatch.setattr(event_frames, "HELD_BYTES", 0)
+    monkeypatch.setattr(event_frames, "MAX_BYTES_WHOLE", 0)
     part = track(film)
     assert len(part.time_s) == len(whole.time_s)
     assert part.time_s == pytest.approx(whole.time_s)

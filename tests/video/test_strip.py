@@ -9,7 +9,7 @@ from plain_scene import Plan, plain_scene
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.resample import sample
-from vinetrack.video.strip import cut_strip, squared
+from vinetrack.video.strip import cut_strip, snap_to_grid
 
 
 def ramp(gx, gy, shape=(90, 140)):
@@ -41,9 +41,9 @@ def test_an_axis_to_the_left_turns_the_picture_half_round():
 
 
 def test_a_nearly_level_axis_is_squared_and_a_tilted_one_is_not():
-    assert squared(Axis((0.0, 20.1), (500.0, 20.3))) == Axis((0, 20), (500, 20))
+    assert snap_to_grid(Axis((0.0, 20.1), (500.0, 20.3))) == Axis((0, 20), (500, 20))
     tilted = Axis((0.0, 20.0), (500.0, 23.0))
-    assert squared(tilted) is tilted
+    assert snap_to_grid(tilted) is tilted
 
 
 def test_flicker_is_taken_out_by_the_bands():

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.order_kernels import fan_gains, passing_times
-from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
+from vinetrack.video.order_kernels import monotone_path_sums, passing_times
+from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 LEAST_FRONT_SHARE = 0.45
 """Least share of all change that one front explains where nothing else of weight moves. Chosen: a swinging door takes a
@@ -164,7 +164,7 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
 def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
     """Share of the change along an axis that is one front passing once.
 
-    Only pixels whose change lasts count (`SmallPictures.grown`); where hardly any of it lasts (LEAST_GROWN), all that
+    Only pixels whose change lasts count (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that
     change count.
 
     Parameters
@@ -189,7 +189,7 @@ def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
     n_times = small.changed[-1]
     if len(near[0]) < 12:
         raise RecordingError("nothing moves along the axis")
-    if len(near_lasting[0]) >= max(12, LEAST_GROWN * len(near[0])):
+    if len(near_lasting[0]) >= max(12, MIN_GROWN_PART * len(near[0])):
         near = near_lasting
     on_front, _, _ = pixels_on_front(*near, n_times, angle, np.array(scaled.from_px), band)
     return float(near[3][on_front].sum() / near[3].sum())
@@ -312,7 +312,7 @@ def _line_near(
         relative = np.column_stack([x, y]) - middle
         along, across = relative @ unit + length / 2, (relative @ side + half_width) / band
         inside = (across >= 0) & (across < bins) & (along >= 0) & (along < length)
-        gains = fan_gains(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
+        gains = monotone_path_sums(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
         offset = (np.arange(gains.size) + 1) * band - half_width
         value = gains * (1 - 0.5 * np.clip(offset / half_width, -1, 1) ** 2)
         i = int(np.argmax(value))
@@ -336,7 +336,7 @@ def _best_line(
     for angle in np.radians(np.arange(0, 360, 6.0)):
         along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
         across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
-        gains = fan_gains(
+        gains = monotone_path_sums(
             along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times
         )
         i = int(np.argmax(gains))

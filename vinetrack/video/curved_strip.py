@@ -20,7 +20,7 @@ from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_problem
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.still_ground import picture_shake
-from vinetrack.video.strip import BAND_PX, GAP_PX, Strip, cut_strip
+from vinetrack.video.strip import BAND_GAP_PX, BAND_HEIGHT_PX, Strip, cut_strip
 
 if TYPE_CHECKING:
     from vinetrack.video.edge import Outline
@@ -272,7 +272,7 @@ def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
 def _rows_on_side(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
     """Rows on one side: those wanted, and as many more as stay in the picture along the whole curve, uncrossed."""
     wanted = int(np.ceil(half_px))
-    most = min(wanted + GAP_PX + BAND_PX[1], int(axis.largest_half_px))
+    most = min(wanted + BAND_GAP_PX + BAND_HEIGHT_PX[1], int(axis.largest_half_px))
     along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)
     for reach in range(most, wanted, -1):
         place = axis.points(along, side * float(reach))

@@ -1,7 +1,7 @@
-"""Frames out of a container, packet by packet, and which of them are damaged.
+"""Decoding of video containers, packet by packet, and detection of damaged frames.
 
-A fault in a file seldom stops a decoder: it fills in what it guesses, and the frames that follow are coded as
-differences to that guess. Only what it says on the way tells which frames those are.
+A fault in a file seldom stops a decoder: it conceals the fault with an estimate, and the frames that follow are coded
+as differences from that estimate. Only the messages of the decoder tell which frames these are.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     import av
 
-UNMARKED = frozenset(
+NON_MARKING_DECODERS = frozenset(
     {"ffv1", "mjpeg", "prores", "huffyuv", "ffvhuff", "utvideo", "dnxhd", "png", "jpeg2000"}
     | {"hevc", "vp8", "vp9", "libdav1d", "av1"}
 )
-"""Decoders of FFmpeg that at best complain of a damaged frame and do not mark it, since they do not conceal errors.
-Those that mark frames (H.264, MPEG-4) complain of harmless things too."""
+"""FFmpeg decoders that report damaged frames in their log at best, but do not mark them, since they do not conceal
+errors. Decoders that do mark frames (H.264, MPEG-4) also report harmless faults."""
 
 PREDICTED_BOTH_WAYS = 3
 """Code of a B frame. Defined by FFmpeg (AV_PICTURE_TYPE_B)."""
 
 MEMORY_PART = 0.4
-"""Part of the machine's memory that the pictures of one recording may take. Derived: strips of them take as much again
-at most, and a fifth is for everything else."""
+"""Fraction of the machine's memory that the pictures of one recording may take. Derived: strips cut from them take as
+much again at most, and a fifth is left for everything else."""
 
-FEW = 256
-"""Frames for which there is place where a film does not declare how many it has; a half more whenever that is full.
-Chosen; at half or twice one is copied once more or less."""
+INITIAL_FRAMES = 256
+"""Frames for which memory is reserved if a film does not declare their number; the buffer grows by half when full.
+Chosen; at half or twice the frames are copied once more or once less."""
 
 HALF_TICK = 0.5
-"""Of a film's unit of time: times are whole numbers of it. Derived."""
+"""Half a tick of a film's time base; times are whole ticks. Derived."""
 
 
 @dataclass
 class Decoded:
-    """Frames in the order in which they are shown: pictures, times (NaN where unknown), and how each was coded.
+    """Decoded frames in display order, with their times (NaN where unknown) and types.
 
-    `pictures` has shape (n_frames, height, width).
-    `corrupt` marks those that the decoder calls so, `key` those coded alone, `between` those coded from later frames
-    too; `complaints` are what the decoder said, and `decoder` is its name.
+    `pictures` has shape (n_frames, height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key
+    frames, `between` B frames, which are coded from later frames too. `messages` are the decoder's messages,
+    `decoder` its name.
     """
 
     pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
@@ -58,7 +58,7 @@ class Decoded:
     corrupt: list[bool] = field(default_factory=list)
     key: list[bool] = field(default_factory=list)
     between: list[bool] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
     decoder: str = ""
 
 
@@ -70,22 +70,22 @@ def decode_container(
     expected: int | None = None,
     between_s: tuple[float, float] | None = None,
 ) -> Decoded:
-    """Decode every frame; a packet that cannot be decoded costs its own frame, not all that follow.
+    """Decode every frame; a packet that cannot be decoded costs only its own frame.
 
-    Pictures go straight into one array, so that they are held once.
+    Pictures are written straight into one array, so that they are held in memory once.
 
     Parameters
     ----------
-    path : of a film.
-    shape : height and width that every frame must have, px; decoding ends at the first that has another.
-    picture_of : what is kept of a frame.
-    threads : of the decoder.
-    expected : frames that the file declares; None where it does not.
-    between_s : times of the first and last frame that are wanted, s; all where None.
+    path : path of a film.
+    shape : required height and width of the frames, px; decoding ends at the first frame of another size.
+    picture_of : returns the picture to keep of a frame.
+    threads : number of decoder threads.
+    expected : number of frames that the file declares; None if it does not.
+    between_s : times of the first and last frame to decode, s; None for all.
 
     Returns
     -------
-    frames and complaints.
+    frames and messages.
 
     Raises
     ------
@@ -94,11 +94,11 @@ def decode_container(
     """
     import av
 
-    decoded, room = Decoded(), memory_for_pictures()
-    held: NDArray[Any] | None = None
-    with quiet_log() as complaints:
+    decoded, available_bytes = Decoded(), memory_for_pictures()
+    buffer: NDArray[Any] | None = None
+    with quiet_log() as messages:
         try:
-            with opened(path) as container:
+            with open_film(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 stream.codec_context.thread_count = threads
@@ -106,40 +106,40 @@ def decode_container(
                 base = float(stream.time_base) if stream.time_base else 1.0
                 if between_s is not None:
                     container.seek(max(int(between_s[0] / base), 0), stream=stream)
-                for frame in _frames_of(container.demux(stream), complaints):
+                for frame in _frames_of(container.demux(stream), messages):
                     if between_s is not None and frame.pts is not None:
                         if frame.pts * base < between_s[0] - HALF_TICK * base:
                             continue
                         if frame.pts * base > between_s[1] + HALF_TICK * base:
                             break
                     if (frame.height, frame.width) != shape:
-                        complaints.append("the size of the picture changes")
+                        messages.append("the size of the picture changes")
                         break
                     picture = picture_of(frame)
                     n = len(decoded.times_s)
-                    if (n + 1) * picture.nbytes > room:
+                    if (n + 1) * picture.nbytes > available_bytes:
                         raise MemoryError
-                    if held is None or n == len(held):
-                        held = _longer(held, picture, expected, room)
-                    held[n] = picture
-                    _keep(decoded, frame, base)
+                    if buffer is None or n == len(buffer):
+                        buffer = _enlarged(buffer, picture, expected, available_bytes)
+                    buffer[n] = picture
+                    _record_frame(decoded, frame, base)
         except av.error.FFmpegError as error:
-            complaints.append(str(error.strerror or error))
-    decoded.complaints = list(complaints)
-    if held is not None:
-        decoded.pictures = held[: len(decoded.times_s)]
-    if decoded.complaints and decoded.times_s and decoded.decoder in UNMARKED:
-        marked = _times_complained_of(path)
+            messages.append(str(error.strerror or error))
+    decoded.messages = list(messages)
+    if buffer is not None:
+        decoded.pictures = buffer[: len(decoded.times_s)]
+    if decoded.messages and decoded.times_s and decoded.decoder in NON_MARKING_DECODERS:
+        marked = _times_of_faulty_packets(path)
         decoded.corrupt = [time_s in marked for time_s in decoded.times_s]
     return decoded
 
 
 def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
-    """Frames that are corrupt or made from corrupt ones, shape (n_frames,).
+    """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,).
 
-    A decoder calls only the frame corrupt in which it met the fault. Those that follow are coded as differences to it
-    and are as wrong, without a word, up to the next frame that is coded alone; so are those that follow a frame which
-    the decoder gave up, and those that are shown before a corrupt frame but coded from it.
+    A decoder marks only the frame in which it met the fault. The frames after it are coded as differences from it and
+    are equally wrong, without a message, until the next key frame. So are frames that follow one the decoder gave up,
+    and B frames displayed before a corrupt frame but coded from it.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
     mask, shape (n_frames,).
     """
     damaged = np.array(decoded.corrupt, dtype=bool)
-    if decoded.complaints:
+    if decoded.messages:
         damaged[1:] |= (np.diff(slot) > 1) & ~np.array(decoded.key[1:], dtype=bool)
     for i in range(1, len(damaged)):
         damaged[i] |= damaged[i - 1] and not decoded.key[i]
@@ -160,21 +160,23 @@ def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
     return damaged
 
 
-def _longer(held: NDArray[Any] | None, picture: NDArray[Any], expected: int | None, room: float) -> NDArray[Any]:
-    """Place for more pictures; memory that nothing is written to takes none."""
-    if held is None:
-        count = expected if expected and expected * picture.nbytes <= room else FEW
+def _enlarged(
+    buffer: NDArray[Any] | None, picture: NDArray[Any], expected: int | None, available_bytes: float
+) -> NDArray[Any]:
+    """Return a larger buffer with the same frames; untouched memory takes no space."""
+    if buffer is None:
+        count = expected if expected and expected * picture.nbytes <= available_bytes else INITIAL_FRAMES
         return np.empty((count, *picture.shape), picture.dtype)
-    longer = np.empty((len(held) + len(held) // 2 + 1, *held.shape[1:]), held.dtype)
-    longer[: len(held)] = held
-    return longer
+    enlarged = np.empty((len(buffer) + len(buffer) // 2 + 1, *buffer.shape[1:]), buffer.dtype)
+    enlarged[: len(buffer)] = buffer
+    return enlarged
 
 
 @dataclass(frozen=True)
 class PacketIndex:
-    """Every frame of a film in the order in which it is shown: `pts` in units of `base_s`, and whether it is a key one.
+    """All frames of a film in display order, shapes (n_frames,).
 
-    `size_bytes` is that of its packet. Shapes (n_frames,).
+    `pts` is the presentation time in units of `base_s`, `key` marks key frames, `size_bytes` is the size of the packet.
     """
 
     pts: NDArray[np.int64]
@@ -193,11 +195,11 @@ def packet_index(path: Path) -> PacketIndex | None:
 
     Parameters
     ----------
-    path : of a film.
+    path : path of a film.
 
     Returns
     -------
-    index : None where packets bear no times, or the same ones.
+    index; None if packets have no times or repeated ones.
     """
     import av
 
@@ -221,37 +223,37 @@ def packet_index(path: Path) -> PacketIndex | None:
 
 
 def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:
-    """Decode packets of a film, by themselves.
+    """Decode selected packets of a film.
 
     Parameters
     ----------
-    path : of a film.
-    chosen : presentation times of those to be decoded, which must be key frames; None for all.
-    threads : of the decoder.
+    path : path of a film.
+    chosen : presentation times of the packets to decode, which must be key frames; None for all.
+    threads : number of decoder threads.
 
     Yields
     ------
     frames, those that cannot be decoded left out.
     """
-    with quiet_log() as complaints, opened(path) as container:
+    with quiet_log() as messages, open_film(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         packets = container.demux(stream)
         wanted = (packet for packet in packets if chosen is None or not packet.size or packet.pts in chosen)
-        yield from _frames_of(wanted, complaints)
+        yield from _frames_of(wanted, messages)
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[av.container.InputContainer]:
-    """Open a film to decode it; its decoder comes to rest before it is closed.
+def open_film(path: Path) -> Iterator[av.container.InputContainer]:
+    """Open a film for decoding; its decoder is flushed before it is closed.
 
-    A decoder that is freed waits for its threads, and Python with it. A thread that has just met a fault waits for
-    Python to take its complaint, and both wait for ever; a flush waits as well, but lets Python go on.
+    Freeing a decoder waits for its threads while holding Python's lock. A thread that has just met a fault waits for
+    that lock to log its message, and both wait for ever. A flush waits as well, but releases the lock.
 
     Parameters
     ----------
-    path : of a film.
+    path : path of a film.
 
     Yields
     ------
@@ -268,15 +270,15 @@ def opened(path: Path) -> Iterator[av.container.InputContainer]:
                     stream.codec_context.flush_buffers()
 
 
-def _keep(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
+def _record_frame(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
     decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base_s)
     decoded.corrupt.append(bool(frame.is_corrupt))
     decoded.key.append(bool(frame.key_frame))
     decoded.between.append(frame.pict_type == PREDICTED_BOTH_WAYS)
 
 
-def _frames_of(packets: Iterator[av.Packet[Any]], complaints: list[str]) -> Iterator[av.VideoFrame]:
-    """Frames of a container's packets; packets that cannot be decoded are left out and complained of."""
+def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterator[av.VideoFrame]:
+    """Yield the frames of packets; packets that cannot be decoded are skipped and their errors recorded."""
     import av
 
     for packet in packets:
@@ -285,19 +287,19 @@ def _frames_of(packets: Iterator[av.Packet[Any]], complaints: list[str]) -> Iter
         except av.error.EOFError:
             return
         except av.error.FFmpegError as error:
-            complaints.append(str(error.strerror or error))
+            messages.append(str(error.strerror or error))
 
 
-def _times_complained_of(path: Path) -> set[float]:
-    """Times of the packets that a decoder complained of.
+def _times_of_faulty_packets(path: Path) -> set[float]:
+    """Return the times of the packets about which the decoder logs an error.
 
-    Decoded once more, by one thread, so that it is known which packet a complaint is about.
+    The film is decoded once more, with one thread, so that each message can be assigned to its packet.
     """
     import av
     import av.logging
 
     marked: set[float] = set()
-    with quiet_log(), opened(path) as container, contextlib.suppress(av.error.FFmpegError):
+    with quiet_log(), open_film(path) as container, contextlib.suppress(av.error.FFmpegError):
         stream = container.streams.video[0]
         stream.codec_context.thread_count = 1
         base = float(stream.time_base) if stream.time_base else 1.0
@@ -310,7 +312,7 @@ def _times_complained_of(path: Path) -> set[float]:
 
 
 def memory_for_pictures() -> float:
-    """Bytes that decoded pictures may take; infinity where the machine does not say how much it has."""
+    """Bytes that decoded pictures may take; infinity if the machine's memory is unknown."""
     try:
         return MEMORY_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -318,7 +320,7 @@ def memory_for_pictures() -> float:
 
 
 class quiet_log:  # noqa: N801 - used as a context, like a function
-    """Collect the decoder's complaints instead of printing or losing them; the log level is put back."""
+    """Collect the decoder's messages instead of printing or losing them; the log level is restored afterwards."""
 
     def __enter__(self) -> list[str]:
         import av.logging
@@ -327,12 +329,12 @@ class quiet_log:  # noqa: N801 - used as a context, like a function
         av.logging.set_level(av.logging.ERROR)
         self._capture = av.logging.Capture(False)
         self._logs = self._capture.__enter__()
-        self._complaints: list[str] = []
-        return self._complaints
+        self._messages: list[str] = []
+        return self._messages
 
     def __exit__(self, *exc: object) -> None:
         import av.logging
 
         self._capture.__exit__(None, None, None)
-        self._complaints.extend(message.strip() for _, _, message in self._logs)
+        self._messages.extend(message.strip() for _, _, message in self._logs)
         av.logging.set_level(self._level)

@@ -1,9 +1,9 @@
-"""Frames out of any recording: brightness as the camera wrote it, and everything that is wrong with the file.
+"""Reading frames of any recording: brightness as the camera wrote it, and everything that is wrong with the file.
 
-The Y plane is copied straight from the decoder's buffer: converting to grey or colour first costs up to half the
-decoding speed. A recording's clock is never read from its container, which knows the playback rate only; DNG frames
-carry the true rate (tag 51044) and the exposure (33434), and so do the files of some high-speed cameras
-(`camera_headers`); other image files carry neither.
+The Y plane is copied straight from the decoder's buffer, since a conversion to grey or colour would cost up to half the
+decoding speed. The capture rate is never taken from the container, which only knows the playback rate. DNG frames carry
+the true rate (tag 51044) and the exposure (33434), and so do the files of some high-speed cameras (`camera_headers`);
+other image files carry neither.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from vinetrack.core.files import file_size
 from vinetrack.video.decoding import (
     HALF_TICK,
-    UNMARKED,
+    NON_MARKING_DECODERS,
     Decoded,
     PacketIndex,
     damaged_frames,
     decode_container,
-    opened,
+    open_film,
     quiet_log,
 )
 from vinetrack.video.frame_faults import torn_frames
@@ -36,27 +36,28 @@ if TYPE_CHECKING:
 
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
-MAKERS_OWN = {
+UNSUPPORTED_FORMATS = {
     ".raw": "raw pixels without a header, as a Chronos writes them; nothing says their size, depth and rate",
     ".r3d": "a recording in RED's own format",
     ".braw": "a recording in Blackmagic's own format",
     ".seq": "a sequence of StreamPix",
 }
-"""Formats that are not read, and what they are: no maker's description was at hand to check a reader against."""
+"""Formats that are not read, and what they are: no vendor documentation was available to check a reader against."""
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
-"""Formats under which FFmpeg takes any text for a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
+"""Formats under which FFmpeg renders any text as a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
 
 DECODER_THREADS = 2
-"""Chosen: as many recordings are tracked at once as there are cores; more threads gain nothing then."""
+"""Decoder threads per recording. Chosen: as many recordings are tracked in parallel as there are cores, so that more
+threads gain nothing."""
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be used, said in one sentence."""
+    """A recording that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Rectangle of a picture in whole pixels: columns `left` to `right`, rows `top` to `bottom`, ends left out."""
+    """Rectangle of a picture in whole pixels: columns `left` to `right`, rows `top` to `bottom`, ends excluded."""
 
     left: int
     top: int
@@ -70,18 +71,18 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Index of the rectangle in a (height, width) picture."""
+        """Index of the rectangle in a picture of shape (height, width)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a recording says about itself, before its frames are decoded.
+    """Properties of a recording, known before its frames are decoded.
 
-    `kind` is `container`, `folder`, `stack` or `raw`. `declared_frames` is the file's own count (None where it gives
-    none); `capture_fps` and `exposure_s` are those that DNG frames and the files of high-speed cameras state, None
-    elsewhere; `raw` says where the frames of such a file lie; `playback_fps` is the rate at which a film plays, None
-    for pictures; `notes` are sentences for a person.
+    `kind` is `container`, `folder`, `stack` or `raw`. `declared_frames` is the frame count that the file states (None
+    if it states none). `capture_fps` and `exposure_s` are stated by DNG frames and files of high-speed cameras,
+    otherwise None; `raw` locates the frames in such a camera file. `playback_fps` is the playback rate of a film, None
+    for images; `notes` are messages for the user.
     """
 
     path: Path
@@ -108,11 +109,11 @@ class Recording:
 class Frames:
     """Decoded frames of one region.
 
-    `luma` has shape (n_frames, height, width), uint8 or uint16; `slot` shape (n_frames,) counts capture periods from
-    the first frame, as the timestamps (or the numbers of image files) tell: 0, 1, 2 … where none is missing.
-    `damaged` marks frames the decoder calls corrupt, and those decoded from them: all up to the next key frame. `notes`
-    are sentences for a person. Of a long recording only the frames about its event are decoded; `slots_before` and
-    `slots_after`, shape (n,), are the capture periods of those before and after.
+    `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape (n_frames,), is the number of capture
+    periods since the first frame, from timestamps or from the numbers of image files: 0, 1, 2 … if no frame is missing.
+    `damaged` marks frames that the decoder calls corrupt, and those coded from them, up to the next key frame. `notes`
+    are messages for the user. Of a long recording only the frames around its event are decoded; `slots_before` and
+    `slots_after`, shape (n,), are the capture periods of the frames before and after.
     """
 
     recording: Recording
@@ -129,21 +130,21 @@ class Frames:
 
     @property
     def first(self) -> int:
-        """Number of the first of them in the recording, counted from 0."""
+        """Index of the first decoded frame in the recording, from 0."""
         return len(self.slots_before)
 
     @property
     def n_recorded(self) -> int:
-        """Frames of the recording, decoded or not."""
+        """Number of frames of the recording, decoded or not."""
         return len(self.slots_before) + len(self.luma) + len(self.slots_after)
 
 
 def inspect_recording(path: Path | str) -> Recording:
-    """Open a recording and read its header, without decoding more than one frame.
+    """Read the header of a recording; at most one frame is decoded.
 
     Parameters
     ----------
-    path : a film, a picture stack, or a folder of pictures.
+    path : a film, an image stack, or a folder of images.
 
     Returns
     -------
@@ -152,7 +153,7 @@ def inspect_recording(path: Path | str) -> Recording:
     Raises
     ------
     RecordingError
-        In one sentence, where there is nothing usable.
+        If the recording cannot be used.
     """
     path = Path(path)
     try:
@@ -180,23 +181,23 @@ def read_frames(
     threads: int = DECODER_THREADS,
     part: tuple[int, int, PacketIndex] | None = None,
 ) -> Frames:
-    """Decode every frame of a recording, or the `region` of it.
+    """Decode all frames of a recording, or a `region` of them.
 
     Parameters
     ----------
-    path : of the recording, or what `inspect_recording` returned.
-    region : part of the picture; the whole where None.
-    threads : of the decoder.
-    part : first and last frame of a film that are decoded, with the list of all; None for every frame.
+    path : path of the recording, or the result of `inspect_recording`.
+    region : part of the picture; None for the whole.
+    threads : number of decoder threads.
+    part : first and last frame of a film to decode, with its index of packets; None for every frame.
 
     Returns
     -------
-    every frame with its capture period; partly damaged recordings say so in `notes`.
+    the frames with their capture periods; `notes` tell of damage.
 
     Raises
     ------
     RecordingError
-        In one sentence, where not one frame can be decoded.
+        If not one frame can be decoded.
     """
     recording = path if isinstance(path, Recording) else inspect_recording(path)
     region = region or recording.whole
@@ -223,7 +224,7 @@ def read_frames(
 
 
 def too_large(recording: Recording) -> RecordingError:
-    """What is said of a recording that does not fit in memory.
+    """Make the error for a recording that does not fit in memory.
 
     Parameters
     ----------
@@ -240,12 +241,12 @@ def too_large(recording: Recording) -> RecordingError:
 
 
 def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
-    """Yield the region of one frame after another; each is a copy of its own. Stops where decoding does.
+    """Yield the region of one frame after another, as copies; stop where decoding fails.
 
     Parameters
     ----------
     recording : from `inspect_recording`.
-    region : part of the picture; the whole where None.
+    region : part of the picture; None for the whole.
 
     Yields
     ------
@@ -263,7 +264,7 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
         return
     import av
 
-    with opened(recording.path) as container:
+    with open_film(recording.path) as container:
         try:
             for frame in container.decode(video=0):
                 yield luma_plane(frame, region)
@@ -272,13 +273,13 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
 
 
 def luma_plane(frame: av.VideoFrame, region: Region, copy: bool = True) -> NDArray[Any]:
-    """Brightness of one decoded frame.
+    """Return the brightness of a decoded frame.
 
     Parameters
     ----------
-    frame : as the decoder gives it.
+    frame : frame from the decoder.
     region : part of the picture.
-    copy : False where the picture is copied at once, before the decoder goes on.
+    copy : False if the caller copies the picture before the decoder goes on.
 
     Returns
     -------
@@ -302,7 +303,7 @@ def _inspect_container(path: Path) -> Recording:
     import av
 
     try:
-        with quiet_log() as complaints, opened(path) as container:
+        with quiet_log() as messages, open_film(path) as container:
             if container.format.name in TEXT_FORMATS:
                 raise RecordingError(f"{path.name}: a text, not a recording; name a film, or a folder of pictures")
             if not container.streams.video:
@@ -316,12 +317,12 @@ def _inspect_container(path: Path) -> Recording:
             playback = float(stream.average_rate) if stream.average_rate else None
             return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
-        # PyAV takes names in a damaged header for UTF-8.
-        raise RecordingError(_why_unreadable(path, complaints, str(error))) from error
+        # PyAV decodes names in a header as UTF-8, which fails for a damaged one.
+        raise RecordingError(_why_unreadable(path, messages, str(error))) from error
 
 
 def _declared_frames(stream: Any, container: Any) -> int | None:
-    """The header's count of frames; where there is none, duration times playback rate."""
+    """Frame count of the header; if absent, duration times playback rate."""
     if stream.frames > 0:
         return int(stream.frames)
     seconds = None
@@ -334,12 +335,12 @@ def _declared_frames(stream: Any, container: Any) -> int | None:
     return max(round(seconds * float(stream.average_rate)), 0) or None
 
 
-def _why_unreadable(path: Path, complaints: list[str], error: str) -> str:
-    text = " ".join([*complaints, error])
+def _why_unreadable(path: Path, messages: list[str], error: str) -> str:
+    text = " ".join([*messages, error])
     if "moov atom not found" in text and _looks_like_mp4(path):
         return f"{path.name}: cut short: the index that is written last is missing; copy the file again, or repair it"
-    if path.suffix.lower() in MAKERS_OWN:
-        return f"{path.name}: {MAKERS_OWN[path.suffix.lower()]}; save it from the camera as DNG, TIFF or mp4"
+    if path.suffix.lower() in UNSUPPORTED_FORMATS:
+        return f"{path.name}: {UNSUPPORTED_FORMATS[path.suffix.lower()]}; save it from the camera as DNG, TIFF or mp4"
     if path.suffix.lower() not in CONTAINERS:
         return f"{path.name}: not a video that can be read; bring mp4, mov, avi, mkv, or a folder of images"
     return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
@@ -375,14 +376,14 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
             f"{name}: of {there} frames {number[0]} to {number[-1]} are decoded, about what moves; name others in "
             "frames_used"
         )
-    if decoded.decoder in UNMARKED:
+    if decoded.decoder in NON_MARKING_DECODERS:
         decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()
     damaged = damaged_frames(decoded, slot)
-    if decoded.complaints or damaged.any():
-        complaint = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
+    if decoded.messages or damaged.any():
+        first_message = f"; the first: {decoded.messages[0].strip()}" if decoded.messages else ""
         notes.append(
-            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or made from corrupt ones"
-            f" ({len(decoded.complaints)} complaints of the decoder{complaint})"
+            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or coded from corrupt ones"
+            f" ({len(decoded.messages)} messages of the decoder{first_message})"
         )
     if irregular:
         notes.append(f"{name}: {irregular}")
@@ -390,19 +391,19 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
 
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
-    """Capture period of every frame from its timestamp, and what is irregular about them ("" where nothing is).
+    """Return the capture period of every frame from its timestamp, and a note on irregularities ("" if there are none).
 
-    Timestamps are rounded to whole periods of their median spacing: a missing frame leaves a gap of one. Timestamps
-    that repeat, run backwards, or fit no common period say nothing, and the plain index is used.
+    Timestamps are rounded to whole multiples of their median spacing, so that a missing frame leaves a gap. Timestamps
+    that repeat, run backwards or fit no common period are not used; frames are then numbered consecutively.
 
     Parameters
     ----------
     times : timestamps, shape (n_frames,), any unit.
-    known_missing : frames that the file declares and that could not be decoded.
+    known_missing : number of frames that the file declares but that could not be decoded.
 
     Returns
     -------
-    capture periods since the first frame, shape (n_frames,), and a sentence.
+    capture periods since the first frame, shape (n_frames,), and the note.
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):
@@ -411,14 +412,14 @@ def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tupl
     period = float(np.median(steps))
     if period <= 0 or np.any(steps <= 0):
         return plain, "timestamps repeat or run backwards; frames are timed by their index"
-    # Times in whole milliseconds have steps of 16 and 17 of them: over a long gap only their mean counts right.
+    # Times in whole milliseconds alternate between, say, steps of 16 and 17: over a long gap only their mean is right.
     period = float(np.mean(steps[steps < 1.5 * period]))
     periods = steps / period
     if np.any(np.abs(periods - np.rint(periods)) > 0.25) or np.any(np.rint(periods) < 1):
         return plain, "the container's frame rate varies; frames are timed by their index"
     slot = np.concatenate([[0], np.cumsum(np.rint(periods).astype(int))])
     missing = int(slot[-1] - plain[-1])
-    # A recorder drops single frames; where a tenth of all is missing the container counts in other units.
+    # Cameras drop single frames; if a tenth of all frames seems missing, the container counts in other units.
     if missing == 0 or missing > max(3, len(times) // 10, known_missing):
         return plain, "" if missing == 0 else "its timestamps are irregular; frames are timed by their index"
-    return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"
+    return slot, f"{missing} frames are missing according to the timestamps; the others keep their own times"

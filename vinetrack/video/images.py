@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vinetrack.core.files import NOT_A_FILE, is_pipe_or_device
 from vinetrack.video.camera_headers import side_file_of
 from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
-from vinetrack.video.raw_frames import levelled, unpacked
+from vinetrack.video.raw_frames import mosaic_brightness, unpack_pixels
 
 TAG_EXPOSURE = 33434
 """Defined by TIFF/EP (ISO 12234-2): exposure time."""
@@ -270,7 +270,7 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
     if raw.ndim == 3:
         raw = np.rint(raw[..., :3].astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)).astype(raw.dtype)
     if mosaic:
-        raw = levelled(raw)
+        raw = mosaic_brightness(raw)
     return raw.astype(np.uint16)
 
 
@@ -285,4 +285,4 @@ def _unpack_12_bit(file: Path, page: Any) -> NDArray[np.uint16]:
     row = (width * 12 + 7) // 8
     data = np.frombuffer(b"".join(parts), np.uint8)[: height * row].reshape(height, row)
     padded = np.pad(data, ((0, 0), (0, -row % 3)))
-    return unpacked(padded.ravel(), 12).reshape(height, -1)[:, :width]
+    return unpack_pixels(padded.ravel(), 12).reshape(height, -1)[:, :width]

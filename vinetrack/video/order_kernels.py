@@ -1,6 +1,6 @@
-"""Compiled medians by a histogram instead of by sorting, largest changes, and paths through pixels changing in order.
+"""Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change in order.
 
-Medians are exact, of many values whose range is known.
+Medians are exact; the range of the values must be known.
 """
 
 from __future__ import annotations
@@ -9,35 +9,35 @@ import numpy as np
 from numba import njit
 
 LEVELS = 256
-"""Range of the values whose histogram is taken. Derived: brightness and its differences are in grey levels of 255."""
-BINS_A_LEVEL = 16
-"""Bins of a histogram by grey level, in one or two of which the median is looked for. Chosen: a bin then holds some
-hundred of 9000 values; only time depends on it."""
-FEW_TO_SORT = 300
-"""Values that are put in order at once. Chosen for time alone: a bin holds some hundred, thousands where a coder has
-frozen the picture."""
+"""Range of the values of the histogram. Derived: brightness and its differences are in grey levels of 255."""
+BINS_PER_LEVEL = 16
+"""Histogram bins per grey level; the median is then sought within one or two bins. Chosen: a bin holds some hundred of
+9000 values; only computing time depends on it."""
+MAX_SORTED = 300
+"""Number of values up to which they are sorted directly. Chosen for speed alone: a bin holds some hundred, or thousands
+where the video coder has frozen the picture."""
 
 
 @njit(cache=True, nogil=True)
-def median(values: np.ndarray, keep: np.ndarray, fine: float) -> float:
-    """Median of the values that are kept; the mean of the two middle ones of an even number.
+def median(values: np.ndarray, keep: np.ndarray, bins_per_unit: float) -> float:
+    """Median of the values with `keep` > 0; the mean of the two middle ones for an even number.
 
     Parameters
     ----------
-    values : from 0 on, shape (n,).
-    keep : 1 for those that count, else 0, shape (n,).
-    fine : bins a unit.
+    values : non-negative, shape (n,).
+    keep : 1 for values that count, else 0, shape (n,).
+    bins_per_unit : histogram bins per unit of the values.
 
     Returns
     -------
-    the median; 0 of no values.
+    the median; 0 if no value counts.
     """
-    last = LEVELS * BINS_A_LEVEL - 1
+    last = LEVELS * BINS_PER_LEVEL - 1
     place = np.empty(len(values), np.int32)
     bins = np.zeros(last + 1, np.int32)
     count = 0
     for k in range(len(values)):
-        place[k] = min(int(values[k] * fine), last) if keep[k] > 0 else -1
+        place[k] = min(int(values[k] * bins_per_unit), last) if keep[k] > 0 else -1
     for k in range(len(values)):
         if place[k] >= 0:
             bins[place[k]] += 1
@@ -53,23 +53,23 @@ def median(values: np.ndarray, keep: np.ndarray, fine: float) -> float:
     while below + within <= upper:
         second += 1
         within += bins[second]
-    middle = np.empty(within, values.dtype)
+    candidates = np.empty(within, values.dtype)
     j = 0
     for k in range(len(values)):
         if first <= place[k] <= second:
-            middle[j] = values[k]
+            candidates[j] = values[k]
             j += 1
-    return 0.5 * (_ranked(middle, lower - below) + _ranked(middle, upper - below))
+    return 0.5 * (_order_statistic(candidates, lower - below) + _order_statistic(candidates, upper - below))
 
 
 @njit(cache=True, nogil=True)
-def _ranked(values: np.ndarray, rank: int) -> float:
-    """The value of a rank, counted from 0; what lies in one bin of a histogram is divided again, until few are left."""
-    while len(values) > FEW_TO_SORT:
+def _order_statistic(values: np.ndarray, rank: int) -> float:
+    """Return the value of a rank, counted from 0, by repeated histograms until few values remain."""
+    while len(values) > MAX_SORTED:
         low, high = values.min(), values.max()
         if low == high:
             return float(low)
-        last = LEVELS * BINS_A_LEVEL - 1
+        last = LEVELS * BINS_PER_LEVEL - 1
         place = np.minimum((values - low) * (last / (high - low)), last).astype(np.int64)
         bins = np.bincount(place, minlength=last + 1)
         below, chosen = 0, 0
@@ -84,12 +84,12 @@ def _ranked(values: np.ndarray, rank: int) -> float:
 
 @njit(cache=True, nogil=True)
 def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Median ratio of each picture, one level brighter, to a reference.
+    """Median ratio of each picture, plus one grey level, to a reference.
 
     Parameters
     ----------
     pictures : shape (n, height, width).
-    reference : shape (height, width), above 0.
+    reference : positive, shape (height, width).
 
     Returns
     -------
@@ -101,19 +101,19 @@ def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
         for y in range(height):
             for x in range(width):
                 ratio[y * width + x] = (pictures[t, y, x] + np.float32(1.0)) / reference[y, x]
-        # A flicker is by tenths: bins of 1/1024.
-        out[t] = median(ratio, keep, 64.0 * BINS_A_LEVEL)
+        # Ratios need a finer histogram than grey levels: bins of 1/1024.
+        out[t] = median(ratio, keep, 64.0 * BINS_PER_LEVEL)
     return out
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
 def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
-    """Mean of the largest absolute changes of single pixels from each picture to the next.
+    """Mean of the `count` largest absolute changes of single pixels from each picture to the next.
 
     Parameters
     ----------
     pictures : brightness, 0 to 255, shape (n, n_pixels).
-    count : number of pixels of which the mean is taken.
+    count : number of pixels averaged.
 
     Returns
     -------
@@ -122,62 +122,62 @@ def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
     n, pixels = pictures.shape
     count = min(count, pixels)
     out, change = np.zeros(n - 1, np.float32), np.empty(pixels, np.float32)
-    bins, totals = np.zeros(LEVELS * BINS_A_LEVEL, np.int64), np.zeros(LEVELS * BINS_A_LEVEL)
+    bins, totals = np.zeros(LEVELS * BINS_PER_LEVEL, np.int64), np.zeros(LEVELS * BINS_PER_LEVEL)
     limit = np.float32(0.0)
     for t in range(n - 1):
         before, after = pictures[t], pictures[t + 1]
         for k in range(pixels):
             change[k] = abs(after[k] - before[k])
-        # Most pixels change less than those that count: only changes near the last picture's smallest are sorted.
+        # Most pixels change too little to count: only changes near the limit of the previous picture are binned.
         while True:
             bins[:], totals[:] = 0, 0.0
             counted = 0
             for start in range(0, pixels, 16):
-                block = change[start : start + 16]
+                chunk = change[start : start + 16]
                 largest = np.float32(0.0)
-                for value in block:
+                for value in chunk:
                     largest = max(largest, value)
                 if largest < limit:
                     continue
-                for value in block:
+                for value in chunk:
                     if value >= limit:
-                        place = min(int(value * BINS_A_LEVEL), LEVELS * BINS_A_LEVEL - 1)
+                        place = min(int(value * BINS_PER_LEVEL), LEVELS * BINS_PER_LEVEL - 1)
                         bins[place] += 1
                         totals[place] += value
                         counted += 1
             if counted >= count:
                 break
             limit = np.float32(0.0)
-        total, taken, place = 0.0, 0, LEVELS * BINS_A_LEVEL - 1
+        total, taken, place = 0.0, 0, LEVELS * BINS_PER_LEVEL - 1
         while taken + bins[place] < count:
             taken += bins[place]
             total += totals[place]
             place -= 1
         total += (count - taken) * totals[place] / max(bins[place], 1)
         out[t] = total / count
-        limit = np.float32(0.7 * place / BINS_A_LEVEL)
+        limit = np.float32(0.7 * place / BINS_PER_LEVEL)
     return out
 
 
 @njit(cache=True, nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """When the means of the pictures before and after differ most at each pixel, and the power of that difference.
+    """Find the frame at which the mean brightness of each pixel changes most, and the power of that change.
 
     Parameters
     ----------
     pictures : shape (n, n_pixels).
-    window : pictures before and after of which means are taken.
+    window : number of pictures averaged before and after.
 
     Returns
     -------
-    number of the first picture after the step and the power, each of shape (n_pixels,).
+    index of the first picture after the step, and the power of the step, each of shape (n_pixels,).
     """
     n, pixels = pictures.shape
     best, when = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
-    at_once = 512
-    sums = np.zeros((n + 1, at_once), np.float32)
-    for start in range(0, pixels, at_once):
-        stop = min(start + at_once, pixels)
+    block = 512
+    sums = np.zeros((n + 1, block), np.float32)
+    for start in range(0, pixels, block):
+        stop = min(start + block, pixels)
         for t in range(n):
             for k in range(stop - start):
                 sums[t + 1, k] = sums[t, k] + pictures[t, start + k]
@@ -197,12 +197,12 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
 
 @njit(cache=True, nogil=True)
 def block_means(luma: np.ndarray, side: int) -> np.ndarray:
-    """Pictures shrunk by a whole factor: means of square blocks, rounded to whole grey levels as OpenCV does.
+    """Shrink pictures by a whole factor: means of square blocks, rounded to whole grey levels as in OpenCV.
 
     Parameters
     ----------
     luma : grey levels, shape (n, height, width), height and width multiples of `side`.
-    side : of a block, px.
+    side : side of a block, px.
 
     Returns
     -------
@@ -220,7 +220,7 @@ def block_means(luma: np.ndarray, side: int) -> np.ndarray:
                 for x in range(width):
                     total[x] += row[x]
             line = out[t, y]
-            if side == 4:  # the usual one: a number of neighbours that is known is added up many at a time
+            if side == 4:  # the usual case: with a constant number of terms the compiler vectorises the sum
                 for x in range(width // 4):
                     k = 4 * x
                     line[x] = np.rint((total[k] + total[k + 1] + total[k + 2] + total[k + 3]) * weight)
@@ -234,22 +234,22 @@ def block_means(luma: np.ndarray, side: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def fan_gains(
+def monotone_path_sums(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
 ) -> np.ndarray:
-    """Sum what monotone paths collect in each band of two bins across parallel lines.
+    """Return the maximum change that a monotone path collects, for each band of two bins across parallel lines.
 
     Parameters
     ----------
-    along, across : place of each changed pixel along the lines, px, and across in bins, shape (n_pixels,).
-    time, weight : when each changes, counted in pictures, and how much, shape (n_pixels,).
-    bins : bins across.
-    length : of the lines, px; places are 4 px apart.
-    n_times : pictures.
+    along, across : position of each changed pixel along the lines, px, and across them, bins; shape (n_pixels,).
+    time, weight : index of the picture in which each pixel changes, and how much it changes, shape (n_pixels,).
+    bins : number of bins across.
+    length : length of the lines, px; positions are rounded to 4 px.
+    n_times : number of pictures.
 
     Returns
     -------
-    change collected in order, shape (bins − 1,).
+    change collected, shape (bins − 1,).
     """
     places = length // 4 + 1
     table = np.zeros((bins, n_times, places), np.float32)
@@ -264,7 +264,7 @@ def fan_gains(
         best[:] = 0.0
         for t in range(n_times):
             last = max(high[b, t], high[b + 1, t]) + 1
-            # `best` never falls along the line: it rises only where something changes now, and on from there.
+            # `best` never decreases along the line: it changes only from where a pixel changes now onwards.
             for s in range(min(low[b, t], low[b + 1, t]) + 1, places + 1):
                 if s > last and best[s] >= best[s - 1]:
                     break
@@ -275,29 +275,29 @@ def fan_gains(
 
 @njit(cache=True)
 def passing_times(table: np.ndarray) -> np.ndarray:
-    """Find the monotone path that collects most, and when it passes each place.
+    """Find the monotone path that collects most change, and the time at which it passes each position.
 
     Parameters
     ----------
-    table : change by time and place, shape (n_times, n_places).
+    table : change by time and position, shape (n_times, n_places).
 
     Returns
     -------
-    time, counted in pictures, shape (n_places,); NaN beyond the ends of the path.
+    index of the picture, shape (n_places,); NaN beyond the ends of the path.
     """
     n, places = table.shape
     best = np.zeros((n, places + 1))
-    came = np.zeros((n, places + 1), np.uint8)
+    predecessor = np.zeros((n, places + 1), np.uint8)
     for t in range(n):
         for s in range(places + 1):
             best[t, s] = best[t - 1, s] if t > 0 else 0.0
             if s > 0 and best[t, s - 1] + table[t, s - 1] > best[t, s]:
                 best[t, s] = best[t, s - 1] + table[t, s - 1]
-                came[t, s] = 1
+                predecessor[t, s] = 1
     passed = np.full(places, np.nan)
     t, s = n - 1, places
     while s > 0 and t >= 0:
-        if came[t, s] == 1:
+        if predecessor[t, s] == 1:
             passed[s - 1] = t
             s -= 1
         elif t > 0:

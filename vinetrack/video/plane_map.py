@@ -1,12 +1,12 @@
-"""From pixels to the plane of growth: lens distortion and tilt, with the errors of both.
+"""Map from pixels to the plane of growth: lens distortion and tilt, with their uncertainty.
 
-A point of the plane, seen through a pinhole, lands where a homography puts it (any pose, any focal length), and radial
-distortion moves it outwards or inwards from the picture's middle (Brown 1966; the form OpenCV uses):
-q_d = q (1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target fixes these ten
-numbers; focal length and distance, which it does not, are not needed to measure in the plane.
+A point of the plane, seen through a pinhole, is mapped by a homography (for any pose and focal length), and radial
+distortion then moves it outwards or inwards from the centre of the picture (Brown 1966; the form OpenCV uses): q_d = q
+(1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target determines these ten
+parameters. Focal length and distance remain unknown, but are not needed to measure in the plane.
 
-Numbers that the corners cannot fix are held by what lenses and rigs are like (PRIOR_SIGMA), so that a small target
-neither fails nor pretends: the covariance of the fit says what is left open.
+Gaussian priors (PRIOR_SIGMA), from typical lenses and set-ups, constrain parameters that the corners do not determine,
+so that a small target neither fails nor claims too much: the covariance of the fit includes the remaining uncertainty.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ import numpy as np
 from vinetrack.core.records import Floats
 
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)
-"""Standard deviations, before any corner is seen, of the two perspective terms (0.15: 25° of tilt at a focal length of
-three half-diagonals), κ₁ (0.1: 10 % at the picture's corners) and κ₂."""
-SMALLEST_NOISE_PX = 0.01
-"""Chosen: no corner is known better; a rendered picture without noise would else claim to be exact."""
+"""Prior standard deviations of the two perspective terms (0.15: 25° of tilt at a focal length of three half-diagonals),
+of κ₁ (0.1: 10 % at the picture's corners) and of κ₂. Chosen."""
+MIN_NOISE_PX = 0.01
+"""Chosen: no corner is located better; otherwise a rendered picture without noise would claim to be exact."""
 
 NOISE_ROUNDS = 3
-"""Chosen: each round leaves a small part of the change of the one before; more cost time alone."""
+"""Iterations of fit and noise estimate. Chosen: each leaves a small part of the previous change; more only cost time.
+"""
 
 NEWTON_STEPS = 12
-"""Chosen: the inverse of the distortion converges quadratically; more cost time alone."""
+"""Iterations of Newton's method. Chosen: it converges quadratically; more only cost time."""
 
 N_PLANE, N_LENS = 8, 2
-"""Numbers of a plane and of a lens. Derived: a homography has eight, κ₁ and κ₂ are two."""
+"""Parameters of a plane and of a lens. Derived: a homography has eight, κ₁ and κ₂ are two."""
 
 
 @dataclass(frozen=True)
 class PlaneMap:
-    """Where in the plane of growth each pixel looks.
+    """Map from pixels to the plane of growth.
 
-    `parameters` are the first eight entries of the homography from undistorted half-diagonals (the ninth is 1) to
-    metres, row by row, then κ₁, κ₂; `covariance`, shape (10, 10), is theirs.
+    `parameters` are the first eight entries of the homography from undistorted half-diagonals to metres, row by row
+    (the ninth is 1), then κ₁ and κ₂; `covariance`, shape (10, 10), is their covariance.
     """
 
     width_px: int
@@ -49,11 +50,11 @@ class PlaneMap:
 
     @classmethod
     def from_scale(cls, m_per_px: float, width_px: int, height_px: int) -> PlaneMap:
-        """Make a plane seen square on, without distortion, known without error.
+        """Make the map of a plane seen at right angles, without distortion, known without error.
 
         Parameters
         ----------
-        m_per_px : scale.
+        m_per_px : scale, m per px.
         width_px, height_px : size of the picture.
 
         Returns
@@ -91,13 +92,13 @@ class PlaneMap:
 
         Returns
         -------
-        m.
+        distance, m.
         """
         ends = self.plane_m(np.array([from_px, to_px], dtype=float))
         return float(np.linalg.norm(ends[1] - ends[0]))
 
     def length_rel_sigma(self, from_px: Floats | Sequence[float], to_px: Floats | Sequence[float]) -> float:
-        """Return the relative standard error of such a distance, from the covariance of the fit.
+        """Return the relative standard error of the distance in the plane between two points, from the covariance.
 
         Parameters
         ----------
@@ -105,12 +106,12 @@ class PlaneMap:
 
         Returns
         -------
-        a fraction.
+        relative standard error.
         """
         return self.path_rel_sigma(np.array([from_px, to_px], dtype=float))
 
     def path_rel_sigma(self, places_px: Floats) -> float:
-        """Return the relative standard error of the length of a path in the plane, from the covariance of the fit.
+        """Return the relative standard error of the length of a path in the plane, from the covariance.
 
         Parameters
         ----------
@@ -118,15 +119,15 @@ class PlaneMap:
 
         Returns
         -------
-        a fraction.
+        relative standard error.
         """
         gradient = np.zeros(self.parameters.size)
         steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
         for k, step in enumerate(steps):
             change = np.zeros(self.parameters.size)
             change[k] = step
-            less, more = (_length(self._plane_m(self.parameters + sign * change, places_px)) for sign in (-1, 1))
-            gradient[k] = (more - less) / (2 * step)
+            lower, upper = (_length(self._plane_m(self.parameters + sign * change, places_px)) for sign in (-1, 1))
+            gradient[k] = (upper - lower) / (2 * step)
         variance = float(gradient @ self.covariance @ gradient)
         return float(np.sqrt(max(variance, 0.0))) / _length(self.plane_m(places_px))
 
@@ -134,15 +135,15 @@ class PlaneMap:
         size = (self.width_px, self.height_px)
         ideal = _undistorted(_half_diagonals(picture_px, size), parameters[8:])
         homography = np.append(parameters[:8], 1.0).reshape(3, 3)
-        carried = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ homography.T
-        return np.asarray(carried[..., :2] / carried[..., 2:])
+        projected = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ homography.T
+        return np.asarray(projected[..., :2] / projected[..., 2:])
 
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """A plane map for each view (one lens for all), and how far corners lie from where it puts them.
+    """Plane maps of several views with a common lens, and the reprojection residuals.
 
-    `residual_px` holds an array of shape (n, 2) for each view; `noise_px` their standard deviation per coordinate.
+    `residual_px` holds an array of shape (n, 2) per view; `noise_px` is the standard deviation per coordinate.
     """
 
     maps: tuple[PlaneMap, ...]
@@ -151,7 +152,7 @@ class PlaneFit:
 
     @property
     def reprojection_px(self) -> float:
-        """Root mean square distance of corners from where the fit puts them, px."""
+        """Root mean square reprojection error, px."""
         return float(np.sqrt(np.mean(np.concatenate([(view**2).sum(axis=1) for view in self.residual_px]))))
 
 
@@ -166,11 +167,11 @@ def _half_diagonal_px(width_px: int, height_px: int) -> float:
 
 
 def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px: int) -> PlaneFit:
-    """Fit a plane to each view and one lens to all.
+    """Fit a plane to each view and a common lens.
 
     Parameters
     ----------
-    views : for each view corners in the picture (px) and on the target (m), both of shape (n, 2), n ≥ 4.
+    views : per view, corners in the picture (px) and on the target (m), both of shape (n, 2), n ≥ 4.
     width_px, height_px : size of the picture.
 
     Returns
@@ -197,9 +198,9 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
         fit = least_squares(_misfit, values, args=arguments, method="lm", xtol=1e-12, ftol=1e-12)
         values = fit.x
         residuals = _residuals(values, *arguments[:2])
-        freedom = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
-        total = sum(float((view**2).sum()) for view in residuals)
-        noise_px = max(unit_px * np.sqrt(total / max(freedom, 1)), SMALLEST_NOISE_PX)
+        n_degrees = 2 * sum(len(view) for view in corners) - N_PLANE * len(views) - N_LENS
+        sum_of_squares = sum(float((view**2).sum()) for view in residuals)
+        noise_px = max(unit_px * np.sqrt(sum_of_squares / max(n_degrees, 1)), MIN_NOISE_PX)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac)
     maps = []
     for k in range(len(views)):
@@ -215,15 +216,17 @@ def _half_diagonals(picture_px: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray((np.asarray(picture_px, dtype=float) - middle) / _half_diagonal_px(*size))
 
 
-def _undistorted(bent: Floats, lens: Floats) -> Floats:
-    """Newton's method on q(1 + κ₁q² + κ₂q⁴) = q_d; beyond the fold of a strong lens the step is held back."""
-    bent_radius = np.sqrt((bent**2).sum(axis=-1, keepdims=True))
-    radius = bent_radius.copy()
+def _undistorted(distorted: Floats, lens: Floats) -> Floats:
+    """Solve q(1 + κ₁q² + κ₂q⁴) = q_d by Newton's method; where a strong lens folds over, steps are limited."""
+    distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
+    radius = distorted_radius.copy()
     for _ in range(NEWTON_STEPS):
-        excess = radius * (1 + lens[0] * radius**2 + lens[1] * radius**4) - bent_radius
+        excess = radius * (1 + lens[0] * radius**2 + lens[1] * radius**4) - distorted_radius
         slope = 1 + 3 * lens[0] * radius**2 + 5 * lens[1] * radius**4
         radius = radius - excess / np.maximum(slope, 0.2)
-    return np.asarray(bent * np.divide(radius, bent_radius, out=np.ones_like(radius), where=bent_radius > 0))
+    return np.asarray(
+        distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
+    )
 
 
 def _distorted(ideal: Floats, lens: Floats) -> Floats:
@@ -232,31 +235,33 @@ def _distorted(ideal: Floats, lens: Floats) -> Floats:
 
 
 def _first_homography(picture: Floats, board: Floats) -> Floats:
-    """Homography from half-diagonals to the board, by the direct linear transform; first eight entries, shape (8,)."""
-    there = np.column_stack([picture, np.ones(len(picture))])
-    nothing = np.zeros_like(there)
-    system = np.block([[there, nothing, -board[:, :1] * there], [nothing, there, -board[:, 1:] * there]])
+    """Homography from half-diagonals to the board by the direct linear transform; first eight entries, shape (8,)."""
+    homogeneous = np.column_stack([picture, np.ones(len(picture))])
+    zeros = np.zeros_like(homogeneous)
+    system = np.block(
+        [[homogeneous, zeros, -board[:, :1] * homogeneous], [zeros, homogeneous, -board[:, 1:] * homogeneous]]
+    )
     _, directions = np.linalg.eigh(system.T @ system)
     homography = directions[:, 0]
     return np.asarray(homography[:8] / homography[8])
 
 
 def _residuals(values: Floats, corners: list[Floats], boards: list[Floats]) -> list[Floats]:
-    """Corners minus where the values put them, half-diagonals, one array a view."""
+    """Corners minus their predicted positions, half-diagonals, one array per view."""
     lens = values[N_PLANE * len(corners) :]
     residuals = []
     for k, (corner, board) in enumerate(zip(corners, boards, strict=True)):
         homography = np.append(values[k * N_PLANE : (k + 1) * N_PLANE], 1.0).reshape(3, 3)
-        carried = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
-        residuals.append(corner - _distorted(carried[:, :2] / carried[:, 2:], lens))
+        projected = np.column_stack([board, np.ones(len(board))]) @ np.linalg.inv(homography).T
+        residuals.append(corner - _distorted(projected[:, :2] / projected[:, 2:], lens))
     return residuals
 
 
 def _misfit(values: Floats, corners: list[Floats], boards: list[Floats], noise: float) -> Floats:
-    """Residuals in units of the noise, then the priors in units of theirs."""
+    """Residuals over the noise, followed by the parameters with priors over their prior standard deviations."""
     n_views = len(corners)
     fits = np.concatenate([view.ravel() for view in _residuals(values, corners, boards)]) / noise
     tilts = np.concatenate([values[k * N_PLANE + 6 : k * N_PLANE + 8] for k in range(n_views)])
     lens = values[N_PLANE * n_views :]
-    held = np.concatenate([tilts / np.tile(PRIOR_SIGMA[:2], n_views), lens / np.array(PRIOR_SIGMA[2:])])
-    return np.concatenate([fits, held])
+    priors = np.concatenate([tilts / np.tile(PRIOR_SIGMA[:2], n_views), lens / np.array(PRIOR_SIGMA[2:])])
+    return np.concatenate([fits, priors])

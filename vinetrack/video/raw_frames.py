@@ -1,7 +1,7 @@
-"""Frames that lie in a file as the sensor gave them: 8 to 16 bit, packed or not, read one at a time.
+"""Reading frames stored as the sensor gave them: 8 to 16 bits, packed or not, one frame at a time.
 
-High-speed cameras write such files with a header of their own (`camera_headers`). Nothing is held but the frame that is
-read.
+High-speed cameras write such files with headers of their own (`camera_headers`). Only the current frame is held in
+memory.
 """
 
 from __future__ import annotations
@@ -31,23 +31,24 @@ _TABLE_STEPS = (
     "77677767777767777777777767777787777777777787777787777877787787787787787878778787878788787878878878878878"
     "887888878888878888888888888888888888888988888988889888988988988988989898898988"
 )
-"""Steps from each of the 1024 values of a packed Phantom frame to the next, from 2 on, up to 4064; later values are
-4095. Source: the table of the vendor's format document, as pycine 0.3.2 has it. It undoes the compression by which the
-camera fits 12 bits in 10: without it an edge shifts by a part of its blur."""
+"""Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064; later values are
+4095. Source: the table of the vendor's format document, as in pycine 0.3.2. It undoes the compression by which the
+camera stores 12 bits in 10: without it an edge shifts by a part of its blur."""
 
 PHANTOM_TABLE: NDArray[np.uint16] = np.full(1024, 4095, np.uint16)
-"""Brightness in 12 bits of each value of a packed Phantom frame, shape (1024,)."""
+"""12-bit brightness for each value of a packed Phantom frame, shape (1024,)."""
 PHANTOM_TABLE[: len(_TABLE_STEPS) + 1] = 2 + np.cumsum([0, *map(int, _TABLE_STEPS)])
 
 
 @dataclass(frozen=True)
 class RawFrames:
-    """Where the frames of a file lie, and how their pixels are packed.
+    """Location of the frames in a file, and packing of their pixels.
 
-    `offsets` are of the first byte of each frame; `stored_bits` those of a pixel in the file: 8, 16 (least significant
-    byte first), or packed 10 or 12 (most significant bits first). `bottom_up`: the last row comes first. `linearise`:
-    by PHANTOM_TABLE. `mosaic`: one colour a pixel, levelled to brightness. `times_s` is when each frame was captured,
-    shape (n_frames,), None where the file does not say.
+    `offsets` are the positions of the first byte of each frame. `stored_bits` is the number of bits of a pixel in the
+    file: 8, 16 (least significant byte first), or packed 10 or 12 (most significant bits first). `bottom_up`: the last
+    row comes first. `linearise`: values go through PHANTOM_TABLE. `mosaic`: the sensor has a colour filter array, which
+    is filtered to brightness. `times_s` is the capture time of each frame, shape (n_frames,), None if the file does not
+    state it.
     """
 
     file: Path
@@ -62,37 +63,37 @@ class RawFrames:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of a frame in the file."""
+        """Size of a frame in the file, bytes."""
         return self.width * self.height * self.stored_bits // 8
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the pixels as they come out."""
+        """Type of the pixels that `pictures` yields."""
         return np.dtype(np.uint8 if self.stored_bits == 8 else np.uint16)
 
     def pictures(self) -> Iterator[NDArray[Any]]:
-        """Yield one frame after another, shape (height, width); stops where the file ends."""
+        """Yield one frame after another, shape (height, width); stop where the file ends."""
         with self.file.open("rb") as stream:
             for offset in self.offsets:
                 stream.seek(offset)
                 data = stream.read(self.frame_bytes)
                 if len(data) < self.frame_bytes:
                     return
-                pixels = unpacked(np.frombuffer(data, np.uint8), self.stored_bits)
+                pixels = unpack_pixels(np.frombuffer(data, np.uint8), self.stored_bits)
                 if self.linearise:
                     pixels = PHANTOM_TABLE[pixels]
                 picture = pixels.reshape(self.height, self.width)
                 picture = picture[::-1] if self.bottom_up else picture
-                yield levelled(picture) if self.mosaic else picture
+                yield mosaic_brightness(picture) if self.mosaic else picture
 
 
-def unpacked(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
-    """Pixels of packed bytes.
+def unpack_pixels(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
+    """Unpack the pixels of a frame.
 
     Parameters
     ----------
     data : shape (n_bytes,).
-    bits : of a pixel: 8, 16 (least significant byte first), or 10 or 12 (most significant bits first).
+    bits : bits per pixel: 8, 16 (least significant byte first), or 10 or 12 (most significant bits first).
 
     Returns
     -------
@@ -111,8 +112,8 @@ def unpacked(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
     ).ravel()  # fmt: skip
 
 
-def levelled(mosaic: NDArray[Any]) -> NDArray[Any]:
-    """Brightness of a sensor with one colour a pixel: a [1 2 1] kernel both ways, fair to every 2 by 2 pattern.
+def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
+    """Return the brightness of a sensor with a colour filter array, for any 2 by 2 pattern: a [1 2 1] kernel both ways.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ def levelled(mosaic: NDArray[Any]) -> NDArray[Any]:
 
     Returns
     -------
-    grey levels, that shape and type.
+    grey levels, of the same shape and type.
     """
     import cv2
 
@@ -134,17 +135,17 @@ def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
     Parameters
     ----------
     recording : from `inspect_recording`.
-    raw : where its frames lie.
+    raw : location of its frames.
     region : part of the picture.
 
     Returns
     -------
-    every frame with its capture period.
+    the frames with their capture periods.
 
     Raises
     ------
     RecordingError
-        Where they do not fit in memory, or there is none.
+        If the frames do not fit in memory, or the file holds none.
     """
     name, notes = recording.path.name, list(recording.notes)
     shape = (len(raw.offsets), *region.shape)
@@ -157,7 +158,7 @@ def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
         raise RecordingError(f"{name}: not one frame is in the file; copy it from the camera again")
     if recording.declared_frames is not None and n < recording.declared_frames:
         notes.append(
-            f"{name}: {n} frames are there where the file declares {recording.declared_frames}: cut short; "
+            f"{name}: the file holds {n} frames but declares {recording.declared_frames}: cut short; "
             "copy it from the camera again"
         )
     slot, irregular = np.arange(n), ""

@@ -1,6 +1,7 @@
-"""How far a camera shook and its light flickered, told by what stands still: each frame against the median picture.
+"""Registration of camera shake and flicker: each frame against the median picture of the static background.
 
-Robust least squares on the median picture and its slopes. What moves there (a door, a hand) strays and is left out.
+Robust least squares on the median picture and its derivatives (Lucas-Kanade). Moving objects, such as a door or a hand,
+appear as outliers and are left out.
 """
 
 from __future__ import annotations
@@ -15,55 +16,56 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
-from vinetrack.video.order_kernels import BINS_A_LEVEL, median
+from vinetrack.video.order_kernels import BINS_PER_LEVEL, median
 from vinetrack.video.resample import sample
 
 REFERENCE_FRAMES = 15
-"""Frames whose median is what all are compared with. Derived: its noise is then a third of a frame's, √(π/2)/√15. By
+"""Frames whose median is the reference. Derived: its noise is then a third of that of a frame, √(π/2)/√15. By
 reasoning: at half it is nearly a half, at twice a quarter."""
 
-PIXELS = 9000
-"""Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
-a pixel and noise of 5: 1/√9000 = 0.01 px."""
+SHIFT_PIXELS = 9000
+"""Pixels of the bands used to measure a shift, evenly spaced. Derived for derivatives of 5 grey levels per pixel and
+noise of 5: 1/√9000 = 0.01 px."""
 LEVEL_PIXELS = 3000
-"""Pixels that tell of light alone, and whether a shake is worth measuring with PIXELS. Derived for noise of 5 grey
-levels at 100: 5/(100·√3000) = 0.1 % of the light, 0.003 px of an edge of 30 grey levels. At half 0.004 px; at twice
-time is as of PIXELS."""
+"""Pixels used to measure flicker alone, and to decide whether to measure shake with SHIFT_PIXELS. Derived for noise of
+5 grey levels at 100: 5/(100·√3000) = 0.1 % of the brightness, 0.003 px of an edge of 30 grey levels. At half 0.004 px;
+at twice it takes as long as SHIFT_PIXELS."""
 MEDIAN_EVERY = 4
-"""Every so many pixels count in medians. Derived: of 750 pixels a median is known to 1.25/√750 = 5 % of their scatter.
-At half time grows, at twice it is known to 7 %."""
-AS_NOISE = 1.5
-"""Median shift over its standard error, with LEVEL_PIXELS, below which no shake is looked for. Derived: 0.67 of noise
-alone; a shake of 2.5 standard errors with PIXELS, the least that is taken off, makes 1.6. By reasoning: at half every
-recording is measured twice, at twice faint shakes stay."""
+"""Stride of the pixels used for medians. Derived: the median of 750 pixels is known to 1.25/√750 = 5 % of their
+scatter. At half computing time grows, at twice it is known to 7 %."""
+NOISE_SHIFT_RATIO = 1.5
+"""Median shift over its standard error, with LEVEL_PIXELS, below which no shake is measured. Derived: noise alone gives
+0.67; a shake of 2.5 standard errors with SHIFT_PIXELS, the smallest that is removed, gives 1.6. By reasoning: at half
+every recording is measured twice, at twice faint shakes remain."""
 SHAKE_FLOOR_PX = 0.04
-"""Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
+"""Smaller shake is not removed: interpolating the picture would cost more accuracy than it gains. Chosen as FLOOR_PX of
 `point_quality`."""
 SHAKE_ROUNDS = 4
-"""Times that a shake is measured, each against what the one before left. Chosen: each leaves a small part of it, more
-cost time alone. Derived: pictures are followed over SHAKE_ROUNDS · SHAKE_STEP_PX = 6 px at most, at half over 3 px, at
-twice over 12 px."""
+"""Number of registration iterations, each from the result of the one before. Chosen: each leaves a small part of the
+shift; more only cost time. Derived: shifts up to SHAKE_ROUNDS · SHAKE_STEP_PX = 6 px are found, at half up to 3 px, at
+twice up to 12 px."""
 SHAKE_STEP_PX = 1.5
-"""Most that a round moves a picture. Chosen: its slopes tell of no more. Half or twice halves or doubles the 6 px of
-SHAKE_ROUNDS; at twice a picture that departs for other reasons is also moved by twice as much."""
-SHAKE_SETTLED_PX = 0.02
-"""Shift of a round below which it is the last. Chosen: a fifth of the error of a shake that was taken off, and half of
-SHAKE_FLOOR_PX. At half another round is made, at twice up to that floor is left."""
-WHOLE_PX = 1e-6
-"""Distance of a place from a whole pixel that is rounding. Derived: places of some thousand px are known to 1e-12."""
-HALVES_APART = 0.7
-"""Difference of the shifts that both halves of what stands still tell, over their sum, below which a camera shook.
-Measured on clips of seeds 1 to 6
-of `benchmarks/tracking_accuracy.py`: 0.03 to 0.36 where it did, 0.89 to 1.02 where film and doors move one half alone.
-The ground beside a curve is judged alike. At half a shake is left in; at twice film shakes the strip."""
+"""Maximum shift per iteration. Chosen: the linearisation holds no further. Half or twice halves or doubles the 6 px of
+SHAKE_ROUNDS; at twice, a picture that differs for other reasons is also moved twice as far."""
+SHAKE_CONVERGED_PX = 0.02
+"""Change of the shift below which the iteration has converged. Chosen: a fifth of the error of a removed shake, and
+half of SHAKE_FLOOR_PX. At half another iteration is made, at twice an error of up to that floor remains."""
+WHOLE_PIXEL_TOLERANCE = 1e-6
+"""Distance of a position from a whole pixel that is due to rounding. Derived: positions of some thousand px are known
+to 1e-12."""
+HALF_DISAGREEMENT = 0.7
+"""Difference of the shifts measured in the two halves of the background, over their sum, below which the camera is
+taken to have shaken. Measured on clips of seeds 1 to 6 of `benchmarks/tracking_accuracy.py`: 0.03 to 0.36 with shake,
+0.89 to 1.02 where film and doors move in one half only. The background beside a curved axis is judged in the same way.
+At half a shake remains; at twice, moving film is taken for shake."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Pixels of the bands with which frames are compared: where they lie, and what they show on average.
+    """Pixels of the bands to which frames are registered: positions and median brightness.
 
-    `along_px` and `across_px`, shape (n_pixels,), whole numbers; `basis`, shape (4, n_pixels): median picture, one, and
-    its slopes along and across.
+    `along_px` and `across_px`, shape (n_pixels,), are whole numbers; the rows of `basis`, shape (4, n_pixels), are the
+    median picture, ones, and the derivatives of the picture along and across.
     """
 
     along_px: Floats
@@ -72,7 +74,7 @@ class Reference:
 
 
 def camera_unit(luma: NDArray[Any]) -> float:
-    """Return the grey levels of 255 in one unit of the camera's.
+    """Return the number of grey levels of 255 per unit of the camera's values.
 
     Parameters
     ----------
@@ -88,22 +90,22 @@ def camera_unit(luma: NDArray[Any]) -> float:
     return 255.0 / max(top, 1.0)
 
 
-def steady(
+def stabilise(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float, still: bool
 ) -> tuple[Floats, Floats, Floats, bool]:
-    """Level and steady every frame against the median picture of its bands.
+    """Estimate flicker and shake of every frame against the median picture of its bands.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
-    bands : rows beside it that show what stands still, px across.
-    unit : grey levels in one unit of the camera's.
-    still : whether the pictures are known not to shake: they are levelled alone.
+    bands : rows beside the axis that show static background, px across.
+    unit : grey levels per unit of the camera's values.
+    still : True if the camera is known not to shake: only flicker is then estimated.
 
     Returns
     -------
-    scale and offset that free a frame of flicker, shape (n_frames,) each
+    scale and offset that correct flicker, shape (n_frames,) each
     shift along and across, shape (n_frames, 2), px
     whether the camera shook
     """
@@ -112,59 +114,62 @@ def steady(
     fit, steadied = np.zeros((n, 4)), False
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
     columns = int(np.floor(axis.length_px)) + 1
-    reference = _still_pixels(luma, axis, bands, picks, (0, columns), LEVEL_PIXELS)
-    if not reference.basis[0].any():  # black all over: it tells of no light and of no shift
+    reference = _reference_at_whole_pixels(luma, axis, bands, picks, (0, columns), LEVEL_PIXELS)
+    if not reference.basis[0].any():  # black all over: neither flicker nor shift can be measured
         return np.full(n, unit), np.zeros(n), shift, False
     fit, sd = register(luma, axis, reference, None, unit)
-    if still or _stands_still(fit, sd, reference):
-        return *_levelled(fit, unit), shift, False
-    reference = _still_pixels(luma, axis, bands, picks, (0, columns), PIXELS)
-    for turn in range(SHAKE_ROUNDS):
-        fit, sd = register(luma, axis, reference, shift if turn else None, unit)
-        if turn == 0:
+    if still or _is_still(fit, sd, reference):
+        return *_flicker_correction(fit, unit), shift, False
+    reference = _reference_at_whole_pixels(luma, axis, bands, picks, (0, columns), SHIFT_PIXELS)
+    for iteration in range(SHAKE_ROUNDS):
+        fit, sd = register(luma, axis, reference, shift if iteration else None, unit)
+        if iteration == 0:
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
             if not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
             parts = (0, columns // 2), (columns // 2, columns)
-            halves = [_still_pixels(luma, axis, bands, picks, part, PIXELS) for part in parts]
-            if not shaken_alike(luma, axis, halves, unit):
+            halves = [_reference_at_whole_pixels(luma, axis, bands, picks, part, SHIFT_PIXELS) for part in parts]
+            if not shifts_agree(luma, axis, halves, unit):
                 break
             steadied = True
         shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
-        if turn == 1:
+        if iteration == 1:
             reference = reference_pixels(_median_pictures(luma, axis, bands, picks, shift), bands)
-        if turn > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
+        if iteration > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_CONVERGED_PX:
             break
-    return *_levelled(fit, unit), shift, steadied
+    return *_flicker_correction(fit, unit), shift, steadied
 
 
-def _stands_still(fit: Floats, sd: Floats, reference: Reference) -> bool:
-    """Whether the shifts of frames along and across are so small that they are noise, or not worth being taken off."""
+def _is_still(fit: Floats, sd: Floats, reference: Reference) -> bool:
+    """Return whether the shifts along and across are consistent with noise, or too small to be worth removing."""
     along, across = reference.basis[2:] @ reference.basis[2:].T
     ratio = np.sqrt(along[0] / max(across[1], 1e-9))
-    size = np.median(np.abs(fit[:, 2:]), axis=0)
-    return bool(np.all(size < np.maximum(SHAKE_FLOOR_PX, AS_NOISE * float(np.median(sd)) * np.array([1.0, ratio]))))
+    median_shift = np.median(np.abs(fit[:, 2:]), axis=0)
+    return bool(
+        np.all(
+            median_shift < np.maximum(SHAKE_FLOOR_PX, NOISE_SHIFT_RATIO * float(np.median(sd)) * np.array([1.0, ratio]))
+        )
+    )
 
 
-def _levelled(fit: Floats, unit: float) -> tuple[Floats, Floats]:
-    """Scale and offset that free each frame of the gain and level of a fit, shape (n_frames,) each."""
+def _flicker_correction(fit: Floats, unit: float) -> tuple[Floats, Floats]:
+    """Scale and offset that undo the gain and level of a fit, shape (n_frames,) each."""
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain
 
 
-def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], unit: float) -> bool:
-    """Judge whether two halves of what stands still tell of the same shift: a shaken camera moves both alike.
+def shifts_agree(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], unit: float) -> bool:
+    """Decide whether the camera shook: two halves of the background must then show the same shift.
 
-    A door, a shadow or a mirror image of the tip that passes moves one after the other. A shift of a pixel is more than
-    the slopes of a picture tell at once, and what one half makes of it is not what the other does: each is followed
-    until it is found.
+    A door, a shadow or a mirror image of the tip passes one half after the other. Shifts of more than a pixel are
+    beyond the linearisation, and its error differs between the halves; therefore each half is iterated to convergence.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
-    axis : the places of both lie along and across it, px.
-    halves : two of them.
-    unit : grey levels in one unit of the camera's.
+    axis : axis along and across which the positions of both halves are given, px.
+    halves : the two references.
+    unit : grey levels per unit of the camera's values.
 
     Returns
     -------
@@ -173,45 +178,49 @@ def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
     shifts, errors = [], []
     for half in halves:
         shift, sd = np.zeros((len(luma), 2)), np.zeros(len(luma))
-        for turn in range(SHAKE_ROUNDS):
-            fit, sd = register(luma, axis, half, shift if turn else None, unit)
+        for iteration in range(SHAKE_ROUNDS):
+            fit, sd = register(luma, axis, half, shift if iteration else None, unit)
             shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
-            if float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
+            if float(np.abs(fit[:, 2:]).max()) < SHAKE_CONVERGED_PX:
                 break
         shifts.append(shift)
         errors.append(sd)
     first, second = shifts
-    apart, both = np.hypot(*(first - second).T), np.hypot(*(first + second).T)
-    most = apart + both >= np.quantile(apart + both, 0.75)
+    difference, total = np.hypot(*(first - second).T), np.hypot(*(first + second).T)
+    strongest = difference + total >= np.quantile(difference + total, 0.75)
     sd_sum = float(np.median(errors[0] + errors[1]))
-    return float(np.mean(apart[most])) < max(HALVES_APART * float(np.mean(both[most])), 2 * sd_sum)
+    return float(np.mean(difference[strongest])) < max(HALF_DISAGREEMENT * float(np.mean(total[strongest])), 2 * sd_sum)
 
 
-def _still_pixels(
+def _reference_at_whole_pixels(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_],
     columns: tuple[int, int], count: int,
 ) -> Reference:  # fmt: skip
-    """About `count` whole pixels of the picture in some bands, with the median of some frames and its slopes.
+    """Make a reference of about `count` whole pixels of some bands, from the median of some frames.
 
-    Whole pixels need no interpolation, along whatever axis.
+    Whole pixels need no interpolation, whatever the direction of the axis.
     """
     low, high = columns
     grids = [np.meshgrid(np.arange(low + 1, high - 1), rows[1:-1]) for rows in bands]
     along, across = (np.concatenate([grid[k].ravel() for grid in grids]) for k in (0, 1))
-    every = max(1, len(along) // count)
+    stride = max(1, len(along) // count)
     height, width = luma.shape[1:]
-    place = np.rint(axis.points(along[::every].astype(float), across[::every].astype(float))).astype(int)
+    place = np.rint(axis.points(along[::stride].astype(float), across[::stride].astype(float))).astype(int)
     x, y = np.clip(place[:, 0], 1, width - 2), np.clip(place[:, 1], 1, height - 2)
     middle, left, right, above, below = _medians_about(luma, picks, x, y)
     right, below = (right - left) / 2, (below - above) / 2
-    unit, side, away = axis.direction, axis.normal, np.column_stack([x, y]) - np.asarray(axis.from_px, float)
-    slopes = -(right * unit[0] + below * unit[1]), -(right * side[0] + below * side[1])
-    return Reference(away @ unit, away @ side, np.stack([middle, np.ones(len(x)), *slopes]))
+    direction, normal, relative_px = (
+        axis.direction,
+        axis.normal,
+        np.column_stack([x, y]) - np.asarray(axis.from_px, float),
+    )
+    slopes = -(right * direction[0] + below * direction[1]), -(right * normal[0] + below * normal[1])
+    return Reference(relative_px @ direction, relative_px @ normal, np.stack([middle, np.ones(len(x)), *slopes]))
 
 
 @njit(cache=True, nogil=True)
 def _medians_about(luma: np.ndarray, picks: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Median over some frames of pixels and of those left, right, above and below them, shape (5, n_pixels)."""
+    """Median over some frames of pixels and of their left, right, upper and lower neighbours, shape (5, n_pixels)."""
     out, values = np.empty((5, len(x))), np.empty(len(picks))
     for i in range(len(x)):
         for k in range(5):
@@ -239,17 +248,17 @@ def _median_pictures(
 def reference_pixels(
     medians: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
 ) -> Reference:
-    """Choose about PIXELS pixels of some bands, with their median brightness and its slopes.
+    """Make a reference of about SHIFT_PIXELS pixels of some bands, from their median pictures.
 
     Parameters
     ----------
     medians : median picture of each band, shape (n_rows, n_along).
     bands : their rows, px across.
-    columns : the first, and the one behind the last; all where None.
+    columns : first column, and the one behind the last; all columns if None.
 
     Returns
     -------
-    the pixels.
+    the reference.
     """
     low, high = columns or (0, medians[0].shape[1])
     parts, along, across = [], [], []
@@ -261,26 +270,26 @@ def reference_pixels(
         along.append(grid[0].ravel())
         across.append(grid[1].ravel())
     basis = np.concatenate(parts, axis=1)
-    every = max(1, basis.shape[1] // PIXELS)
+    stride = max(1, basis.shape[1] // SHIFT_PIXELS)
     return Reference(
-        np.concatenate(along)[::every].astype(float), np.concatenate(across)[::every].astype(float),
-        np.ascontiguousarray(basis[:, ::every], dtype=np.float64),
+        np.concatenate(along)[::stride].astype(float), np.concatenate(across)[::stride].astype(float),
+        np.ascontiguousarray(basis[:, ::stride], dtype=np.float64),
     )  # fmt: skip
 
 
 def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floats | None) -> NDArray[Any]:
-    """The pixels of a reference in every frame, as `sample` would cut them, shape (n_frames, n_pixels)."""
+    """Pixels of a reference in every frame, as `sample` would cut them, shape (n_frames, n_pixels)."""
     import cv2
 
     along, across = axis.direction, axis.normal
     start = axis.points(reference.along_px, reference.across_px)
     whole = np.rint(start)
-    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - whole).max() < WHOLE_PX):
+    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - whole).max() < WHOLE_PIXEL_TOLERANCE):
         x, y = (np.clip(whole[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
         return _whole_pixels(luma, x, y)
-    # Rows of a thousand: OpenCV takes no picture wider than 32767 pixels.
-    wide = -(-len(start) // 1000)
-    place = np.pad(start, ((0, wide * 1000 - len(start)), (0, 0)), mode="edge").reshape(wide, 1000, 2)
+    # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
+    n_rows = -(-len(start) // 1000)
+    place = np.pad(start, ((0, n_rows * 1000 - len(start)), (0, 0)), mode="edge").reshape(n_rows, 1000, 2)
     out = np.empty((len(luma), len(start)), luma.dtype)
     for i, frame in enumerate(luma):
         moved = place if shift_px is None else place + shift_px[i, 0] * along + shift_px[i, 1] * across
@@ -292,7 +301,7 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
 
 @njit(cache=True, nogil=True)
 def _whole_pixels(luma: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Some pixels of every frame, shape (n_frames, n_pixels)."""
+    """Read whole pixels of every frame, shape (n_frames, n_pixels)."""
     out = np.empty((len(luma), len(x)), luma.dtype)
     for t in range(len(luma)):
         for i in range(len(x)):
@@ -303,22 +312,24 @@ def _whole_pixels(luma: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def register(
     luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floats | None, unit: float
 ) -> tuple[Floats, Floats]:
-    """Compare every frame with what stands still, robustly.
+    """Register every frame to the static background by robust least squares.
 
-    frame(x) = gain · picture(x − shift) + level. Where the bands show no texture the level is held near zero and the
-    shift is left at zero.
+    The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
+    zero, and the shift at zero where the bands have no texture.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
-    axis : the reference's places lie along and across it, px.
-    reference : what stands still.
-    shift_px : what every frame is moved back by first, along and across, shape (n_frames, 2), px.
-    unit : grey levels in one unit of the camera's.
+    axis : axis along and across which the positions of the reference are given, px.
+    reference : static background.
+    shift_px : displacement that is removed from every frame first, along and across, shape (n_frames, 2), px; None for
+        none.
+    unit : grey levels per unit of the camera's values.
 
     Returns
     -------
-    gain, level, shift along and across of every frame, shape (n_frames, 4), and the error of the shift, (n_frames,).
+    gain, level, shift along and across of every frame, shape (n_frames, 4), and the standard error of the shift, shape
+    (n_frames,).
     """
     basis = reference.basis
     level = float(np.abs(basis[0]).mean()) + 1e-9
@@ -331,73 +342,73 @@ def register(
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares of every frame on the rows of `basis`, once more without what strays by four standard deviations.
+    """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd).
 
-    Where a gain alone, the ratio of the medians, leaves less to the median pixel than least squares of all do, it
-    tells what strays: a door that stands where the picture is brightest turns least squares so far that the door
-    stays in.
+    Outliers of the first fit are found with a gain alone (the ratio of the medians) if that leaves the smaller median
+    residual: a door in front of the brightest part of the picture distorts least squares so much that the door itself
+    would pass as inlier.
 
-    `data` has shape (n_frames, n_pixels), `basis` (4, n_pixels); the answer the coefficients (n_frames, 4) and the
-    standard error of the third, (n_frames,).
+    `data` has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
+    standard error of the third, shape (n_frames,).
     """
     n, count = data.shape
     out, error = np.zeros((n, 4)), np.full(n, np.inf)
-    strays, keep = np.empty(count), np.ones(count)
-    whole, fine = basis @ basis.T + ridge, unit * BINS_A_LEVEL
-    # A median of a part of the pixels tells as well how large residuals are.
-    few = (count + MEDIAN_EVERY - 1) // MEDIAN_EVERY
-    part, kept, everywhere = np.empty(few), np.empty(few), np.ones(few)
-    for k in range(few):
-        part[k] = basis[0, k * MEDIAN_EVERY]
-    usual = max(median(part, everywhere, fine), 1e-9)
+    residuals, inlier = np.empty(count), np.ones(count)
+    normal_matrix, bins_per_unit = basis @ basis.T + ridge, unit * BINS_PER_LEVEL
+    # A sample of the pixels suffices for the median of the residuals.
+    n_sampled = (count + MEDIAN_EVERY - 1) // MEDIAN_EVERY
+    sampled, sampled_inlier, all_sampled = np.empty(n_sampled), np.empty(n_sampled), np.ones(n_sampled)
+    for k in range(n_sampled):
+        sampled[k] = basis[0, k * MEDIAN_EVERY]
+    reference_median = max(median(sampled, all_sampled, bins_per_unit), 1e-9)
     for t in range(n):
-        keep[:] = 1.0
+        inlier[:] = 1.0
         values = data[t]
-        for turn in range(2):
+        for iteration in range(2):
             r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
             for k in range(count):
-                value = keep[k] * values[k]
+                value = inlier[k] * values[k]
                 r0 += value * basis[0, k]
                 r1 += value * basis[1, k]
                 r2 += value * basis[2, k]
                 r3 += value * basis[3, k]
-            inverse = np.linalg.inv(whole if turn == 0 else _products(basis, keep) + ridge)
+            inverse = np.linalg.inv(normal_matrix if iteration == 0 else _masked_products(basis, inlier) + ridge)
             a, b, c, d = inverse @ np.array([r0, r1, r2, r3])
             for k in range(count):
-                strays[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
-            for k in range(few):
-                part[k], kept[k] = strays[k * MEDIAN_EVERY], keep[k * MEDIAN_EVERY]
-            size = 1.4826 * median(part, kept, fine) + 0.3
+                residuals[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
+            for k in range(n_sampled):
+                sampled[k], sampled_inlier[k] = residuals[k * MEDIAN_EVERY], inlier[k * MEDIAN_EVERY]
+            scale = 1.4826 * median(sampled, sampled_inlier, bins_per_unit) + 0.3
             out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
-            error[t] = size * np.sqrt(max(inverse[2, 2], 0.0))
-            if turn == 0:
-                for k in range(few):
-                    part[k] = values[k * MEDIAN_EVERY]
-                gain = median(part, everywhere, fine) / usual
-                for k in range(few):
-                    part[k] = abs(values[k * MEDIAN_EVERY] - gain * basis[0, k * MEDIAN_EVERY])
-                bare_size = 1.4826 * median(part, everywhere, fine) + 0.3
-                if bare_size < size:
-                    size = bare_size
+            error[t] = scale * np.sqrt(max(inverse[2, 2], 0.0))
+            if iteration == 0:
+                for k in range(n_sampled):
+                    sampled[k] = values[k * MEDIAN_EVERY]
+                gain = median(sampled, all_sampled, bins_per_unit) / reference_median
+                for k in range(n_sampled):
+                    sampled[k] = abs(values[k * MEDIAN_EVERY] - gain * basis[0, k * MEDIAN_EVERY])
+                gain_only_scale = 1.4826 * median(sampled, all_sampled, bins_per_unit) + 0.3
+                if gain_only_scale < scale:
+                    scale = gain_only_scale
                     for k in range(count):
-                        strays[k] = abs(values[k] - gain * basis[0, k])
-            inside = 0.0
+                        residuals[k] = abs(values[k] - gain * basis[0, k])
+            n_inliers = 0.0
             for k in range(count):
-                keep[k] = 1.0 if strays[k] < 4 * size else 0.0
-                inside += keep[k]
-            if inside > 0.99 * count:
+                inlier[k] = 1.0 if residuals[k] < 4 * scale else 0.0
+                n_inliers += inlier[k]
+            if n_inliers > 0.99 * count:
                 break
     return out, error
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _products(basis: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Sums of products of the rows of `basis`, (4, 4), over the pixels that are kept."""
+def _masked_products(basis: np.ndarray, inlier: np.ndarray) -> np.ndarray:
+    """Products of the rows of `basis` with each other, shape (4, 4), summed over the inliers."""
     out = np.empty((4, 4))
     for i in range(4):
         for j in range(i, 4):
             total, first, second = 0.0, basis[i], basis[j]
-            for k in range(len(keep)):
-                total += keep[k] * first[k] * second[k]
+            for k in range(len(inlier)):
+                total += inlier[k] * first[k] * second[k]
             out[i, j] = out[j, i] = total
     return out

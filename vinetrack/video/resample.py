@@ -1,7 +1,8 @@
-"""Cutting strips out of many pictures alike, exactly or by bicubic interpolation on a straight grid, compiled.
+"""Cutting the same strip out of many pictures, by slicing or by bicubic interpolation on a straight grid, compiled.
 
-Along an axis that lies nearly along the rows of a picture, neighbours of the strip are neighbours of the picture for
-hundreds of pixels, so that sixteen weights and sixteen loads of neighbouring pixels make one pixel, many at a time.
+Along an axis close to the rows of a picture, neighbours in the strip are neighbours in the picture for hundreds of
+pixels. A pixel then takes sixteen weights and sixteen loads from neighbouring addresses, and many pixels are computed
+at a time.
 """
 
 from __future__ import annotations
@@ -16,36 +17,38 @@ from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge_cover import NO_REFCOUNT
 
-SHARPNESS = np.float32(-0.75)
-"""Slope of the cubic at its first zero. Defined by OpenCV's INTER_CUBIC, whose values these are but for rounding."""
-SHORTEST_RUN_PX = 16
-"""Mean length of the runs of neighbours from which compiled loops are used. Measured: runs of 8 px take as long as
-OpenCV does; only time depends on it."""
-WHOLE = np.float32(2**23)
-"""Added and taken off again it rounds a number of single precision to the nearest whole, ties to even. Derived."""
+CUBIC_COEFFICIENT = np.float32(-0.75)
+"""Coefficient a of the bicubic kernel (Keys 1981). Defined by OpenCV's INTER_CUBIC, which this reproduces up to
+rounding."""
+MIN_MEAN_RUN_PX = 16
+"""Mean length of runs of neighbours from which the compiled loops are used. Measured: with runs of 8 px they take as
+long as OpenCV; only computing time depends on it."""
+ROUNDING_CONSTANT = np.float32(2**23)
+"""Adding and subtracting it rounds a single-precision number to the nearest integer, ties to even. Derived."""
 VECTOR = 16
-"""Pixels that are computed at a time. Derived: 512 bits are sixteen numbers of single precision."""
-EXACT = {"contract", "nsz"}
-"""Freedom of the compiler: products and sums in one instruction."""
+"""Pixels computed at a time. Derived: 512 bits hold sixteen single-precision numbers."""
+CONTRACT_FASTMATH = {"contract", "nsz"}
+"""Floating-point freedom of the compiler: fused multiply-add only. Chosen, so that results do not depend on the order
+of sums."""
 
 
 def warp_all(luma: NDArray[Any], matrix: NDArray[np.float64], n_rows: int, n_along: int) -> NDArray[Any]:
-    """Interpolate every picture on a straight grid, bicubically; beyond its border it repeats.
+    """Interpolate every picture on a straight grid, bicubically; beyond its border the border pixel is repeated.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width), uint8 or uint16.
     matrix : shape (2, 3); x and y in the picture are matrix @ (along, row, 1).
-    n_rows, n_along : of the grid.
+    n_rows, n_along : size of the grid.
 
     Returns
     -------
     grey levels, shape (n_frames, n_rows, n_along).
     """
     out = np.empty((len(luma), n_rows, n_along), luma.dtype)
-    parts, runs = _grid(np.asarray(matrix, np.float32), n_rows, n_along)
-    if luma.dtype in (np.uint8, np.uint16) and len(runs) * SHORTEST_RUN_PX <= n_rows * n_along:
-        _interpolate(luma, parts, runs, np.float32(np.iinfo(luma.dtype).max), out.reshape(len(luma), -1))
+    fractions, runs = _grid(np.asarray(matrix, np.float32), n_rows, n_along)
+    if luma.dtype in (np.uint8, np.uint16) and len(runs) * MIN_MEAN_RUN_PX <= n_rows * n_along:
+        _interpolate(luma, fractions, runs, np.float32(np.iinfo(luma.dtype).max), out.reshape(len(luma), -1))
         return out
     import cv2
 
@@ -57,12 +60,13 @@ def warp_all(luma: NDArray[Any], matrix: NDArray[np.float64], n_rows: int, n_alo
 
 @njit(cache=True, nogil=True)
 def _grid(matrix: np.ndarray, n_rows: int, n_along: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where a grid lies between pixels, shape (2, n_rows, n_along + VECTOR), along and across; and runs of neighbours.
+    """Return the subpixel positions of a grid and the runs of pixels that are neighbours in the picture.
 
-    A run is (row, first, behind the last, picture's row, column less place), shape (n_runs, 5), of the pixel before.
-    Rounded as OpenCV does.
+    Positions, along and across, have shape (2, n_rows, n_along + VECTOR). A run is (row, first, one behind the last,
+    row in the picture, column in the picture less column of the grid), shape (n_runs, 5), of the pixel one before the
+    position in either direction. Positions are rounded as in OpenCV.
     """
-    parts = np.zeros((2, n_rows, n_along + VECTOR), np.float32)
+    fractions = np.zeros((2, n_rows, n_along + VECTOR), np.float32)
     runs = np.empty((n_rows * n_along, 5), np.int64)
     column, row = np.empty(n_along, np.float32), np.empty(n_along, np.float32)
     count = 0
@@ -73,7 +77,7 @@ def _grid(matrix: np.ndarray, n_rows: int, n_along: int) -> tuple[np.ndarray, np
             x = matrix[0, 0] * np.float32(s) + x0
             y = matrix[1, 0] * np.float32(s) + y0
             column[s], row[s] = np.floor(x) - np.float32(s), np.floor(y)
-            parts[0, u, s], parts[1, u, s] = x - np.floor(x), y - np.floor(y)
+            fractions[0, u, s], fractions[1, u, s] = x - np.floor(x), y - np.floor(y)
         first = 0
         while first < n_along:
             last = first + 1
@@ -83,95 +87,100 @@ def _grid(matrix: np.ndarray, n_rows: int, n_along: int) -> tuple[np.ndarray, np
             runs[count, 3], runs[count, 4] = int(row[first]) - 1, int(column[first]) - 1
             count += 1
             first = last
-    return parts, runs[:count].copy()
+    return fractions, runs[:count].copy()
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _weights(x: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Weights of four neighbours, of which the second lies `x` before the place asked for."""
-    unity, a = np.float32(1.0), SHARPNESS
+    """Bicubic weights of four neighbours; the position lies `x` after the second of them."""
+    unit, a = np.float32(1.0), CUBIC_COEFFICIENT
     two, three, five, eight = np.float32(2.0), np.float32(3.0), np.float32(5.0), np.float32(8.0)
-    far, y = x + unity, unity - x
+    far, y = x + unit, unit - x
     before = ((a * far - five * a) * far + eight * a) * far - np.float32(4.0) * a
-    left = ((a + two) * x - (a + three)) * x * x + unity
-    right = ((a + two) * y - (a + three)) * y * y + unity
-    return before, left, right, unity - before - left - right
+    left = ((a + two) * x - (a + three)) * x * x + unit
+    right = ((a + two) * y - (a + three)) * y * y + unit
+    return before, left, right, unit - before - left - right
 
 
-@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy")
-def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np.float32, out: np.ndarray) -> None:
+@njit(cache=True, nogil=True, fastmath=CONTRACT_FASTMATH, error_model="numpy")
+def _interpolate(
+    luma: np.ndarray, fractions: np.ndarray, runs: np.ndarray, max_value: np.float32, out: np.ndarray
+) -> None:
     """Fill `out`, shape (n_frames, n_rows * n_along), run by run; see `_grid`.
 
-    Whole vectors are computed; what is too much of the last unity is overwritten by the next run.
+    Whole vectors are computed; the excess of the last one is overwritten by the next run.
     """
     n, height, width = luma.shape
     top = max(0, runs[:, 3].min())
     bottom = max(top + 1, min(height, runs[:, 3].max() + 4))
     rows = np.zeros((bottom - top, width + VECTOR), np.float32)
     for t in range(n):
-        picture, made = luma[t], out[t]
+        picture, row_out = luma[t], out[t]
         for y in range(bottom - top):
             source, target = picture[top + y], rows[y]
             for s in range(width):
                 target[s] = np.float32(source[s])
-        _interpolate_one(picture, rows, top, parts, runs, most, made)
+        _interpolate_one(picture, rows, top, fractions, runs, max_value, row_out)
 
 
-@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", **NO_REFCOUNT)
+@njit(cache=True, nogil=True, fastmath=CONTRACT_FASTMATH, error_model="numpy", **NO_REFCOUNT)
 def _interpolate_one(
-    picture: np.ndarray, rows: np.ndarray, top: int, parts: np.ndarray, runs: np.ndarray, most: np.float32,
-    made: np.ndarray,
+    picture: np.ndarray, rows: np.ndarray, top: int, fractions: np.ndarray, runs: np.ndarray, max_value: np.float32,
+    row_out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill `made`, shape (n_rows * n_along,), from one picture; `rows` are those from `top` on in single precision."""
+    """Fill `row_out`, shape (n_rows * n_along,), from one picture.
+
+    `rows` are the rows of the picture from `top` on, in single precision.
+    """
     height, width = picture.shape
     bottom = top + len(rows)
-    n_along = parts.shape[2] - VECTOR
-    nothing = np.float32(0.0)
+    n_along = fractions.shape[2] - VECTOR
+    zero = np.float32(0.0)
     for i in range(len(runs)):
-        u, first, last, y, lead = runs[i]
+        u, first, last, y, column_offset = runs[i]
         begin, end, place = first, first, u * n_along
         if y >= top and y + 4 <= bottom:
-            begin = min(max(first, -lead), last)
-            end = max(min(last, width - 3 - lead), begin)
-            full = end - begin + (begin - end) % VECTOR
-            full = full if place + begin + full <= made.size else end - begin
-            at, j = begin + lead, y - top
+            begin = min(max(first, -column_offset), last)
+            end = max(min(last, width - 3 - column_offset), begin)
+            vector_length = end - begin + (begin - end) % VECTOR
+            vector_length = vector_length if place + begin + vector_length <= row_out.size else end - begin
+            at, j = begin + column_offset, y - top
             a, b, c, d = rows[j, at:], rows[j + 1, at:], rows[j + 2, at:], rows[j + 3, at:]
-            p, q, line = parts[0, u, begin:], parts[1, u, begin:], made[place + begin :]
-            for s in range(full):
+            p, q, line = fractions[0, u, begin:], fractions[1, u, begin:], row_out[place + begin :]
+            for s in range(vector_length):
                 x0, x1, x2, x3 = _weights(p[s])
                 y0, y1, y2, y3 = _weights(q[s])
                 value = y0 * (x0 * a[s] + x1 * a[s + 1] + x2 * a[s + 2] + x3 * a[s + 3])
                 value += y1 * (x0 * b[s] + x1 * b[s + 1] + x2 * b[s + 2] + x3 * b[s + 3])
                 value += y2 * (x0 * c[s] + x1 * c[s + 1] + x2 * c[s + 2] + x3 * c[s + 3])
                 value += y3 * (x0 * d[s] + x1 * d[s + 1] + x2 * d[s + 2] + x3 * d[s + 3])
-                line[s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
+                line[s] = np.int32((min(max(value, zero), max_value) + ROUNDING_CONSTANT) - ROUNDING_CONSTANT)
         for s in range(first, last):
             if begin <= s < end:
                 continue
-            across, value = _weights(parts[1, u, s]), nothing
-            along = _weights(parts[0, u, s])
+            across, value = _weights(fractions[1, u, s]), zero
+            along = _weights(fractions[0, u, s])
             for k in range(4):
                 neighbours = picture[min(max(y + k, 0), height - 1)]
-                total = nothing
+                total = zero
                 for j in range(4):
-                    total += along[j] * neighbours[min(max(s + lead + j, 0), width - 1)]
+                    total += along[j] * neighbours[min(max(s + column_offset + j, 0), width - 1)]
                 value += across[k] * total
-            made[place + s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
+            row_out[place + s] = np.int32((min(max(value, zero), max_value) + ROUNDING_CONSTANT) - ROUNDING_CONSTANT)
 
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
-    """Values at whole pixels along the axis and at `rows_px` (consecutive) across; shape (n, n_rows, n_along).
+    """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along).
 
-    An axis along the picture's own rows or columns is cut out without interpolation, moved by less than half a
-    pixel for it; `shift_px` (n, 2) moves every frame back by its own shift.
+    An axis along rows or columns of the picture is sliced without interpolation, after moving it by less than half a
+    pixel. Given `shift_px`, every frame is interpolated at its own displacement.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
-    rows_px : consecutive distances beside the axis, shape (n_rows,), px.
-    shift_px : shake of every frame along and across, shape (n_frames, 2), px.
+    rows_px : consecutive distances from the axis, shape (n_rows,), px.
+    shift_px : displacement of every frame along and across, shape (n_frames, 2), px; None for none.
 
     Returns
     -------
@@ -195,12 +204,12 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
 
 
 def _matrix(along: Floats, across: Floats, origin: Floats) -> Floats:
-    """Matrix of places in the picture: matrix @ (along, row, 1), shape (2, 3)."""
+    """Matrix from (along, row, 1) to x and y in the picture, shape (2, 3)."""
     return np.array([[along[0], across[0], origin[0]], [along[1], across[1], origin[1]]])
 
 
 def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
-    """Whole pixels of an axis that runs along rows or columns of the picture; outside it the border repeats."""
+    """Slice whole pixels of an axis along rows or columns of the picture; beyond the picture its border is repeated."""
     x = np.rint(
         start[0] + np.arange(n_along) * along[0] if abs(along[0]) > 0.5 else start[0] + np.arange(n_rows) * across[0]
     )
@@ -214,7 +223,7 @@ def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_r
 
 
 def _take(luma: NDArray[Any], index: NDArray[np.int_], dim: int) -> NDArray[Any]:
-    """Consecutive indices as a view, others as a copy."""
+    """Index one dimension: consecutive indices as a view, others as a copy."""
     steps = np.diff(index)
     if len(steps) and np.all(steps == 1):
         chosen = slice(int(index[0]), int(index[-1]) + 1)

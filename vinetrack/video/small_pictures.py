@@ -1,8 +1,8 @@
-"""The frames of a recording, shrunk, and when each of their pixels changes: where an axis is sought.
+"""Shrunk frames of a recording and the time at which each pixel changes: input of the search for the axis.
 
-Not all that changes is growth. A door that swings away, a hand or a payload passes over many pixels, and where the
-door stood at first it is gone. What an everting tube brings stays where it is, and stands out from its surroundings in
-the last pictures but not in the first: `SmallPictures.grown` are the pixels that change so.
+Not every change is growth. A door, a hand or a payload passes over many pixels, and a door leaves the place where it
+stood at first. What an everting tube covers stays covered, and differs from its surroundings in the last pictures but
+not in the first: `SmallPictures.grown` selects the pixels that change in this way.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.order_kernels import (
-    BINS_A_LEVEL,
+    BINS_PER_LEVEL,
     block_means,
     largest_changes,
     largest_steps,
@@ -24,44 +24,47 @@ from vinetrack.video.order_kernels import (
 )
 
 SMALL_PX = 240
-"""Longest side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide;
-at half a thin vine is lost, at twice time is fourfold."""
+"""Longer side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide; at half a
+thin vine is lost, at twice computing time is fourfold."""
 MAX_FRAMES = 150
-"""Frames, spread evenly over the changes, in which it is sought. Chosen for time; they resolve 1 % of the growth."""
+"""Maximum number of frames in which it is sought, spread evenly over the changes. Chosen for speed; they resolve 1 % of
+the growth."""
 BUSIEST_PIXELS = 200
-"""Pixels of a small picture whose mean change is its activity. Chosen: the area of a thin vine's tip; half or twice
-changes only how the MAX_FRAMES frames are spread over the changes."""
-GROWN = 0.4
-"""Part of a pixel's change that lasts, times the part by which it stands out at the end, from which growth may have
-brought it. Measured on 40 short tubes beside long doors (`benchmarks/long_doors.py`, seeds 71001-71040) and 40 drawn by
-other code, axes more than 5 degrees off: 8 and 2 at 0.4, 7 and none at 0.2, 6 and 4 at 0.6; 15 and 24 with all that
-changes."""
-LEAST_GROWN = 0.16
-"""Part of all change that must be such, or all that changes is asked: a vine that sweeps leaves what it has covered.
-Chosen between 0.08 of a real vine that sweeps and 0.32, the least of those 40; at half that vine counts as one that
-stays, at twice two of those 40 do not."""
-AROUND_PX = 4.0
-"""Distance, in the small pictures, over which what has not changed tells how a pixel's surroundings look. Chosen:
-between the widths of thin and wide tubes. Measured on the same: 6 and 4 axes are off at half, 8 and none at twice."""
-ENDS = 12
-"""Part of the pictures, a twelfth, whose median is the first and the last of them. Chosen: more than two, so that a
-single one that is spoilt does not count; by reasoning, nothing changes at half or twice while it rests so long."""
-TOLERANCE, LEAST_TOLERANCE = 0.03, 2.0
-"""Part of the pictures, and number of them, by which a change may miss the front that brings it. Chosen: the tip's
-shape and blur are within it. By reasoning: at half round tips fall out of order, at twice doors come into it."""
-LEAST_SURPRISE = 0.05
-"""Chosen: so that what all changes at once, as where a vine takes two pictures, tells as well. Half or twice changes
-nothing where anything else does."""
+"""Number of pixels of a small picture whose mean change is its activity. Chosen: the area of a thin vine's tip; half or
+twice changes only how the MAX_FRAMES frames are spread over the changes."""
+MIN_GROWTH_SCORE = 0.4
+"""Score of a pixel (the part of its change that lasts, times the part by which it stands out at the end) from which
+growth may have caused the change. Measured on 40 short tubes beside long doors (`benchmarks/long_doors.py`, seeds
+71001-71040) and 40 drawn by other code, axes more than 5 degrees off: 8 and 2 at 0.4, 7 and none at 0.2, 6 and 4 at
+0.6; 15 and 24 if all changes are used."""
+MIN_GROWN_PART = 0.16
+"""Part of all change that must pass MIN_GROWTH_SCORE; otherwise all changes are used: a sweeping vine leaves what it
+has covered. Chosen between 0.08 of a real vine that sweeps and 0.32, the smallest of those 40; at half that vine counts
+as one that stays, at twice two of those 40 do not."""
+SURROUNDINGS_PX = 4.0
+"""Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel. Chosen: between the
+widths of thin and wide tubes. Measured on the same recordings: 6 and 4 axes are off at half, 8 and none at twice."""
+END_DIVISOR = 12
+"""One in so many pictures at either end are averaged (median) into the first and last appearance. Chosen: at least two,
+so that a single bad picture does not count; by reasoning, nothing changes at half or twice while the scene rests that
+long."""
+TOLERANCE, MIN_TOLERANCE = 0.03, 2.0
+"""Time by which the change of a pixel may differ from the passage of the front: part of the pictures, and minimum
+number of pictures. Chosen: it covers the tip's shape and blur. By reasoning: at half round tips fall out of order, at
+twice doors come within it."""
+MIN_TIMING_INFORMATION = 0.05
+"""Minimum information of a change, in nats. Chosen so that a recording in which everything changes at once, as where a
+vine takes two pictures, still gives an answer. Half or twice changes nothing in other recordings."""
 
 Pixels = tuple[Floats, Floats, Floats, Floats, int]
-"""Pixels that change: x, y, when and worth, shape (n_pixels,) each; and the number of times looked at."""
+"""Pixels that change: x, y, time of change and weight, shape (n_pixels,) each; and the number of pictures."""
 
 
 class SmallPictures:
-    """The frames of a recording, shrunk once for all that look for its axis.
+    """The frames of a recording, shrunk once for every step that looks for its axis.
 
-    `frames` has shape (n_frames, height, width) in grey levels of 255, free of flicker; `factor` is by how much they
-    shrank and `shape` the height and width before, px.
+    `frames`, shape (n_frames, height, width), are in grey levels of 255, corrected for flicker; `factor` is the factor
+    by which they were shrunk and `shape` their original height and width, px.
     """
 
     def __init__(self, luma: NDArray[Any]) -> None:
@@ -70,8 +73,8 @@ class SmallPictures:
 
     @cached_property
     def _busy(self) -> tuple[NDArray[np.float32], float]:
-        """The frames that are looked at, and the variance of their noise."""
-        return _looked_at(self.frames)
+        """Frames in which something changes, and the variance of their noise."""
+        return _frames_with_change(self.frames)
 
     @cached_property
     def changed(self) -> Pixels:
@@ -80,22 +83,22 @@ class SmallPictures:
 
     @cached_property
     def grown(self) -> Pixels:
-        """Pixels that change as where a tube grows: what comes stays, and stands out where nothing did.
+        """Pixels that change as in growth: the change lasts, and stands out where nothing did before.
 
-        Their worth is less where many change at once, as where a door comes to rest. It is `changed` itself where
-        hardly any of it stays (LEAST_GROWN).
+        Their weight is reduced where many change at the same time, as where a door comes to rest. If hardly any change
+        lasts (MIN_GROWN_PART), this is `changed`.
         """
-        x, y, time, worth, n_times = self.changed
+        x, y, time, weight, n_times = self.changed
         if not len(x):
             return self.changed
         frames, noise = self._busy
         rows, columns = y.astype(int), x.astype(int)
-        lasting = _lasting_part(frames[:, rows, columns].astype(float), time.astype(int), noise)
-        kept = lasting * _standing_out(frames, rows, columns, noise) > GROWN
-        if worth[kept].sum() < LEAST_GROWN * worth.sum():
+        lasting = _step_fraction(frames[:, rows, columns].astype(float), time.astype(int), noise)
+        kept = lasting * _contrast_gain(frames, rows, columns, noise) > MIN_GROWTH_SCORE
+        if weight[kept].sum() < MIN_GROWN_PART * weight.sum():
             return self.changed
-        worth = worth[kept] * _surprise(time[kept], worth[kept], n_times)
-        return x[kept], y[kept], time[kept], worth, n_times
+        weight = weight[kept] * _timing_information(time[kept], weight[kept], n_times)
+        return x[kept], y[kept], time[kept], weight, n_times
 
 
 def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
@@ -104,30 +107,30 @@ def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
     Parameters
     ----------
     small : brightness, shape (n_frames, height, width).
-    count : frames, from the first, within which they change.
+    count : number of frames, from the first, that are used.
 
     Returns
     -------
     the pixels.
     """
-    return _changed(*_looked_at(small[:count]))
+    return _changed(*_frames_with_change(small[:count]))
 
 
-def _looked_at(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """Frames in which something changes, and the variance of their noise."""
+def _frames_with_change(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """Return the frames in which something changes, and the variance of their noise."""
     busy = small[_busy_frames(small)]
     return busy, _noise_power(busy)
 
 
 def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
-    when, worth = _changes(busy, noise_power)
-    rows, columns = np.nonzero(worth > 0)
+    when, weight = _changes(busy, noise_power)
+    rows, columns = np.nonzero(weight > 0)
     time = when[rows, columns].astype(float)
-    return columns.astype(float), rows.astype(float), time, worth[rows, columns].astype(float), len(busy)
+    return columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), len(busy)
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
-    """Pictures no longer than SMALL_PX, brightness freed of flicker, and the factor by which they shrank."""
+    """Shrink pictures to at most SMALL_PX and correct flicker; also return the factor."""
     import cv2
 
     n, height, width = luma.shape
@@ -144,7 +147,7 @@ def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
 
 
 def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
-    """At most MAX_FRAMES frames, spread evenly over what changes rather than over time."""
+    """Select at most MAX_FRAMES frames, spread evenly over the changes rather than over time."""
     n = len(small)
     if n <= MAX_FRAMES:
         return np.arange(n)
@@ -156,7 +159,7 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
 
 
 def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
-    """Frame at which each pixel changes most and for good, and what that change is worth; shapes (height, width)."""
+    """Frame of the largest lasting change of each pixel, and its weight; shapes (height, width)."""
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
     when, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
@@ -165,62 +168,66 @@ def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[n
 
 
 def _noise_power(frames: NDArray[np.float32]) -> float:
-    """Variance of the noise of a pixel, of a picture's quantisation at least."""
+    """Variance of the noise of a pixel, at least that of quantisation."""
     changes = np.abs(np.diff(frames[:: max(1, len(frames) // 30), ::2, ::2], axis=0)).ravel()
-    noise = 1.4826 * float(median(changes, np.ones(changes.size, np.int8), BINS_A_LEVEL)) / np.sqrt(2)
+    noise = 1.4826 * float(median(changes, np.ones(changes.size, np.int8), BINS_PER_LEVEL)) / np.sqrt(2)
     return max(noise, 0.7) ** 2
 
 
-def _lasting_part(values: Floats, when: NDArray[np.int_], noise_power: float) -> Floats:
-    """Part of each pixel's variance, but for noise, that one step at `when` explains, shape (n_pixels,).
+def _step_fraction(values: Floats, when: NDArray[np.int_], noise_power: float) -> Floats:
+    """Fraction of each pixel's variance, beyond noise, that a single step at `when` explains, shape (n_pixels,).
 
-    `values` has shape (n_frames, n_pixels). What passes leaves a pixel as it was, and hardly any is explained.
+    `values` has shape (n_frames, n_pixels). A passing object leaves a pixel as it was, so that a step explains hardly
+    any.
     """
     n, sums = len(values), np.cumsum(values, axis=0)
     before = np.take_along_axis(sums, np.maximum(when - 1, 0)[None], axis=0)[0]
     step = before / np.maximum(when, 1) - (sums[-1] - before) / np.maximum(n - when, 1)
     explained = when * (n - when) / n * step**2
-    left = np.maximum(n * values.var(axis=0) - explained - n * noise_power, 0.0)
-    return explained / np.maximum(explained + left, 1e-9)
+    unexplained = np.maximum(n * values.var(axis=0) - explained - n * noise_power, 0.0)
+    return explained / np.maximum(explained + unexplained, 1e-9)
 
 
-def _standing_out(
+def _contrast_gain(
     frames: NDArray[np.float32], rows: NDArray[np.int_], columns: NDArray[np.int_], noise_power: float
 ) -> Floats:
-    """How much more pixels that changed differ from their surroundings at the end than at the beginning, (n_pixels,).
+    """How much more changed pixels differ from their surroundings at the end than at the beginning, shape (n_pixels,).
 
-    1 where they did not differ at first, 0 where they do not at last. The surroundings are what did not change, on the
-    side where it tells most: film beside film that stands already differs from the ground above and below.
+    1 if they did not differ at first, 0 if they do not differ at the end. The surroundings are unchanged pixels, on the
+    side where the contrast is most informative: film beside film that already stands differs from the ground above and
+    below.
     """
     import cv2
 
-    count = max(2, len(frames) // ENDS)
+    count = max(2, len(frames) // END_DIVISOR)
     ends = [np.median(frames[:count], axis=0), np.median(frames[-count:], axis=0)]
     still = np.ones(frames.shape[1:], np.float32)
     still[rows, columns] = 0.0
-    grounds = [_sides(picture * still) for picture in (*ends, np.ones_like(still))]
+    grounds = [_side_sums(picture * still) for picture in (*ends, np.ones_like(still))]
     out = np.zeros(len(rows))
     for first, last, weight in zip(*grounds, strict=True):
-        seen = np.maximum(weight, 1e-9)
+        total_weight = np.maximum(weight, 1e-9)
         before, after = (
-            cv2.blur((picture - ground / seen) ** 2, (3, 3))[rows, columns]
+            cv2.blur((picture - ground / total_weight) ** 2, (3, 3))[rows, columns]
             for picture, ground in zip(ends, (first, last), strict=True)
         )
-        out = np.maximum(out, np.where(seen[rows, columns] > 1e-6, after / (before + after + 2 * noise_power), 0.0))
+        out = np.maximum(
+            out, np.where(total_weight[rows, columns] > 1e-6, after / (before + after + 2 * noise_power), 0.0)
+        )
     return out
 
 
-def _sides(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """Sums over what lies left, right, above and below of each pixel; far off counts where nothing is near."""
+def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Sum the pixels left, right, above and below of each pixel; distant ones count where none is near."""
     import cv2
 
     out = [np.zeros_like(picture) for _ in range(4)]
     for share, reach in ((1.0, 1), (1e-2, 4), (1e-4, 16)):
-        # Wide filters work on a picture that is shrunk by as much as they are wider.
+        # Wider filters are applied to a picture shrunk by the same factor.
         height, width = picture.shape
         shrunk = cv2.resize(picture, (-(-width // reach), -(-height // reach)), interpolation=cv2.INTER_AREA)
-        size = 2 * min(round(3 * AROUND_PX), max(shrunk.shape)) + 1
-        whole = cv2.getGaussianKernel(size, AROUND_PX, cv2.CV_32F).ravel()
+        size = 2 * min(round(3 * SURROUNDINGS_PX), max(shrunk.shape)) + 1
+        whole = cv2.getGaussianKernel(size, SURROUNDINGS_PX, cv2.CV_32F).ravel()
         back, ahead = whole.copy(), whole.copy()
         back[size // 2 + 1 :] = ahead[: size // 2] = 0.0
         for side, (along, across) in zip(
@@ -232,25 +239,26 @@ def _sides(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 
 def order_tolerance(n_times: int) -> float:
-    """How much earlier or later than the front a pixel may change that it passes, in pictures.
+    """Return by how many pictures a pixel may change before or after the front passes it.
 
     Parameters
     ----------
-    n_times : pictures that are looked at.
+    n_times : number of pictures.
 
     Returns
     -------
     pictures.
     """
-    return max(LEAST_TOLERANCE, TOLERANCE * n_times)
+    return max(MIN_TOLERANCE, TOLERANCE * n_times)
 
 
-def _surprise(time: Floats, worth: Floats, n_times: int) -> Floats:
-    """How much it tells that a pixel changes just when a front passes it, shape (n_pixels,).
+def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
+    """Information of a pixel changing just when a front passes it, in nats, shape (n_pixels,).
 
-    It is the logarithm of how seldom any pixel changes then: where much changes at once, order says little.
+    It is minus the logarithm of the fraction of all change that occurs at that time: where much changes at once, the
+    order of changes says little.
     """
-    by_time = np.bincount(time.astype(int), worth, n_times)
+    by_time = np.bincount(time.astype(int), weight, n_times)
     span = int(order_tolerance(n_times))
     share = np.convolve(by_time, np.ones(2 * span + 1))[span : span + n_times] / by_time.sum()
-    return np.asarray(LEAST_SURPRISE - np.log(np.minimum(share[time.astype(int)], 1.0)))
+    return np.asarray(MIN_TIMING_INFORMATION - np.log(np.minimum(share[time.astype(int)], 1.0)))

@@ -15,18 +15,18 @@ from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.registration import (
-    PIXELS,
     REFERENCE_FRAMES,
+    SHAKE_CONVERGED_PX,
     SHAKE_FLOOR_PX,
     SHAKE_ROUNDS,
-    SHAKE_SETTLED_PX,
     SHAKE_STEP_PX,
+    SHIFT_PIXELS,
     Reference,
     camera_unit,
     register,
-    shaken_alike,
+    shifts_agree,
 )
-from vinetrack.video.strip import GAP_PX
+from vinetrack.video.strip import BAND_GAP_PX
 
 GROUND_PX = 120
 """Distance from the tube within which background counts. Chosen: some thousand pixels lie there, in the plane in which
@@ -50,10 +50,10 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
     level = Axis((0.0, 0.0), (float(max(width - 1, 10)), 0.0))
     y, x = (values.ravel() for values in np.mgrid[2 : height - 2 : 2, 2 : width - 2 : 2])
     across = np.abs(axis.along_and_across(np.column_stack([x, y]).astype(float))[1])
-    still = (across > half_px + GAP_PX) & (across < half_px + GROUND_PX)
-    if np.count_nonzero(still) < PIXELS // 10:
+    still = (across > half_px + BAND_GAP_PX) & (across < half_px + GROUND_PX)
+    if np.count_nonzero(still) < SHIFT_PIXELS // 10:
         return None
-    every = max(1, np.count_nonzero(still) // PIXELS)
+    every = max(1, np.count_nonzero(still) // SHIFT_PIXELS)
     x, y = x[still][::every], y[still][::every]
     sampled = np.unique(np.linspace(0, len(luma) - 1, REFERENCE_FRAMES).astype(int))
     picture, unit = np.median(luma[sampled], axis=0), camera_unit(luma)
@@ -62,7 +62,7 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
     (first, first_sd), (second, second_sd) = (register(luma, level, half, None, unit) for half in halves)
     shake_px = float(np.median(np.abs(np.concatenate([first[:, 2:], second[:, 2:]]))))
     sd_sum = float(np.median(first_sd + second_sd))
-    if not shake_px > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or not shaken_alike(luma, level, halves, unit):
+    if not shake_px > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or not shifts_agree(luma, level, halves, unit):
         return None
     whole = _reference(picture, x, y)
     shift = np.zeros((len(luma), 2))
@@ -70,7 +70,7 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
         fit, _ = register(luma, level, whole, shift if turn else None, unit)
         step = np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
         shift = shift + step
-        if np.abs(step).max() < SHAKE_SETTLED_PX:
+        if np.abs(step).max() < SHAKE_CONVERGED_PX:
             break
         if turn == 0:
             whole = _reference(np.median(_moved_back(luma[sampled], shift[sampled]), axis=0), x, y)

@@ -1,6 +1,7 @@
-"""A straight strip along the axis, cut from every frame, freed of flicker and of camera shake.
+"""A straight strip along the axis, cut from every frame, corrected for flicker and camera shake.
 
-The bands beside the tube show what stands still: each frame's gain and shift come from them (`registration`).
+The bands of background beside the tube stand still; each frame's gain and shift are estimated from them
+(`registration`).
 """
 
 from __future__ import annotations
@@ -13,28 +14,29 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
-from vinetrack.video.registration import camera_unit, steady
+from vinetrack.video.registration import camera_unit, stabilise
 from vinetrack.video.resample import sample
 
-GAP_PX = 5
-"""Rows left out between tube and band, for sway and blur. Chosen; at half a swaying tube enters the bands, at twice
-small pictures have none."""
-FORGIVEN_PX = 0.4
-"""Slope of an axis over its whole length under which it counts as lying along rows or columns. Chosen: rows then lag by
-a fifth of a pixel at most. At half more strips are interpolated, at twice rows lag by up to 0.4 px."""
-BAND_PX = (14, 44)
-"""Least and greatest height of a band. Chosen: at the least, two bands hold PIXELS along 320 px of axis. Half or twice
-changes how well flicker is known."""
+BAND_GAP_PX = 5
+"""Rows left out between tube and band, to allow for sway and blur. Chosen; at half a swaying tube enters the bands, at
+twice small pictures have no bands."""
+SNAP_TOLERANCE_PX = 0.4
+"""Slope of an axis over its whole length up to which it is treated as lying along rows or columns. Chosen: rows then
+lag by a fifth of a pixel at most. At half more strips are interpolated, at twice rows lag by up to 0.4 px."""
+BAND_HEIGHT_PX = (14, 44)
+"""Minimum and maximum height of a band. Chosen: at the minimum, two bands hold SHIFT_PIXELS of `registration` along 320
+px of axis. Half or twice changes how accurately flicker is known."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Pixels along the axis of every frame.
+    """Pixels along the axis in every frame.
 
-    `values` has shape (n_frames, n_across, n_along), as the camera wrote them; `scale * values + offset` (shape
-    (n_frames,) each) is in grey levels of 255, free of flicker. `shift_px`, shape (n_frames, 2), is how far the
-    picture had moved along and across (already undone); `noise` the standard deviation of a pixel, grey levels.
-    `axis` runs through column 0 and along the middle row.
+    `values`, shape (n_frames, n_across, n_along), are as the camera wrote them; `scale * values + offset`, shape
+    (n_frames,) each, is in grey levels of 255 and free of flicker. `shift_px`, shape (n_frames, 2), is the displacement
+    of the picture along and across the axis, already removed from the values; `noise` is the standard deviation of a
+    pixel, grey levels. `axis` runs through column 0 and along the middle row. `steadied` tells whether camera shake was
+    removed.
     """
 
     values: NDArray[Any]
@@ -47,19 +49,19 @@ class Strip:
 
     @property
     def shake_px(self) -> Floats | None:
-        """`shift_px` where a shake was taken off, else None."""
+        """`shift_px` if camera shake was removed, else None."""
         return self.shift_px if self.steadied else None
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = False) -> Strip:
-    """Cut, level and steady the strip on both sides of an axis.
+    """Cut the strip on both sides of an axis; correct flicker and camera shake.
 
     Parameters
     ----------
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
     half_px : half the height of the strip, px.
-    still : whether the pictures are known not to shake: they are levelled alone.
+    still : True if the camera is known not to shake: only flicker is then corrected.
 
     Returns
     -------
@@ -72,13 +74,13 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = Fals
     scale, offset, shift = np.full(n, unit), np.zeros(n), np.zeros((n, 2))
     steadied = False
     if bands:
-        scale, offset, shift, steadied = steady(luma, axis, bands, unit, still)
+        scale, offset, shift, steadied = stabilise(luma, axis, bands, unit, still)
     values = sample(luma, axis, np.arange(-half, half + 1), shift if steadied else None)
     return Strip(values, scale, offset, shift, _noise(values, scale), axis, steadied)
 
 
 def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
-    """Cut the same frames along a slightly different axis; gain and shift are those of `strip`.
+    """Cut the same frames along a slightly different axis, with the gain and shift of `strip`.
 
     Parameters
     ----------
@@ -96,39 +98,39 @@ def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip
     return replace(strip, values=values, axis=axis)
 
 
-def squared(axis: Axis, forgiven_px: float = FORGIVEN_PX) -> Axis:
-    """The axis turned and moved onto whole rows or columns where it lies along them already but for a small slope.
+def snap_to_grid(axis: Axis, tolerance_px: float = SNAP_TOLERANCE_PX) -> Axis:
+    """Move an axis that lies along rows or columns, except for a small slope, onto whole rows or columns.
 
-    Cutting is then exact, and takes a tenth of the time.
+    Cutting then needs no interpolation, and a tenth of the time.
 
     Parameters
     ----------
     axis : in the picture, px.
-    forgiven_px : slope over the whole length that is forgiven, px.
+    tolerance_px : slope over the whole length up to which the axis is moved, px.
 
     Returns
     -------
-    the axis, or the same where it slopes by more or is a curve.
+    the moved axis; the given one if it slopes by more or is a curve.
     """
     if type(axis) is not Axis:
         return axis
     (x0, y0), (x1, y1) = axis.from_px, axis.to_px
-    if abs(y1 - y0) <= forgiven_px and abs(x1 - x0) > 10:
+    if abs(y1 - y0) <= tolerance_px and abs(x1 - x0) > 10:
         y = round((y0 + y1) / 2)
         return Axis((round(x0), y), (round(x1), y), axis.width_px)
-    if abs(x1 - x0) <= forgiven_px and abs(y1 - y0) > 10:
+    if abs(x1 - x0) <= tolerance_px and abs(y1 - y0) > 10:
         x = round((x0 + x1) / 2)
         return Axis((x, round(y0)), (x, round(y1)), axis.width_px)
     return axis
 
 
 def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np.int_]]:
-    """Rows of the bands on both sides, as far as they lie inside the picture along the whole axis."""
+    """Rows of the bands on both sides that lie inside the picture along the whole axis."""
     height, width = shape
     bands = []
-    deep = int(np.clip(half, *BAND_PX))
+    depth = int(np.clip(half, *BAND_HEIGHT_PX))
     for side in (-1, 1):
-        rows = np.arange(half + GAP_PX, half + GAP_PX + deep) * side
+        rows = np.arange(half + BAND_GAP_PX, half + BAND_GAP_PX + depth) * side
         ends = axis.points(np.array([[0.0], [axis.length_px]]), rows[None, :].astype(float))
         inside = ((ends > -0.5) & (ends < [width - 0.5, height - 0.5])).all(axis=(0, 2))
         kept = np.sort(rows[inside])
@@ -138,14 +140,14 @@ def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np
 
 
 def _noise(values: NDArray[Any], scale: Floats) -> float:
-    """Standard deviation of a pixel from the differences of neighbouring frames, grey levels, at least 1.
+    """Estimate the standard deviation of a pixel from differences of neighbouring frames, grey levels, at least 1.
 
-    The median over frames and pixels: motion touches few of them. Compression freezes a resting picture; what moves
-    is never known better than a grey level.
+    Medians over pixels are used, since motion affects few of them. The minimum is needed because compression freezes a
+    picture at rest, while moving pixels are never known better than to a grey level.
     """
     step = max(1, len(values) // 40)
     first, second = values[:-1:step, ::4, ::4], values[1::step, ::4, ::4]
     n = min(len(first), len(second))
     change = np.abs(second[:n].astype(np.float32) - first[:n].astype(np.float32))
-    middle = np.median(change, axis=(1, 2)) if n else np.zeros(1)
-    return max(1.0, float(np.quantile(middle, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))
+    medians = np.median(change, axis=(1, 2)) if n else np.zeros(1)
+    return max(1.0, float(np.quantile(medians, 0.7)) * 1.4826 / np.sqrt(2) * float(np.median(scale)))

@@ -12,7 +12,7 @@ from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import CENTRED_PX, cut_along, outline_stretches, recentred_curve
 from vinetrack.video.edge import Outline, outline
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import Strip, recut, squared
+from vinetrack.video.strip import Strip, recut, snap_to_grid
 
 MOST_RECUTS = 3
 """Most times that the strip is cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew
@@ -50,7 +50,7 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
     """
     if front_share_of(axis) < LEAST_FRONT_SHARE:
         return None
-    strip = first = cut_along(luma, squared(axis, FIRST_SLOPE * axis.width_px), 0.65 * axis.width_px + 3)
+    strip = first = cut_along(luma, snap_to_grid(axis, FIRST_SLOPE * axis.width_px), 0.65 * axis.width_px + 3)
     tube = outline(strip, outline_stretches(axis))
     try:
         for _ in range(2 * MOST_RECUTS if axis.bends else MOST_RECUTS):
@@ -93,4 +93,4 @@ def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
     start = strip.axis.points(np.array(0.0), shift)
     stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
     turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return recut(strip, luma, squared(turned), half * 1.15 + 5)
+    return recut(strip, luma, snap_to_grid(turned), half * 1.15 + 5)
