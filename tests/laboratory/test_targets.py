@@ -81,7 +81,7 @@ def test_target_in_a_trials_recording_hangs_where_it_is_told(shake_px):
     target = replace(CHECKER, squares=(11, 3), square_m=0.02)
     scene = replace(SCENE, target=target, door=None, origin_px=(60.0, 20.0), shake_px=shake_px)
     renderer = FrameRenderer(scene, np.zeros_like, n_frames=3, capture_fps=1000.0)
-    moved = renderer.staging.shake_px(float(renderer.staging.mid_exposure_s(2)))
+    moved = renderer.scene_motion.shake_px(float(renderer.scene_motion.mid_exposure_s(2)))
     where_m = np.array(target.centre_m) + np.array(moved) * CAMERA.m_per_px
     expected = corners_by_opencv(replace(target, centre_m=tuple(where_m)), CAMERA)
     measured = crossings(renderer.frame(2), expected)

@@ -1,4 +1,7 @@
-"""Frames become a file: H.264 as cameras write it, other codecs, folders and stacks of pictures; and its faults."""
+"""Writing of rendered frames to files, and file faults.
+
+Formats are H.264 as in cameras, other codecs, and folders and stacks of images.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ Frame = NDArray[np.uint8 | np.uint16]
 
 
 class Renderer(Protocol):
-    """What can be written: anything that renders frames by number."""
+    """Interface of what can be written: anything that renders frames by index."""
 
     scene: Scene
     seed: int
@@ -29,9 +32,9 @@ class Renderer(Protocol):
 
         Parameters
         ----------
-        frame : its number.
-        low : level of black.
-        span : levels from black to full scale; all of the bit depth if None.
+        frame : index of the frame.
+        low : black level.
+        span : levels from black to full scale; None for the full bit depth.
 
         Returns
         -------
@@ -47,25 +50,25 @@ CODECS = {"h264": "libx264", "ffv1": "ffv1", "mjpeg": "mjpeg", "raw": "rawvideo"
 GREY_FORMATS = {8: "gray", 10: "gray10le", 12: "gray12le", 16: "gray16le"}
 LIMITED_RANGE, FULL_RANGE = 1, 2
 """Codes of the H.264 stream for 16…235 and 0…255. Defined by FFmpeg (AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG)."""
-HEADER_SHARE = 0.15
-"""Share of a file left alone when bytes are damaged: the index at its front is well inside. Chosen: 85 % of the file
-may then be damaged."""
+HEADER_FRACTION = 0.15
+"""Fraction of a file that is spared when bytes are damaged: it contains the index at the front. Chosen: 85 % of the
+file can then be damaged."""
 TINT = (12, -8)
-"""How far (U, V) of a colour recording lie from grey: a warm wall and bluish film under LED lamps. Chosen by eye;
+"""Offsets (U, V) of a colour recording from grey: a warm wall and bluish film under LED lamps. Chosen by eye;
 brightness, which is what trackers read, does not depend on it."""
 
 
 def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> None:
-    """Write frames `order` of `renderer` to `path`, whole or not at all, then apply the scene's file faults.
+    """Write frames `order` of `renderer` to `path`, completely or not at all, then apply the scene's file faults.
 
-    A path without ending becomes a folder of `frame_000000.png` and so on; `NAME.dng`, `NAME.jpg`, `NAME.tiff` and
-    `NAME.png` as *folder* names choose another format and lose that ending.
+    A path without ending becomes a folder of numbered images, `frame_000000.png` and so on, in the format of
+    `encoding.codec` if that is png, tiff, jpg or dng.
 
     Parameters
     ----------
-    renderer : of the scene.
-    order : frame of the renderer that each frame of the file shows, shape (n_frames,); −1 for rubbish.
-    path : its ending chooses the form.
+    renderer : renders the frames.
+    order : frame of the renderer that each frame of the file shows, shape (n_frames,); −1 for garbage.
+    path : its ending sets the form.
 
     Raises
     ------
@@ -98,17 +101,17 @@ def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> 
 def _frames(
     renderer: Renderer, order: NDArray[np.int_], low: float = 0.0, span: float | None = None
 ) -> Iterator[Frame]:
-    """Grey frames in the order of the file; rubbish for −1."""
+    """Yield grey frames in the order of the file; garbage for −1."""
     camera, sensor = renderer.scene.camera, renderer.scene.sensor
     for index in order:
         if index >= 0:
             yield renderer.frame(int(index), low=low, span=span)
         else:
-            yield _rubbish(camera.height_px, camera.width_px, sensor.bit_depth, renderer.seed)
+            yield _garbage(camera.height_px, camera.width_px, sensor.bit_depth, renderer.seed)
 
 
-def _rubbish(height: int, width: int, bit_depth: int, seed: int) -> Frame:
-    """A frame as a camera writes it when its buffer was not ready: bands of noise and black."""
+def _garbage(height: int, width: int, bit_depth: int, seed: int) -> Frame:
+    """A frame as written by a camera whose buffer was not ready: bands of noise and black."""
     rng = np.random.default_rng([seed, 77])
     full = 2**bit_depth - 1
     bands = rng.integers(0, 2, size=(height // 16 + 1, 1)).repeat(16, axis=0)[:height]
@@ -132,9 +135,9 @@ def _write_video(renderer: Renderer, order: NDArray[np.int_], path: Path) -> Non
         if encoding.codec == "h264":
             stream.gop_size = encoding.gop
             stream.codec_context.color_range = LIMITED_RANGE if _is_limited(scene) else FULL_RANGE
-        for count, levels_frame in enumerate(_frames(renderer, order, *levels)):
+        for index, levels_frame in enumerate(_frames(renderer, order, *levels)):
             picture = _picture(levels_frame, pixel_format, chroma)
-            picture.pts = count
+            picture.pts = index
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
 
@@ -144,7 +147,7 @@ def _is_limited(scene: Scene) -> bool:
 
 
 def _video_levels(scene: Scene) -> tuple[float, float | None]:
-    """Level of black and span to white: 16…235 where the range is limited, everything otherwise."""
+    """Black level and span to white: 16…235 for limited range, otherwise the full range."""
     return (16.0, 219.0) if _is_limited(scene) else (0.0, None)
 
 
@@ -178,7 +181,7 @@ def _codec_options(encoding: Encoding) -> dict[str, str]:
 
 
 def _chroma(scene: Scene) -> tuple[Frame, Frame] | None:
-    """The two colour planes at half resolution; they do not move, since film is seen through."""
+    """The two colour planes at half resolution, constant in time, since film is transparent; None for a grey scene."""
     if not scene.sensor.colour:
         return None
     rows, columns = (scene.camera.height_px + 1) // 2, (scene.camera.width_px + 1) // 2
@@ -187,7 +190,7 @@ def _chroma(scene: Scene) -> tuple[Frame, Frame] | None:
 
 
 def _picture(levels: Frame, pixel_format: str, chroma: tuple[Frame, Frame] | None) -> Any:
-    """A PyAV frame that holds `levels` as its first plane, without a conversion."""
+    """Make a PyAV frame with `levels` as its first plane, without conversion."""
     import av
 
     height, width = levels.shape
@@ -207,7 +210,7 @@ def _fill(plane: Any, values: Frame) -> None:
 
 
 def _in_colour(levels: Frame, scene: Scene) -> Frame:
-    """BGR picture of `levels` with the scene's tint, for pictures in files; unchanged where the scene is grey."""
+    """Return a BGR picture of `levels` with the scene's tint, for image files; unchanged if the scene is grey."""
     import cv2
 
     chroma = _chroma(scene)
@@ -223,22 +226,22 @@ def _in_colour(levels: Frame, scene: Scene) -> Frame:
     return np.asarray(np.round(bgr), dtype=levels.dtype)
 
 
-def _spread(levels: Frame, bit_depth: int) -> Frame:
-    """10 and 12 bits as 16-bit files hold them: in the lower bits, unchanged."""
+def _as_stored(levels: Frame, bit_depth: int) -> Frame:
+    """Return 10- and 12-bit values as 16-bit files hold them: in the lower bits, unchanged."""
     return levels if bit_depth <= 8 else levels.astype(np.uint16)
 
 
 def _write_pictures(frames: Iterator[Frame], folder: Path, scene: Scene, renderer: Renderer) -> None:
-    """Numbered pictures in the format of the scene's `encoding.codec`: png, tiff, jpg or dng; png for any other."""
+    """Write numbered images: png, tiff, jpg or dng by the scene's `encoding.codec`; png for other codecs."""
     import cv2
 
     ending = scene.encoding.codec if scene.encoding.codec in PICTURE_FORMATS else "png"
-    for count, levels in enumerate(frames):
-        path = folder / f"frame_{count:06d}.{ending}"
+    for index, levels in enumerate(frames):
+        path = folder / f"frame_{index:06d}.{ending}"
         if ending == "dng":
             _write_dng(path, levels, scene.sensor.bit_depth, renderer.capture_fps, renderer.exposure_s)
             continue
-        picture = _in_colour(_spread(levels, scene.sensor.bit_depth), scene)
+        picture = _in_colour(_as_stored(levels, scene.sensor.bit_depth), scene)
         settings = [cv2.IMWRITE_PNG_COMPRESSION, 1] if ending == "png" else []
         if not cv2.imwrite(str(path), picture, settings):
             raise ValueError(f"{path}: the picture could not be written; is the disk full?")
@@ -268,12 +271,12 @@ def _write_dng(path: Path, levels: Frame, bit_depth: int, capture_fps: float, ex
 
 
 def _damage(path: Path, scene: Scene, seed: int) -> None:
-    """Overwrite bytes past the header, then cut the file, as the scene's faults say."""
+    """Overwrite bytes behind the header, then truncate the file, according to the scene's faults."""
     faults = scene.faults
     if faults.damaged_fraction > 0:
         content = np.fromfile(path, dtype=np.uint8)
         rng = np.random.default_rng([seed, 78])
-        run, start = 64, int(HEADER_SHARE * content.size)
+        run, start = 64, int(HEADER_FRACTION * content.size)
         runs = max(1, int(faults.damaged_fraction * (content.size - start) / run))
         for place in rng.integers(start, max(content.size - run, start + 1), size=runs):
             content[place : place + run] = rng.integers(0, 256, size=content[place : place + run].size)

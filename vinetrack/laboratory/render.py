@@ -1,14 +1,14 @@
-"""Rendering of a motion as a recording: pictures of a scene, frame by frame, and the truth of each.
+"""Rendering of a motion as a recording: the frames of a scene, and the true positions in each.
 
 **The leading edge** is the foremost point of the tube on its own centreline. A sharp picture of it would be a step
-there; optics and pixel blur that step with a Gaussian of `psf_px`, the exposure with the tip's own motion, so that at
-constant speed the half-way point of the blurred step is the tip at mid-exposure, to which the truth refers.
-`lead_position_m` is the tip's travel in the plane of growth, `lead_px` its distance from the path's start in plane
-pixels, `tip_x_px`, `tip_y_px` where it is in the picture as recorded: after shake, tilt and distortion.
-For a body that moves as a whole the same holds for its foremost point.
+there; optics and pixel blur that step with a Gaussian of `psf_px`, the exposure blurs it with the tip's own motion. At
+constant speed, the half-way point of the blurred step is therefore the tip at mid-exposure, to which the truth refers.
+`lead_position_m` is the tip's travel in the plane of growth, `lead_px` its distance from the start of the path in plane
+pixels, and `tip_x_px`, `tip_y_px` its position in the picture as recorded, including shake, tilt and distortion. For a
+body that moves as a whole, the same holds for its foremost point.
 
-Everted film stays where it is; the tail inside moves at twice the tip's speed and is blurred accordingly; a body's
-texture moves with it.
+Everted film stays in place; the tail inside moves at twice the tip's speed and is blurred accordingly; the texture of a
+body moves with it.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from vinetrack.laboratory.targets import lay_target, plane_seen
 Image = NDArray[np.float32]
 
 TONE_STEPS = 4096
-"""Entries of the table of a sensor's gamma: a sixteenth of an 8-bit level. Derived: 4096/256 = 16 entries a level."""
+"""Entries of the lookup table of a sensor's gamma. Derived: 4096/256 = 16 entries per 8-bit level."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a recording shows. Arrays have shape (n_frames,), one entry for every frame in the file, in order.
+    """True positions in a recording. Arrays have shape (n_frames,), one entry per frame of the file, in order.
 
-    `source_frame` is the frame of the undisturbed recording that is shown; `time_s` its mid-exposure; `in_frame` says
-    whether the tip is inside the picture; −1 and NaN where a frame shows nothing. Positions are defined in the module
-    docstring.
+    `source_frame` is the frame of the undisturbed recording that is shown, `time_s` its mid-exposure; `in_frame` tells
+    whether the tip is inside the picture. Frames that show nothing have −1 and NaN. The module docstring defines the
+    positions.
     """
 
     source_frame: NDArray[np.int_]
@@ -55,11 +55,11 @@ class Truth:
     exposure_s: float
 
     def write_csv(self, path: Path) -> None:
-        """Write one row for each frame.
+        """Write one row per frame.
 
         Parameters
         ----------
-        path : of the table; its folder is made where it is missing.
+        path : path of the table; its folder is created if missing.
         """
         names = ("source_frame", "time_s", "lead_position_m", "lead_px", "tip_x_px", "tip_y_px", "in_frame")
         table = np.column_stack([np.asarray(getattr(self, name), dtype=float) for name in names])
@@ -100,7 +100,7 @@ class FrameRenderer:
                 f"An exposure of {self.exposure_s * 1e6:.0f} µs does not fit between frames at {capture_fps:g} a "
                 "second; choose a shorter one."
             )
-        self.staging = SceneMotion(
+        self.scene_motion = SceneMotion(
             scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=self.exposure_s, seed=seed
         )
         maps = PathMaps(scene)
@@ -108,18 +108,18 @@ class FrameRenderer:
         rng = np.random.default_rng([seed, 2])
         self._subject: TubeLayer | BallLayer
         if isinstance(scene.subject, Tube):
-            self._subject = TubeLayer(self.staging, maps, rng)
+            self._subject = TubeLayer(self.scene_motion, maps, rng)
         else:
             radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
-            staging = self.staging
+            scene_motion = self.scene_motion
             self._subject = BallLayer(
-                staging, maps, rng, scene.subject, lambda time_s: staging.lead_px(time_s) - radius
+                scene_motion, maps, rng, scene.subject, lambda time_s: scene_motion.lead_px(time_s) - radius
             )
-        self._door = DoorLayer(self.staging, scene.door) if scene.door else None
+        self._door = DoorLayer(self.scene_motion, scene.door) if scene.door else None
         self._prepare_sensor()
 
     def _hang_backdrop(self, maps: PathMaps) -> None:
-        """Paint the backdrop on plane pixels and project it through the lens once, for frames without shake."""
+        """Paint the backdrop on plane pixels; project it through the lens once, for frames without shake."""
         margin = 4 + math.ceil(4 * self.scene.shake_px)
         x0, y0 = (math.floor(part.min()) - margin for part in (maps.plane_x, maps.plane_y))
         x1, y1 = (math.ceil(part.max()) + margin for part in (maps.plane_x, maps.plane_y))
@@ -137,7 +137,7 @@ class FrameRenderer:
             self._still = lay_target(self._still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
-        """Gain of every pixel (vignetting, fixed pattern), normal deviates and the table of the gamma."""
+        """Prepare the gain of every pixel (vignetting, fixed pattern), normal deviates and the gamma table."""
         from scipy.special import ndtri
 
         rng = np.random.default_rng([self.seed, 3])
@@ -155,17 +155,17 @@ class FrameRenderer:
         self._tone = (np.linspace(0, 1, steps + 1) ** (1 / sensor.gamma)).astype(np.float32)
 
     def radiance(self, frame: int) -> Image:
-        """Return the light that reaches the sensor, before lamps, gain and noise.
+        """Return the radiance at the sensor, before lamps, gain and noise.
 
         Parameters
         ----------
-        frame : its number.
+        frame : index of the frame.
 
         Returns
         -------
         fraction of full scale, shape (height, width).
         """
-        shake = self.staging.shake_px(float(self.staging.mid_exposure_s(frame)))
+        shake = self.scene_motion.shake_px(float(self.scene_motion.mid_exposure_s(frame)))
         light = self._still.copy()
         if shake != (0.0, 0.0):
             shading.sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, *shake, light)
@@ -176,7 +176,7 @@ class FrameRenderer:
         return light
 
     def backdrop(self) -> Image:
-        """Light of the static scene, shape (height, width)."""
+        """Radiance of the static scene, shape (height, width)."""
         return self._still.copy()
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
@@ -184,9 +184,9 @@ class FrameRenderer:
 
         Parameters
         ----------
-        frame : its number.
-        low : level of black.
-        span : levels from black to full scale; all of the bit depth if None.
+        frame : index of the frame.
+        low : black level.
+        span : levels from black to full scale; None for the full bit depth.
 
         Returns
         -------
@@ -197,13 +197,13 @@ class FrameRenderer:
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None
     ) -> NDArray[np.uint8 | np.uint16]:
-        """Turn light into grey levels with the lamps, gain and noise of one frame.
+        """Convert radiance to grey levels with the lamps, gain and noise of one frame.
 
         Parameters
         ----------
-        light : fraction of full scale, shape (height, width).
-        frame : its number.
-        low, span : as of `frame`.
+        light : radiance, fraction of full scale, shape (height, width).
+        frame : index of the frame.
+        low, span : as in `frame`.
 
         Returns
         -------
@@ -214,28 +214,28 @@ class FrameRenderer:
         well_e = sensor.full_well_e if sensor.noise else 0.0
         full = float(2**sensor.bit_depth - 1 if span is None else span)
         shading.expose(
-            light, self._gain, self.staging.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
+            light, self._gain, self.scene_motion.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
             self._normals, self._tone, low, full, out,
         )  # fmt: skip
         return out
 
     def truth(self, source_frame: NDArray[np.int_]) -> Truth:
-        """Return what frames show.
+        """Return the true positions in given frames.
 
         Parameters
         ----------
-        source_frame : frame of the renderer for each frame of a file, shape (n,); −1: nothing.
+        source_frame : frame of the renderer for each frame of the file, shape (n,); −1 for none.
 
         Returns
         -------
-        the truth, an entry each; NaN where nothing is shown.
+        the truth, one entry per frame; NaN where nothing is shown.
         """
         shown = source_frame >= 0
         blank = np.where(shown, 0.0, np.nan)
-        time_s = self.staging.mid_exposure_s(np.maximum(source_frame, 0))
-        along = self.staging.lead_px(time_s)
+        time_s = self.scene_motion.mid_exposure_s(np.maximum(source_frame, 0))
+        along = self.scene_motion.lead_px(time_s)
         camera = self.scene.camera
-        tip = camera.picture_from_plane(self.staging.tip_plane_px(time_s))
+        tip = camera.picture_from_plane(self.scene_motion.tip_plane_px(time_s))
         inside = ((tip >= -0.5) & (tip <= np.array([camera.width_px, camera.height_px]) - 0.5)).all(axis=1)
         return Truth(
             source_frame=np.asarray(source_frame),
@@ -246,23 +246,23 @@ class FrameRenderer:
             tip_y_px=tip[:, 1] + blank,
             in_frame=inside & shown,
             m_per_px=camera.m_per_px,
-            release_s=self.staging.release_s,
+            release_s=self.scene_motion.release_s,
             capture_fps=self.capture_fps,
             exposure_s=self.exposure_s,
         )
 
 
 def frame_order(scene: Scene, n_frames: int) -> NDArray[np.int_]:
-    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a spoiled frame.
+    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a corrupt frame.
 
     Parameters
     ----------
-    scene : its `faults` drop, repeat and spoil frames.
-    n_frames : of the undisturbed recording.
+    scene : its `faults` drop, repeat and corrupt frames.
+    n_frames : number of frames of the undisturbed recording.
 
     Returns
     -------
-    shape (n_frames of the file,).
+    frame indices, shape (n_frames of the file,).
     """
     faults = scene.faults
     order: list[int] = []
@@ -289,29 +289,29 @@ def render_recording(
 ) -> Truth:
     """Film `motion` in `scene` and write the recording to `out_path`.
 
-    The ending chooses the form: .mp4, .mov, .mkv, .avi with the scene's codec; .tif, .tiff one stack; no ending a
-    folder of numbered pictures (see `encode.write_recording`). `truth_path`, a CSV, should lie outside the folder
-    that an experiment's analysis is given. Returns the truth, one entry for each frame of the file.
+    The ending sets the form: .mp4, .mov, .mkv, .avi a film with the scene's codec; .tif, .tiff one stack; no ending a
+    folder of numbered images (see `encode.write_recording`). `truth_path`, a CSV, should lie outside the folder that
+    the analysis of the experiment is given.
 
     Parameters
     ----------
-    scene : what stands before the camera.
+    scene : the scene in front of the camera.
     motion : position of the leading edge, m: a function of time, s, or samples (time, position).
-    n_frames : of the undisturbed recording.
-    capture_fps : frames per second.
-    out_path : of the recording.
-    exposure_s : of a frame; the scene's fraction of a frame if None.
-    seed : of noise and textures.
-    truth_path : a CSV of the truth; none is written if None.
+    n_frames : number of frames of the undisturbed recording.
+    capture_fps : capture rate, frames per second.
+    out_path : path of the recording.
+    exposure_s : exposure time, s; None for the scene's fraction of the frame period.
+    seed : seed of noise and textures.
+    truth_path : path of a CSV of the truth; None to write none.
 
     Returns
     -------
-    the truth, an entry for each frame of the file.
+    the truth, one entry per frame of the file.
 
     Raises
     ------
     ValueError
-        If the exposure is longer than the time between frames or the scene cannot be written in that form.
+        If the exposure is longer than the frame period, or the scene cannot be written in that form.
     """
     from vinetrack.laboratory.encode import write_recording
 

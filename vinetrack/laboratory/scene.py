@@ -1,7 +1,7 @@
-"""Settings and presets of a scene of the virtual laboratory: objects, light, camera, sensor, recording.
+"""Settings and presets of a scene in the virtual laboratory: objects, light, camera, sensor, recording.
 
-Brightness is radiance as a fraction of the sensor's full scale. Lengths that end in `_px` are plane pixels (see
-`camera`). Presets are made by `preset(name)`; `dataclasses.replace` changes them.
+Brightness is radiance as a fraction of the sensor's full scale. Lengths ending in `_px` are in plane pixels (see
+`camera`). `preset(name)` makes a preset; `dataclasses.replace` changes it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from vinetrack.laboratory.targets import Target
 class Tube:
     """An everting tube, seen from the side.
 
-    `opacity` is that of one look through the everted wall at its middle; `brightness` of the film where it is opaque;
-    `texture` and `tail_texture` relative contrasts (standard deviation) of wrinkles on the everted wall and on the
-    tail; `tail_width` the tail's share of the diameter; `tip_roundness` the corner radius of the tip over the tube's
-    radius (1: a hemisphere, 0.5: the torus that a folded film makes, always flat around the axis);
-    `tip_glow` extra brightness of the fold; `reflection` strength of the tube's mirror image in a panel behind;
-    `wobble_px` sideways sway where the tip is after `length_m` of growth. The payload rides on the tail's end, 0
-    diameter for none, and flies on at the speed of the tail when that end comes out.
+    `opacity` is that of the everted wall, both layers, at the middle of the tube; `brightness` that of opaque film.
+    `texture` and `tail_texture` are the relative contrasts (standard deviations) of wrinkles on the everted wall and on
+    the tail. `tail_width` is the width of the tail as a fraction of the diameter; `tip_roundness` the corner radius of
+    the tip over the radius of the tube (1: a hemisphere, 0.5: the torus of a folded film, always flat around the axis).
+    `tip_glow` is extra brightness of the fold; `reflection` the strength of the tube's mirror image in a panel behind
+    it; `wobble_px` the sideways sway of the tip after `length_m` of growth. The payload rides on the end of the tail
+    (diameter 0: none) and flies on at the speed of the tail once that end comes out.
     """
 
     diameter_m: float = 0.024
@@ -46,7 +46,7 @@ class Tube:
 
 @dataclass(frozen=True, kw_only=True)
 class Ball:
-    """A body that moves as a whole (travel ratio 1): a sphere with a texture and two glints of the lamps."""
+    """A body that moves as a whole (travel ratio 1): a textured sphere with two highlights of the lamps."""
 
     diameter_m: float = 0.020
     brightness: float = 0.45
@@ -56,7 +56,10 @@ class Ball:
 
 @dataclass(frozen=True, kw_only=True)
 class Door:
-    """The latched door before the tip: starts to swing `lead_s` before the tip moves, is open after `swing_s`."""
+    """The latched door in front of the tip.
+
+    It starts to swing `lead_s` before the tip moves and is open after `swing_s`.
+    """
 
     brightness: float = 0.55
     length_m: float = 0.034
@@ -68,7 +71,7 @@ class Door:
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """What is behind: mean brightness, its rise along the path across the picture, contrast of its texture, things."""
+    """The background: brightness, its increase along the path, contrast of its texture, and objects in it."""
 
     brightness: float = 0.25
     gradient: float = 0.05
@@ -80,7 +83,7 @@ class Backdrop:
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """Flicker of the lamps (relative amplitude; twice the mains' frequency) and relative darkening at the corners."""
+    """Flicker of the lamps (relative amplitude, at twice the mains frequency) and vignetting at the corners."""
 
     flicker: float = 0.0
     flicker_Hz: float = 100.0
@@ -89,7 +92,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """Noise and quantisation. `fixed_pattern` is the relative spread of pixel gains; `gamma` 1 keeps levels linear."""
+    """Noise and quantisation. `fixed_pattern`: relative scatter of pixel gains; `gamma` 1: linear levels."""
 
     full_well_e: float = 9000.0
     read_noise_e: float = 28.0
@@ -102,10 +105,10 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Encoding:
-    """How the file is written; the container or the image format follow from the path's ending.
+    """How the file is written; the ending of the path sets the container or image format.
 
-    `codec`: h264, ffv1, mjpeg or raw. With `bitrate_Mbit_s` the stream is held near that rate at `container_fps`, as
-    cameras do; without it, `crf` holds. `limited_range` maps full scale to 16…235, as video does.
+    `codec`: h264, ffv1, mjpeg or raw. With `bitrate_Mbit_s` the bit rate is held near that value at `container_fps`, as
+    in cameras; without it `crf` applies. `limited_range` maps full scale to 16…235, as is usual for video.
     """
 
     codec: str = "h264"
@@ -119,11 +122,11 @@ class Encoding:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """What can be wrong with a recording.
+    """Faults of a recording.
 
-    `dropped`: frames the camera missed; `repeated`: frames written twice in a row; `wrong_second_frame`: the second
-    one shows another moment; `corrupt_first_frame`: the first one is rubbish; `keep_fraction`: share of the file left
-    after it was cut short; `damaged_fraction`: share of the bytes past the header that are overwritten.
+    `dropped`: frames that the camera missed; `repeated`: frames written twice in a row; `wrong_second_frame`: the
+    second frame shows another moment; `corrupt_first_frame`: the first frame is garbage; `keep_fraction`: fraction of
+    the file left after truncation; `damaged_fraction`: fraction of the bytes behind the header that are overwritten.
     """
 
     dropped: tuple[int, ...] = ()
@@ -136,13 +139,13 @@ class Faults:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Everything that makes a recording but the motion and the frame rate.
+    """Everything that defines a recording except the motion and the frame rate.
 
     `growth_angle_deg` is the direction of growth in the picture, from +x (right) towards +y (down). The path starts at
-    `origin_px` (plane pixels; where it is None, at the border that lets the path run through the middle of the
-    picture) and the tip rests `start_m` after it. `psf_px` is the standard deviation of the optics and pixel together;
-    `shake_px` of the camera's movement; `exposure_fraction` is the exposure over the time between frames. A `target`
-    hangs behind the tube, in the plane of growth.
+    `origin_px` (plane pixels; if None, near the border, such that the path runs through the middle of the picture), and
+    the tip rests `start_m` further on. `psf_px` is the standard deviation of the blur by optics and pixel together;
+    `shake_px` that of the camera's motion; `exposure_fraction` is exposure time over frame period. A `target` hangs
+    behind the tube, in the plane of growth.
     """
 
     camera: Camera = field(default_factory=Camera)
@@ -169,7 +172,7 @@ class Scene:
 
     @property
     def origin(self) -> tuple[float, float]:
-        """Where the path starts, plane pixels: `origin_px`, or 60 px inside the border, upstream of the middle."""
+        """Start of the path, plane pixels: `origin_px`, or 60 px inside the border, upstream of the middle."""
         if self.origin_px is not None:
             return self.origin_px
         cx, cy = self.camera.centre_px
@@ -179,13 +182,13 @@ class Scene:
 
 
 def _camera_like(scene: Scene) -> Scene:
-    """60 Mbit/s at 1280 × 720, as a high-speed camera writes, in proportion to the picture's area."""
+    """Set the bit rate to that of a high-speed camera: 60 Mbit/s at 1280 × 720, in proportion to the picture's area."""
     rate = 60.0 * scene.camera.width_px * scene.camera.height_px / (1280 * 720)
     return replace(scene, encoding=replace(scene.encoding, bitrate_Mbit_s=rate))
 
 
 def _presets() -> dict[str, Scene]:
-    """All presets by name; `clean` and `demo` first, then the harder ones."""
+    """All presets by name; `clean` and `demo` come first, harder ones follow."""
     plain = Backdrop(brightness=0.1, gradient=0, texture=0, ruler=False, launcher=False, clutter=False)
     opaque = Tube(
         opacity=1.0, brightness=0.8, texture=0, tail_texture=0, tail_opacity=0, specular=0, tip_glow=0
@@ -254,7 +257,7 @@ def _presets() -> dict[str, Scene]:
 
 
 PRESETS = tuple(_presets())
-"""Names of presets."""
+"""Names of the presets."""
 
 
 def preset(name: str) -> Scene:
@@ -262,7 +265,7 @@ def preset(name: str) -> Scene:
 
     Parameters
     ----------
-    name : a key of `PRESETS`.
+    name : one of `PRESETS`.
 
     Returns
     -------

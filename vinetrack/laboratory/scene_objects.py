@@ -63,10 +63,10 @@ class PathMaps:
 class TubeLayer:
     """Composites the everting tube with its payload over a frame."""
 
-    def __init__(self, staging: SceneMotion, maps: PathMaps, rng: np.random.Generator) -> None:
-        scene = staging.scene
+    def __init__(self, scene_motion: SceneMotion, maps: PathMaps, rng: np.random.Generator) -> None:
+        scene = scene_motion.scene
         assert isinstance(scene.subject, Tube)
-        self._staging, self._maps, self._tube, self._psf_px = staging, maps, scene.subject, scene.psf_px
+        self._motion, self._maps, self._tube, self._psf_px = scene_motion, maps, scene.subject, scene.psf_px
         self._radius_px = radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
         length = max(math.ceil(float(maps.along.max())) + 8, 64)
         self._wall = textures.film_wall(self._tube, rng, radius, length)
@@ -88,7 +88,7 @@ class TubeLayer:
                 texture=0.1,
                 specular=0.25,
             )
-            self._payload = BallLayer(staging, maps, rng, metal, staging.tail_end_px, emerges_at_px=0.0)
+            self._payload = BallLayer(scene_motion, maps, rng, metal, scene_motion.tail_end_px, emerges_at_px=0.0)
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
         """Lay the tube as exposed in one frame over a picture, in place.
@@ -101,11 +101,11 @@ class TubeLayer:
         """
         if self._payload is not None:
             self._payload.lay(light, frame, shift)
-        staging, tube = self._staging, self._tube
-        middle_s = float(staging.mid_exposure_s(frame))
+        scene_motion, tube = self._motion, self._tube
+        middle_s = float(scene_motion.mid_exposure_s(frame))
         part = np.linspace(0, 1, EXPOSURE_PIECES + 1)
-        path = staging.lead_px(frame / staging.capture_fps + staging.exposure_s * part)
-        tip = float(staging.lead_px(middle_s))
+        path = scene_motion.lead_px(frame / scene_motion.capture_fps + scene_motion.exposure_s * part)
+        tip = float(scene_motion.lead_px(middle_s))
         table, first = self._edge_table(path - tip)
         setback, slope_row, side, core = self._profiles
         tail_from, tail_to = 2 * float(path[0]), 2 * float(path[-1])
@@ -113,10 +113,10 @@ class TubeLayer:
         slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shading.shade_tube(
             light, self._maps.along, self._maps.across, self._first_x, self._last_x, *shift, tip,
-            staging.sway_px(middle_s), staging.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
+            scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
             setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
             tail_to + slack,
-            float(staging.tail_end_px(middle_s)), tube.tail_opacity, tube.brightness, tube.tail_texture,
+            float(scene_motion.tail_end_px(middle_s)), tube.tail_opacity, tube.brightness, tube.tail_texture,
             tube.tip_glow, 0.25 * tube.reflection * tube.brightness, self._ghost_across,
         )  # fmt: skip
 
@@ -171,15 +171,15 @@ class BallLayer:
 
     def __init__(
         self,
-        staging: SceneMotion,
+        scene_motion: SceneMotion,
         maps: PathMaps,
         rng: np.random.Generator,
         ball: Ball,
         centre_px: Callable[[Floats], Floats],
         emerges_at_px: float = -1e9,
     ) -> None:
-        self._staging, self._maps, self._centre_px, self._from_px = staging, maps, centre_px, emerges_at_px
-        self._radius_px = ball.diameter_m / 2 / staging.scene.camera.m_per_px
+        self._motion, self._maps, self._centre_px, self._from_px = scene_motion, maps, centre_px, emerges_at_px
+        self._radius_px = ball.diameter_m / 2 / scene_motion.scene.camera.m_per_px
         self._surface = textures.ball_surface(ball, rng, max(self._radius_px, 2.0))
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
@@ -191,21 +191,21 @@ class BallLayer:
         frame : its number.
         shift : shake along and across the path, px.
         """
-        staging = self._staging
-        begin_s, span_s = frame / staging.capture_fps, staging.exposure_s
+        scene_motion = self._motion
+        begin_s, span_s = frame / scene_motion.capture_fps, scene_motion.exposure_s
         ends = self._centre_px(begin_s + np.array([0, span_s]))
         pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / BALL_STEP_PX), 3), 80))
         path = self._centre_px(begin_s + span_s * (np.arange(pieces) + 0.5) / pieces)
         box = self._box(path, max(abs(part) for part in shift), (light.shape[0], light.shape[1]))
         if box[2] > box[0] and box[3] > box[1]:
             shading.shade_ball(
-                light, self._maps.along, self._maps.across, *shift, path, self._radius_px, staging.scene.psf_px,
+                light, self._maps.along, self._maps.across, *shift, path, self._radius_px, scene_motion.scene.psf_px,
                 self._surface, box, self._from_px,
             )  # fmt: skip
 
     def _box(self, path: Floats, shake: float, shape: tuple[int, int]) -> NDArray[np.int64]:
         """Columns and rows (x0, y0, x1, y1) that the ball can touch."""
-        scene = self._staging.scene
+        scene = self._motion.scene
         reach = 1.15 * (self._radius_px + 6) + 1.5 * shake
         ends = np.array([path.min(), path.max()])[:, None] * np.array(scene.direction) + np.array(scene.origin)
         corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * reach
@@ -218,13 +218,13 @@ class BallLayer:
 class DoorLayer:
     """Composites the door over a frame: a plate hinged beside the resting tip that swings out of the path."""
 
-    def __init__(self, staging: SceneMotion, door: Door) -> None:
-        scene = staging.scene
+    def __init__(self, scene_motion: SceneMotion, door: Door) -> None:
+        scene = scene_motion.scene
         scale = scene.camera.m_per_px
-        self._staging, self._door = staging, door
+        self._motion, self._door = scene_motion, door
         self._length, self._half = door.length_m / scale, door.thickness_m / scale / 2
         radius = scene.subject.diameter_m / 2 / scale
-        self._hinge = np.array([float(staging.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
+        self._hinge = np.array([float(scene_motion.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
 
     def lay(self, light: Image, frame: int, shake: tuple[float, float]) -> None:
         """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure.
@@ -235,8 +235,8 @@ class DoorLayer:
         frame : its number.
         shake : displacement of the picture along x and y, px.
         """
-        times_s = frame / self._staging.capture_fps + self._staging.exposure_s * np.array([0.1, 0.5, 0.9])
-        angles = [self._staging.door_angle_rad(float(t)) for t in times_s]
+        times_s = frame / self._motion.capture_fps + self._motion.exposure_s * np.array([0.1, 0.5, 0.9])
+        angles = [self._motion.door_angle_rad(float(t)) for t in times_s]
         arm = np.array([[-1, -4], [1, -4], [1, self._length], [-1, self._length]]) * [self._half, 1]
         knuckle = np.array([[-2, -7], [2, -7], [2, 5], [-2, 5]]) * [self._half, 1]
         lit = np.array([[0.3, -4], [1, -4], [1, self._length], [0.3, self._length]]) * [self._half, 1]
@@ -250,7 +250,7 @@ class DoorLayer:
         """Fill the outline, turned by each of `angles` about the hinge, each with its share of the exposure."""
         import cv2
 
-        scene = self._staging.scene
+        scene = self._motion.scene
         ux, uy = scene.direction
         axes = np.array([[ux, uy], [-uy, ux]])
         turned = []

@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer: tube, ball and sensor, each one pass over the pixels it touches."""
+"""Compiled loops of the renderer: tube, ball and sensor, one pass each over the pixels that it touches."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Image = NDArray[np.float32]
 Whole = NDArray[np.int64]
 
 NORMAL_BITS = 12
-"""Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level. Chosen;
-each bit more doubles the table."""
+"""Bits of a random number per normal deviate: 4096 quantiles, whose steps are below one grey level. Chosen; each
+further bit doubles the table."""
 TAIL_TAPER_PX = 30.0
 """Length over which the end of the tail, a crumpled bunch of film, fades out. Chosen by eye."""
 
 
 @njit(cache=True)
 def _ramp(z: float) -> float:
-    """Integral of the normal distribution's Φ from −∞ to z: zΦ(z) + φ(z)."""
+    """Integral of the normal distribution function Φ from −∞ to z: zΦ(z) + φ(z)."""
     if z > 8:
         return z
     if z < -8:
@@ -32,19 +32,19 @@ def _ramp(z: float) -> float:
 
 @njit(cache=True)
 def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px: float, n: int) -> Image:
-    """Share of the exposure for which a point has been passed by a blurred edge, shape (len(sigmas_px), n).
+    """Return the fraction of the exposure during which a blurred edge covers a point, shape (len(sigmas_px), n).
 
-    Column i is a point `first_px + i·step_px` ahead of the edge's reference; `path_px` are positions of the edge
-    against that reference at equal times, moving evenly between them, so each piece is integrated exactly:
-    the mean of Φ((p − e)/σ) over p from a to b is σ [ramp((b−e)/σ) − ramp((a−e)/σ)] / (b − a).
+    Column i is the point `first_px + i·step_px` ahead of the edge's reference position. `path_px` are positions of the
+    edge relative to that reference at equal time steps. The edge moves uniformly between them, so that each piece is
+    integrated exactly: the mean of Φ((p − e)/σ) over p from a to b is σ [ramp((b−e)/σ) − ramp((a−e)/σ)] / (b − a).
 
     Parameters
     ----------
-    path_px : positions of the edge at equal times, shape (n_pieces + 1,).
-    sigmas_px : standard deviations of the blur, a row each.
-    first_px : place of column 0.
-    step_px : from column to column.
-    n : columns.
+    path_px : positions of the edge at equal time steps, shape (n_pieces + 1,).
+    sigmas_px : standard deviation of the blur, one per row.
+    first_px : position of column 0.
+    step_px : spacing of the columns.
+    n : number of columns.
 
     Returns
     -------
@@ -73,14 +73,14 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
 
 @njit(cache=True, fastmath=True, nogil=True)
 def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
-    """Backdrop as the camera sees it when everything is moved by (shift_x, shift_y) px; bilinear, into `out`.
+    """Sample the backdrop, displaced by (shift_x, shift_y) px, at every pixel of the camera; bilinear, into `out`.
 
     Parameters
     ----------
     canvas : the backdrop, shape (canvas_height, canvas_width).
-    map_x, map_y : place on the canvas that each pixel sees at rest, shape (height, width), px.
+    map_x, map_y : position on the canvas that each pixel sees without shake, shape (height, width), px.
     shift_x, shift_y : shake of the picture, px.
-    out : written to, shape (height, width).
+    out : output, shape (height, width).
     """
     rows, columns = canvas.shape
     for y in range(out.shape[0]):
@@ -102,28 +102,30 @@ def shade_tube(
     girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
     tail_level: float, tail_contrast: float, fold_glow: float, ghost: float, ghost_across: float,
 ) -> None:  # fmt: skip
-    """Lay the tube over `out` (height, width), in place.
+    """Draw the tube over `out`, in place.
 
-    `along`, `across` are coordinates (px) of each pixel at rest; `first_x`, `last_x` the columns of each row that the
-    tube can touch; `tip_px` the reference of `table` (see `coverage_table`), whose row `fold_row` is the fold's glow;
-    `setback`, `slope_row`, `side`, `core` are profiles over the distance from the axis, `per_px` entries a pixel.
-    The tail's texture is averaged from `tail_from` to `tail_to`, its displacements at both ends of the exposure.
+    For each pixel: the mirror image is added, the tail is laid over the backdrop, then the film over both, in
+    proportion to the coverage by the moving edge. The texture of the tail is averaged over its motion during the
+    exposure.
 
     Parameters
     ----------
-    out : the light so far, fraction of full scale.
-    along, across : coordinates of each pixel at rest, shape (height, width), px.
+    out : radiance so far, fraction of full scale, shape (height, width).
+    along, across : coordinates of each pixel without shake, shape (height, width), px.
     first_x, last_x : columns of each row that the tube can touch, shape (height,).
     shift_along, shift_across : shake, px.
-    tip_px : place of the tip, the reference of `table`.
-    sway, sway_length : sideways displacement, and where along the path, px.
-    table, table_first, table_step, fold_row : covers of the edge, see `coverage_table`, and the row of the fold's glow.
-    setback, slope_row, side, core, per_px : profiles across, see `scene_objects.tip_profiles`, and entries a pixel.
+    tip_px : reference position of the tip in `table`.
+    sway, sway_length : sideways displacement, and the position along the path at which it applies, px.
+    table, table_first, table_step, fold_row : coverage of the edge, see `coverage_table`, and its row for the glow of
+        the fold.
+    setback, slope_row, side, core, per_px : profiles over the distance from the axis, see `scene_objects.tip_profiles`,
+        and their entries per pixel.
     transmission, glow, girth, tail : textures, see `textures`.
-    tail_from, tail_to : displacements of the tail's texture at both ends of the exposure, px.
-    tail_end : where the tail ends along the path, px.
-    tail_opacity, tail_level, tail_contrast : of the tail.
-    fold_glow, ghost, ghost_across : brightness of the fold and of a mirror image, and where that lies across, px.
+    tail_from, tail_to : displacement of the tail's texture at either end of the exposure, px.
+    tail_end : position of the end of the tail along the path, px.
+    tail_opacity, tail_level, tail_contrast : opacity, brightness and contrast of the tail.
+    fold_glow, ghost, ghost_across : brightness of the fold and of the mirror image, and the position of the latter
+        across, px.
     """
     half_profile = (setback.size - 1) // 2
     reach = (half_profile - 1) / per_px
@@ -141,42 +143,42 @@ def shade_tube(
             if ghost > 0 and abs(v - ghost_across) < reach:
                 i = int((v - ghost_across) * per_px + half_profile + 0.5)
                 place = (u + setback[i] - tip_px - table_first) / table_step
-                seen = table[slope_row[i], min(max(int(place), 0), n - 1)] if u > 0 else 0.0
-                out[y, x] += ghost * seen * side[i]
+                reflected = table[slope_row[i], min(max(int(place), 0), n - 1)] if u > 0 else 0.0
+                out[y, x] += ghost * reflected * side[i]
             if u < -1:
                 continue
             v *= girth[min(int(u) + 1, columns - 1)]
             if abs(v) >= reach:
                 continue
             i = int(v * per_px + half_profile)
-            between = np.float32(v * per_px + half_profile - i)
-            back = setback[i] + between * (setback[i + 1] - setback[i])
-            beside = side[i] + between * (side[i + 1] - side[i])
-            place = (u + back - tip_px - table_first) / table_step
+            fraction = np.float32(v * per_px + half_profile - i)
+            setback_here = setback[i] + fraction * (setback[i + 1] - setback[i])
+            side_here = side[i] + fraction * (side[i + 1] - side[i])
+            place = (u + setback_here - tip_px - table_first) / table_step
             if place >= n - 1:
                 continue
             if place <= 0:
-                cover, fold = np.float32(1.0), np.float32(0.0)
+                coverage, fold = np.float32(1.0), np.float32(0.0)
             else:
                 k = int(place)
                 part = np.float32(place - k)
                 row = slope_row[i]
-                cover = table[row, k] + part * (table[row, k + 1] - table[row, k])
+                coverage = table[row, k] + part * (table[row, k + 1] - table[row, k])
                 fold = table[fold_row, k] + part * (table[fold_row, k + 1] - table[fold_row, k])
-            cover *= beside * min(max(u + 0.5, 0.0), 1.0)
-            behind = out[y, x]
+            coverage *= side_here * min(max(u + 0.5, 0.0), 1.0)
+            backdrop = out[y, x]
             if core[i] > 0 and u > tail_end:
                 a, b = (u - tail_to) % period, (u - tail_from) % period
                 if b < a:
                     b += period
-                line = int(v + half_tail + 0.5)
+                tail_row = int(v + half_tail + 0.5)
                 ia = int(a)
-                low = tail[line, ia] + (a - ia) * (tail[line, ia + 1] - tail[line, ia])
+                low = tail[tail_row, ia] + (a - ia) * (tail[tail_row, ia + 1] - tail[tail_row, ia])
                 c = b - period if b >= period else b
                 ic = int(c)
-                high = tail[line, ic] + (c - ic) * (tail[line, ic + 1] - tail[line, ic])
+                high = tail[tail_row, ic] + (c - ic) * (tail[tail_row, ic + 1] - tail[tail_row, ic])
                 weight = tail_opacity * core[i] * min((u - tail_end) / TAIL_TAPER_PX, 1.0)
-                behind += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - behind)
+                backdrop += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - backdrop)
             fu, fv = min(max(u, 0.0), columns - 1.001), v + half_rows
             iu, iv = int(fu), int(fv)
             au, av = np.float32(fu - iu), np.float32(fv - iv)
@@ -184,8 +186,8 @@ def shade_tube(
             t1 = transmission[iv + 1, iu] + au * (transmission[iv + 1, iu + 1] - transmission[iv + 1, iu])
             g0 = glow[iv, iu] + au * (glow[iv, iu + 1] - glow[iv, iu])
             g1 = glow[iv + 1, iu] + au * (glow[iv + 1, iu + 1] - glow[iv + 1, iu])
-            film = behind * (t0 + av * (t1 - t0)) + g0 + av * (g1 - g0) + fold_glow * fold
-            out[y, x] += cover * (film - out[y, x])
+            film = backdrop * (t0 + av * (t1 - t0)) + g0 + av * (g1 - g0) + fold_glow * fold
+            out[y, x] += coverage * (film - out[y, x])
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -193,18 +195,18 @@ def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
     radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
 ) -> None:  # fmt: skip
-    """Lay a ball over `out` within `box` (x0, y0, x1, y1), averaged over its centres `path_px` along the path.
+    """Draw a ball over `out` within `box`, averaged over its positions `path_px` during the exposure.
 
     Parameters
     ----------
-    out : the light so far, fraction of full scale, shape (height, width).
-    along, across : coordinates of each pixel at rest, shape (height, width), px.
+    out : radiance so far, fraction of full scale, shape (height, width).
+    along, across : coordinates of each pixel without shake, shape (height, width), px.
     shift_along, shift_across : shake, px.
-    path_px : centres along the path, shape (n_pieces,).
-    radius_px, sigma_px : of the ball, and of the optical blur.
+    path_px : positions of the centre along the path, shape (n_pieces,).
+    radius_px, sigma_px : radius of the ball, and standard deviation of the optical blur.
     surface : from `textures.ball_surface`.
-    box : x0, y0, x1, y1, pixels that it can touch.
-    min_along : place along the path before which it is hidden, px.
+    box : x0, y0, x1, y1: pixels that the ball can touch.
+    min_along : position along the path before which the ball is hidden, px.
     """
     half = (surface.shape[0] - 1) // 2
     for y in range(box[1], box[3]):
@@ -212,7 +214,7 @@ def shade_ball(
             v = across[y, x] - shift_across
             if abs(v) >= half - 1:
                 continue
-            cover_sum = 0.0
+            coverage_sum = 0.0
             light_sum = 0.0
             place = along[y, x] - shift_along
             for k in range(path_px.size):
@@ -220,15 +222,15 @@ def shade_ball(
                 inside = (radius_px - math.sqrt(u * u + v * v)) / sigma_px
                 if inside < -3.5 or place < min_along or abs(u) >= half - 1:
                     continue
-                cover = 1.0 if inside > 3.5 else 0.5 * (1 + math.erf(inside * 0.7071067811865476))
+                coverage = 1.0 if inside > 3.5 else 0.5 * (1 + math.erf(inside * 0.7071067811865476))
                 fu, fv = u + half, v + half
                 iu, iv = int(fu), int(fv)
                 au, av = fu - iu, fv - iv
                 s0 = surface[iv, iu] + au * (surface[iv, iu + 1] - surface[iv, iu])
                 s1 = surface[iv + 1, iu] + au * (surface[iv + 1, iu + 1] - surface[iv + 1, iu])
-                cover_sum += cover
-                light_sum += cover * (s0 + av * (s1 - s0))
-            out[y, x] += np.float32((light_sum - cover_sum * out[y, x]) / path_px.size)
+                coverage_sum += coverage
+                light_sum += coverage * (s0 + av * (s1 - s0))
+            out[y, x] += np.float32((light_sum - coverage_sum * out[y, x]) / path_px.size)
 
 
 @njit(cache=True)
@@ -244,23 +246,23 @@ def expose(
     light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
     normals: Image, tone: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
 ) -> None:  # fmt: skip
-    """Turn radiance into grey levels with shot and read noise, into `out`; returns nothing.
+    """Convert radiance to grey levels with shot and read noise, into `out`.
 
     Level = low + span · tone(signal); the noise of a signal s has standard deviation √(s·well + read²)/well. Normal
-    deviates are looked up in `normals` (2^NORMAL_BITS quantiles), four for each step of a 64-bit xorshift generator
-    seeded by (seed, frame, row). A `full_well_e` of 0 means no noise.
+    deviates are looked up in `normals` (2^NORMAL_BITS quantiles), four per step of a 64-bit xorshift generator seeded
+    by (seed, frame, row). A `full_well_e` of 0 means no noise.
 
     Parameters
     ----------
-    light : fraction of full scale, shape (height, width).
-    gain : of each pixel, shape (height, width).
+    light : radiance, fraction of full scale, shape (height, width).
+    gain : gain of each pixel, shape (height, width).
     lamp : brightness of the lamps in this frame.
-    full_well_e, read_noise_e : of the sensor, electrons.
-    seed, frame : of the noise.
+    full_well_e, read_noise_e : full-well capacity and read noise of the sensor, electrons.
+    seed, frame : seed of the noise and index of the frame.
     normals : quantiles of the normal distribution, shape (2^NORMAL_BITS,).
-    tone : table of the sensor's gamma; of fewer than three entries for a linear one.
-    low, span : level of black, and levels from black to full scale.
-    out : written to, shape (height, width).
+    tone : lookup table of the sensor's gamma; fewer than three entries for a linear sensor.
+    low, span : black level, and number of levels from black to full scale.
+    out : output, shape (height, width).
     """
     rows, columns = out.shape
     mask = np.uint64((1 << NORMAL_BITS) - 1)
@@ -268,12 +270,12 @@ def expose(
     per_well = np.float32(1.0 / full_well_e) if full_well_e > 0 else np.float32(0.0)
     read2 = np.float32((read_noise_e * per_well) ** 2)
     linear = steps < 2
-    bright = np.float32(lamp)
+    lamp32 = np.float32(lamp)
     for y in range(rows):
         state = _mixed(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + _mixed(np.uint64(frame * 65536 + y + 1)))
         bits = np.uint64(0)
         for x in range(columns):
-            signal = max(light[y, x] * gain[y, x] * bright, np.float32(0.0))
+            signal = max(light[y, x] * gain[y, x] * lamp32, np.float32(0.0))
             if full_well_e > 0:
                 if x % 4 == 0:
                     state ^= state << np.uint64(13)

@@ -1,6 +1,6 @@
 """Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film, tail, ball.
 
-All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that a change of
+All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that changing
 one surface does not change the others.
 """
 
@@ -16,12 +16,12 @@ from vinetrack.laboratory.scene import Ball, Scene, Tube
 Image = NDArray[np.float32]
 
 OVERSAMPLING = 4
-"""Sub-pixels per pixel for drawing lines. Derived: edges are then within half a sub-pixel, 1/8 px, of their
+"""Sub-pixels per pixel for drawing lines. Derived: edges are then within half a sub-pixel, 1/8 px, of their true
 positions."""
 
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
-    """Periodic Gaussian noise of mean 0 and standard deviation 1, smooth over `sigma_y`, `sigma_x` px."""
+    """Periodic Gaussian noise with mean 0 and standard deviation 1, smoothed over `sigma_y`, `sigma_x` px."""
     white = np.fft.rfft2(rng.standard_normal(shape))
     fy = np.fft.fftfreq(shape[0])[:, None]
     fx = np.fft.rfftfreq(shape[1])[None, :]
@@ -32,7 +32,7 @@ def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: flo
 
 
 def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, int]) -> tuple[Image, Image]:
-    """Distances along the path and across it (px) of each canvas pixel, each of shape `shape`."""
+    """Coordinates along the path and across it (px) of each canvas pixel, each of shape `shape`."""
     yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
     ux, uy = scene.direction
@@ -40,7 +40,7 @@ def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, i
 
 
 def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
-    """The wall in the background: a gradient along the path, soft blotches and grain."""
+    """The wall in the background: a gradient along the path, a pool of light, soft blotches and grain."""
     look = scene.backdrop
     shape = (along.shape[0], along.shape[1])
     span = max(float(along.max()), 1.0)
@@ -66,7 +66,7 @@ def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]
 def _axis_matrix(
     scene: Scene, corner: tuple[int, int], along_px: float, across_px: float, turned: bool = False
 ) -> NDArray[np.float64]:
-    """Affine that puts a patch drawn along the path with its top left at (along_px, across_px) on the canvas."""
+    """Affine map of a patch drawn along the path to the canvas; its top left is at (along_px, across_px)."""
     ux, uy = scene.direction
     x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
     y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
@@ -76,7 +76,7 @@ def _axis_matrix(
 
 
 def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
-    """A steel ruler: tick k mm is centred k·px_per_mm from the first column; shape (width_px, length_px)."""
+    """Paint a steel ruler, shape (width_px, length_px): tick k mm is centred k·px_per_mm from the first column."""
     import cv2
 
     k = OVERSAMPLING
@@ -101,7 +101,7 @@ def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random
 
 
 def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -> Image:
-    """The block the tube comes out of: dark anodised aluminium with a knurled clamp ring and screws."""
+    """Paint the block from which the tube grows: dark anodised aluminium with a knurled clamp ring and screws."""
     import cv2
 
     height, width = int(2.9 * radius_px), reach_px
@@ -123,7 +123,7 @@ def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -
 
 
 def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
-    """Out-of-focus objects on the wall: an aluminium profile with its slot, a hose, a label."""
+    """Add out-of-focus objects on the wall: an aluminium profile with its slot, a hose, a label."""
     import cv2
 
     height, width = canvas.shape
@@ -153,14 +153,14 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
 
     Parameters
     ----------
-    scene : backdrop, ruler, launcher.
-    rng : of the textures.
+    scene : supplies backdrop, ruler and launcher.
+    rng : random generator of the textures.
     shape : height and width, plane pixels.
     corner : (x, y) of the first pixel, plane pixels.
 
     Returns
     -------
-    fraction of full scale, of that shape.
+    radiance, fraction of full scale, of that shape.
     """
     import cv2
 
@@ -182,9 +182,9 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
 
 
 def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
-    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, sharp creases at all slants.
+    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, creases in all directions.
 
-    A crease is a bright flank beside a dark one; most are short and lie within 60° of the tube's axis.
+    A crease is a bright flank beside a dark one; most are short and within 60° of the tube's axis.
     """
     import cv2
 
@@ -206,16 +206,16 @@ def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
 
 
 def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px: int) -> tuple[Image, Image]:
-    """Everted wall, at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px).
+    """Paint the everted wall at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px).
 
-    Row `i` lies `i − (rows − 1)/2` px off the axis. Towards its limb a look through the wall crosses more film:
-    transmission (1 − opacity) to the power of 1/√(1 − (v/R)²), kept finite.
+    Row `i` lies `i − (rows − 1)/2` px off the axis. Towards the limb the line of sight crosses more film: the
+    transmission is (1 − opacity) to the power of 1/√(1 − (v/R)²), kept finite.
 
     Parameters
     ----------
-    tube : what is drawn.
-    rng : of the wrinkles.
-    radius_px, length_px : of the tube.
+    tube : properties of the film.
+    rng : random generator of the wrinkles.
+    radius_px, length_px : radius and length of the tube.
 
     Returns
     -------
@@ -238,37 +238,37 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
 
 
 def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
-    """Relative stretch of distances from the axis along the everted wall, shape (length_px,): its sides ripple.
+    """Return the relative stretch of distances from the axis along the everted wall, whose sides ripple.
 
     Parameters
     ----------
-    tube : what is drawn.
-    rng : of the ripples.
-    length_px : of the tube.
+    tube : properties of the film.
+    rng : random generator of the ripples.
+    length_px : length of the tube.
 
     Returns
     -------
-    shape (length_px,), about 1.
+    stretch, about 1, shape (length_px,).
     """
     ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
     return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
 
 
 def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
-    """Running sums along the tail's texture, shape (rows, period_px + 1); the texture is periodic, of mean 0.
+    """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1).
 
-    The mean over any stretch, as motion blur takes it, is a difference of two entries.
+    The mean over any stretch, as in motion blur, is then the difference of two entries over the length.
 
     Parameters
     ----------
-    tube : what is drawn.
-    rng : of the texture.
-    radius_px : of the tube.
+    tube : properties of the tail.
+    rng : random generator of the texture.
+    radius_px : radius of the tube.
     period_px : length after which the texture repeats.
 
     Returns
     -------
-    shape (rows, period_px + 1).
+    running sums, shape (rows, period_px + 1).
     """
     rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
     shape = (rows, period_px)
@@ -280,13 +280,13 @@ def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px:
 
 
 def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Image:
-    """A sphere lit from the upper left, with texture and two glints; square of side 2·(ceil(radius)+4)+1.
+    """Paint a sphere lit from the upper left, with texture and two highlights; square of side 2·(ceil(radius)+4)+1.
 
     Parameters
     ----------
-    ball : what is drawn.
-    rng : of the texture.
-    radius_px : of the ball.
+    ball : properties of the ball.
+    rng : random generator of the texture.
+    radius_px : radius of the ball.
 
     Returns
     -------

@@ -198,8 +198,8 @@ def _normal_sums(
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
     """Sums of the normal equations for edge, amplitude and level, and the weighted sum of squared residuals.
 
-    Weights are those of Student's t with variance + r²/9. In single precision, sixteen pixels at a time: a relative
-    error of 1e-6 is far below that of the edge.
+    The weights 1/(variance + r²/9), as of Student's t with nine degrees of freedom, limit the influence of outliers.
+    In single precision, sixteen pixels at a time: a relative error of 1e-6 is far below that of the edge.
     """
     zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
     yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = zero

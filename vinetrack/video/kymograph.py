@@ -60,8 +60,6 @@ dark ground does not."""
 SIGMA_PX = 0.8
 """Standard error of an arrival: half a pixel of the path's grid, and the ragged outline of a crumpled tip. Chosen; half
 or twice halves or doubles the stated error of such tracks."""
-
-
 START_LEAP_RATIO, MIN_TYPICAL_STEP_PX = 3.0, 2.0
 """A first step more than so many times the median of the four that follow is not growth; that median is taken as at
 least the second number, px. Chosen: starting from rest, steps increase. By reasoning: at half, vines that slow down at
