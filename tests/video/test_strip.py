@@ -59,7 +59,7 @@ def test_shake_is_measured_to_a_twentieth_of_a_pixel():
     plan = Plan(seed=12, shake=0.8, end_px=300, width=420, rest_frames=6, end_frames=4)
     scene = plain_scene(plan)
     strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
-    assert strip.steadied
+    assert strip.stabilised
     phase = np.random.default_rng(plan.seed)
     del phase
     n = np.arange(len(scene.frames))
@@ -73,7 +73,7 @@ def test_shake_is_measured_to_a_twentieth_of_a_pixel():
 def test_a_still_camera_is_not_stabilised():
     scene = plain_scene(Plan(seed=13, end_px=300, width=420, rest_frames=6, end_frames=4))
     strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
-    assert not strip.steadied
+    assert not strip.stabilised
     assert np.all(strip.shift_px == 0)
 
 
@@ -110,4 +110,4 @@ def test_black_background_is_not_used_for_flicker(kind: type) -> None:
     strip = cut_strip(luma, Axis((5.0, 60.0), (195.0, 60.0)), 8)
     assert np.ptp(strip.scale) == 0
     assert not strip.offset.any()
-    assert not strip.steadied
+    assert not strip.stabilised

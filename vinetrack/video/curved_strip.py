@@ -105,7 +105,7 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     shake_px = picture_shake(luma, axis, half) if before is None else before.shake_px
     straight = straightened(luma, axis, half, shake_px)
     strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
-    return strip if shake_px is None else replace(strip, shift_px=shake_px, steadied=True)
+    return strip if shake_px is None else replace(strip, shift_px=shake_px, stabilised=True)
 
 
 def path_error_px(axis: Axis) -> float:
@@ -144,7 +144,7 @@ def shake_along(strip: Strip, edge_px: Floats) -> Floats:
 
     Parameters
     ----------
-    strip : steadied.
+    strip : stabilised.
     edge_px : along its axis, shape (n_frames,), px; NaN where unknown.
 
     Returns

@@ -57,13 +57,13 @@ MARGIN_FRAMES, MARGIN_PART = 40, 0.15
 by less than MIN_CHANGE. By reasoning: at half little rest is left; at twice a short event takes twice the memory."""
 
 
-def read_event(recording: Recording, wanted: tuple[int, int] | None = None) -> Frames:
+def read_event(recording: Recording, frame_range: tuple[int, int] | None = None) -> Frames:
     """Decode the frames that show the event; the whole recording if it is small or if no event stands out.
 
     Parameters
     ----------
     recording : from `inspect_recording`.
-    wanted : first and last frame that the sheet names; None to detect the event.
+    frame_range : first and last frame that the sheet names; None to detect the event.
 
     Returns
     -------
@@ -79,9 +79,9 @@ def read_event(recording: Recording, wanted: tuple[int, int] | None = None) -> F
     if count * recording.width * recording.height * pixel_bytes <= MAX_BYTES_WHOLE:
         return read_frames(recording)
     if recording.raw is not None:
-        return _raw_event(recording, wanted)
+        return _raw_event(recording, frame_range)
     if recording.kind == "container":
-        return _film_event(recording, wanted)
+        return _film_event(recording, frame_range)
     return read_frames(recording)
 
 
@@ -129,23 +129,23 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
     return _with_margin(start, stop, count)
 
 
-def _film_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
+def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
     """Decode the event of a film; the whole film if its packets cannot be assigned to frames."""
     index = packet_index(recording.path)
     if index is None or len(index.pts) < MAX_SAMPLE_INTERVAL:
         return read_frames(recording)
     count = len(index.pts)
-    if wanted is None:
-        wanted = _range_by_packets(recording, index)
-    if wanted is None:
+    if frame_range is None:
+        frame_range = _range_by_packets(recording, index)
+    if frame_range is None:
         pictures, numbers = _sample_film(recording, index)
-        wanted = event_range(pictures, numbers, count)
+        frame_range = event_range(pictures, numbers, count)
         pictures.clear()
-    if wanted is None or wanted[0] >= count:
+    if frame_range is None or frame_range[0] >= count:
         return read_frames(recording)
-    if wanted == (0, count - 1):
+    if frame_range == (0, count - 1):
         return read_frames(recording)
-    return read_frames(recording, part=(wanted[0], min(wanted[1], count - 1), index))
+    return read_frames(recording, part=(frame_range[0], min(frame_range[1], count - 1), index))
 
 
 def _range_by_packets(recording: Recording, index: PacketIndex) -> tuple[int, int] | None:
@@ -220,27 +220,29 @@ def _samples_of(
     return pictures
 
 
-def _raw_event(recording: Recording, wanted: tuple[int, int] | None) -> Frames:
+def _raw_event(recording: Recording, frame_range: tuple[int, int] | None) -> Frames:
     """Read the event of a file in a camera's own format."""
     raw = recording.raw
     assert raw is not None
     count = len(raw.offsets)
-    if wanted is None:
+    if frame_range is None:
         every = max(1, -(-count // MAX_SAMPLES))
         chosen = np.arange(0, count, every)
         sparse = replace(raw, offsets=raw.offsets[::every])
         pictures = [_shrunk(picture, recording.bit_depth) for picture in sparse.pictures()]
-        wanted = event_range(pictures, chosen[: len(pictures)], count)
-    if wanted is None or wanted[0] >= count:
+        frame_range = event_range(pictures, chosen[: len(pictures)], count)
+    if frame_range is None or frame_range[0] >= count:
         return read_frames(recording)
-    first, last = wanted[0], min(wanted[1], count - 1)
+    first, last = frame_range[0], min(frame_range[1], count - 1)
     slots, irregular = np.arange(count), ""
     if raw.times_s is not None:
         slots, irregular = slots_from_times(raw.times_s[:count])
     part = replace(raw, offsets=raw.offsets[first : last + 1], times_s=None)
     frames = read_frames(replace(recording, raw=part, declared_frames=len(part.offsets)))
     name = recording.path.name
-    notes = [f"{name}: of {count} frames {first} to {last} are read, about what moves; name others in frames_used"]
+    notes = [
+        f"{name}: of {count} frames only {first} to {last}, around the motion, are read; choose others in frames_used"
+    ]
     notes += [f"{name}: {irregular}"] if irregular else []
     end = first + len(frames)
     return replace(

@@ -307,7 +307,7 @@ def _inspect_container(path: Path) -> Recording:
             if container.format.name in TEXT_FORMATS:
                 raise RecordingError(f"{path.name}: a text, not a recording; name a film, or a folder of pictures")
             if not container.streams.video:
-                raise RecordingError(f"{path.name}: holds no picture; name a video file")
+                raise RecordingError(f"{path.name}: holds no video stream; name a video file")
             stream = container.streams.video[0]
             first = next(container.decode(stream), None)
             if first is None:
@@ -342,7 +342,7 @@ def _why_unreadable(path: Path, messages: list[str], error: str) -> str:
     if path.suffix.lower() in UNSUPPORTED_FORMATS:
         return f"{path.name}: {UNSUPPORTED_FORMATS[path.suffix.lower()]}; save it from the camera as DNG, TIFF or mp4"
     if path.suffix.lower() not in CONTAINERS:
-        return f"{path.name}: not a video that can be read; bring mp4, mov, avi, mkv, or a folder of images"
+        return f"{path.name}: not a video that can be read; use mp4, mov, avi, mkv, or a folder of images"
     return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
 
 
@@ -373,8 +373,8 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
         number = np.searchsorted(index.times_s, times_s - HALF_TICK * index.base_s)
         before, slot, after = slots[: number[0]], slots[number], slots[number[-1] + 1 :]
         notes.append(
-            f"{name}: of {there} frames {number[0]} to {number[-1]} are decoded, about what moves; name others in "
-            "frames_used"
+            f"{name}: of {there} frames only {number[0]} to {number[-1]}, around the motion, are decoded; set others "
+            "in frames_used"
         )
     if decoded.decoder in NON_MARKING_DECODERS:
         decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()

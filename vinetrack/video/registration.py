@@ -111,7 +111,7 @@ def stabilise(
     """
     n = len(luma)
     shift = np.zeros((n, 2))
-    fit, steadied = np.zeros((n, 4)), False
+    fit, stabilised = np.zeros((n, 4)), False
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
     columns = int(np.floor(axis.length_px)) + 1
     reference = _reference_at_whole_pixels(luma, axis, bands, picks, (0, columns), LEVEL_PIXELS)
@@ -131,13 +131,13 @@ def stabilise(
             halves = [_reference_at_whole_pixels(luma, axis, bands, picks, part, SHIFT_PIXELS) for part in parts]
             if not shifts_agree(luma, axis, halves, unit):
                 break
-            steadied = True
+            stabilised = True
         shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
         if iteration == 1:
             reference = reference_pixels(_median_pictures(luma, axis, bands, picks, shift), bands)
         if iteration > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_CONVERGED_PX:
             break
-    return *_flicker_correction(fit, unit), shift, steadied
+    return *_flicker_correction(fit, unit), shift, stabilised
 
 
 def _is_still(fit: Floats, sd: Floats, reference: Reference) -> bool:

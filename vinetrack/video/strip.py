@@ -35,8 +35,8 @@ class Strip:
     `values`, shape (n_frames, n_across, n_along), are as the camera wrote them; `scale * values + offset`, shape
     (n_frames,) each, is in grey levels of 255 and free of flicker. `shift_px`, shape (n_frames, 2), is the displacement
     of the picture along and across the axis, already removed from the values; `noise` is the standard deviation of a
-    pixel, grey levels. `axis` runs through column 0 and along the middle row. `steadied` tells whether camera shake was
-    removed.
+    pixel, grey levels. `axis` runs through column 0 and along the middle row. `stabilised` tells whether camera shake
+    was removed.
     """
 
     values: NDArray[Any]
@@ -45,12 +45,12 @@ class Strip:
     shift_px: Floats
     noise: float
     axis: Axis
-    steadied: bool
+    stabilised: bool
 
     @property
     def shake_px(self) -> Floats | None:
         """`shift_px` if camera shake was removed, else None."""
-        return self.shift_px if self.steadied else None
+        return self.shift_px if self.stabilised else None
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = False) -> Strip:
@@ -72,11 +72,11 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = Fals
     unit = camera_unit(luma)
     n = len(luma)
     scale, offset, shift = np.full(n, unit), np.zeros(n), np.zeros((n, 2))
-    steadied = False
+    stabilised = False
     if bands:
-        scale, offset, shift, steadied = stabilise(luma, axis, bands, unit, still)
-    values = sample(luma, axis, np.arange(-half, half + 1), shift if steadied else None)
-    return Strip(values, scale, offset, shift, _noise(values, scale), axis, steadied)
+        scale, offset, shift, stabilised = stabilise(luma, axis, bands, unit, still)
+    values = sample(luma, axis, np.arange(-half, half + 1), shift if stabilised else None)
+    return Strip(values, scale, offset, shift, _noise(values, scale), axis, stabilised)
 
 
 def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:

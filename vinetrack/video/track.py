@@ -188,7 +188,7 @@ def track_frames(
     shown = [quality.first_moving, (quality.first_moving + quality.last_moving) // 2, quality.last_moving]
     pictures = tuple((int(number[i]), luma[i].copy()) for i in shown)
     shake_px = np.zeros(frames.n_recorded)
-    shake_px[number] = shake_along(strip, followed.edge_px) if strip.steadied else 0.0
+    shake_px[number] = shake_along(strip, followed.edge_px) if strip.stabilised else 0.0
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, followed.blur_px, followed.exposure_frames, shake_px,
         *followed.width_px, *followed.seen_exposure, strip_frames=number,
@@ -251,7 +251,7 @@ def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Float
     largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
     random_px = calibrated_sigma(edge_px, followed.sigma_px, moving & np.isfinite(edge_px), largest=largest)
     total_px = np.maximum(np.hypot(random_px, FLOOR_PX), np.hypot(followed.extra_sigma_px, FLOOR_PX))
-    return random_px, np.hypot(total_px, STABILISED_PX if strip.steadied else 0.0)
+    return random_px, np.hypot(total_px, STABILISED_PX if strip.stabilised else 0.0)
 
 
 def _random_error(random_px: Floats, followed: Positions, quality: PointQuality) -> Floats:
@@ -263,7 +263,7 @@ def _random_error(random_px: Floats, followed: Positions, quality: PointQuality)
 def _slow_error(strip: Strip, followed: Positions) -> Floats:
     """Error that neighbouring frames share: of edge, stabilisation and path, LOST_SIGMA_PX at most."""
     slow_px = np.broadcast_to(followed.slow_px, followed.edge_px.shape)
-    slow_px = np.hypot(slow_px, STABILISED_PX if strip.steadied else 0.0)
+    slow_px = np.hypot(slow_px, STABILISED_PX if strip.stabilised else 0.0)
     return np.minimum(np.hypot(slow_px, path_error_px(strip.axis)), LOST_SIGMA_PX)
 
 
