@@ -50,7 +50,7 @@ def film_evidence(
 
     Parameters
     ----------
-    strip, scale, offset : as in `gather`.
+    strip, scale, offset : as in `picture_kernels.gather`.
     appearance : film and background from `solve`, shape (4, n_across, n_along).
     width : additional standard deviation of a pixel, grey levels.
     clip : standard deviations at which distances are clipped.
@@ -66,15 +66,15 @@ def film_evidence(
     weight = unit / (appearance[2:] + extra_variance)
     for t in range(n):
         gain, level = np.float32(scale[t]), np.float32(offset[t])
-        line = out[t]
+        scores = out[t]
         for u in range(rows):
-            values, after, before = strip[t, u], appearance[0, u], appearance[1, u]
-            after_weight, before_weight = weight[0, u], weight[1, u]
+            values, film, background = strip[t, u], appearance[0, u], appearance[1, u]
+            film_weight, background_weight = weight[0, u], weight[1, u]
             for s in range(columns):
                 value = np.float32(values[s]) * gain + level
-                a, b = value - after[s], value - before[s]
-                a, b = a * a * after_weight[s], b * b * before_weight[s]
-                line[s] += (
+                a, b = value - film[s], value - background[s]
+                a, b = a * a * film_weight[s], b * b * background_weight[s]
+                scores[s] += (
                     (a if a < film_clip else film_clip) - (b if b < background_clip else background_clip) - film_bias
                 )
     return out
@@ -106,7 +106,7 @@ def fit_edges(
 
     Parameters
     ----------
-    strip, scale, offset, lengths, lag, blur : as in `gather`.
+    strip, scale, offset, lengths, lag, blur : as in `picture_kernels.gather`.
     start : initial edge of each search, shape (n_searches,), px.
     appearance : film and background from `solve`, shape (4, n_across, n_along).
     inflation : factor on the variance by distance from the edge, 1 px per bin, edge at the middle bin; shape (n_bins,).
@@ -240,9 +240,9 @@ def _gather_pixels(
     columns, unit = picture.shape[1], np.float32(1.0)
     used = 0
     for u in range(picture.shape[0]):
-        at = y - lag[u]
-        whole_px, j, table_fraction, on_grid = subpixel_index(at)
-        a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
+        row_edge = y - lag[u]
+        whole_px, j, table_fraction, on_grid = subpixel_index(row_edge)
+        a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
         if b <= a:
             continue
         k, m = a - whole_px + middle, b - a
@@ -252,13 +252,13 @@ def _gather_pixels(
         low, high = table[0, j, k : k + full], table[0, j + 1, k : k + full]
         low_slope, high_slope = table[1, j, k : k + full], table[1, j + 1, k : k + full]
         inflation = bin_inflation[k + on_grid : k + on_grid + full]
-        values, after, before = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
-        after_variance, before_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+        values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+        film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
         coverage, slope, contrast_of = coverages[used:stop], slopes[used:stop], contrasts[used:stop]
         excess_of, variance_of, shading_slope = excesses[used:stop], variances[used:stop], shading_slopes[used:stop]
         f, fraction, first_bin = (
             np.float32(table_fraction),
-            np.float32(at - whole_px),
+            np.float32(row_edge - whole_px),
             a - whole_px + (len(shading) - 1) // 2,
         )
         shade_before, shade_after = (
@@ -269,12 +269,14 @@ def _gather_pixels(
             p = low[i] + f * (high[i] - low[i])
             coverage[i] = p
             slope[i] = low_slope[i] + f * (high_slope[i] - low_slope[i])
-            contrast_of[i] = after[i] - before[i]
+            contrast_of[i] = film[i] - background[i]
             shading_slope[i] = shade_before[i] - shade_after[i]
             excess_of[i] = (
-                np.float32(values[i]) * gain + level - before[i] - shade_after[i] - fraction * shading_slope[i]
+                np.float32(values[i]) * gain + level - background[i] - shade_after[i] - fraction * shading_slope[i]
             )
-            variance_of[i] = (p * p * after_variance[i] + (unit - p) * (unit - p) * before_variance[i]) * inflation[i]
+            variance_of[i] = (
+                p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
+            ) * inflation[i]  # fmt: skip
         used += m
     return used
 
@@ -333,9 +335,9 @@ def residual_sums(
         column_sums = np.zeros((2, table.shape[2] + 1))
         log_terms = np.empty(table.shape[2])
         for u in range(rows):
-            at = y - lag[u]
-            whole_px, j, f, on_grid = subpixel_index(at)
-            a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
+            row_edge = y - lag[u]
+            whole_px, j, f, on_grid = subpixel_index(row_edge)
+            a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
             if b <= a:
                 continue
             k = a - whole_px + middle
@@ -343,22 +345,22 @@ def residual_sums(
             count += m
             low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
             low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-            values, after, before = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
-            after_variance, before_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+            values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+            film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
             numerators, denominators = (
                 column_sums[0, k + on_grid : k + on_grid + m],
                 column_sums[1, k + on_grid : k + on_grid + m],
             )
-            fraction, first_bin = at - whole_px, a - whole_px + (len(shading) - 1) // 2
+            fraction, first_bin = row_edge - whole_px, a - whole_px + (len(shading) - 1) // 2
             gradient_sum, curvature_sum = 0.0, 0.0
             for i in range(m):
                 p = low[i] + f * (high[i] - low[i])
                 slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
-                contrast = after[i] - before[i]
-                r = values[i] * scale[t] + offset[t] - before[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                contrast = film[i] - background[i]
+                r = values[i] * scale[t] + offset[t] - background[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
                 d = first_bin + i
                 r -= shading[d] + fraction * (shading[d - 1] - shading[d])
-                v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
+                v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
                 w = 1 / (v + r * r / 9)
                 numerators[i] += w * contrast * r
                 denominators[i] += w * contrast * contrast
@@ -370,7 +372,7 @@ def residual_sums(
                 gradient_sum += w * g * r
                 curvature_sum += w * g * g
                 # The variance does not depend on the blur: otherwise a wider blur would lower its own misfit.
-                log_terms[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
+                log_terms[i] = 1 + r * r / (4.5 * (film_variance[i] + background_variance[i]))
             by_row[u, 0] += gradient_sum
             by_row[u, 1] += curvature_sum
             misfit += _log_of_product(log_terms[:m])

@@ -180,7 +180,7 @@ def _differ(still: NDArray[np.uint8], picture: NDArray[np.uint8]) -> bool:
     """Whether two samples differ by more than noise, apart from a change of brightness."""
     import cv2
 
-    first, second = (cv2.blur(seen.astype(np.float32), (3, 3)) for seen in (still, picture))
+    first, second = (cv2.blur(sample.astype(np.float32), (3, 3)) for sample in (still, picture))
     change = np.abs(second * (np.median(first + 1) / np.median(second + 1)) - first)
     limit = max(CHANGE_THRESHOLD * 1.4826 * float(np.median(change)), MIN_CHANGE)
     return bool(np.count_nonzero(change > limit) >= MIN_CHANGED_PIXELS)

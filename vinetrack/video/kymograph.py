@@ -95,9 +95,9 @@ def _change_score(
             a, b = min(n, t + window), max(0, t - window)
             factor = np.float32((a - t) * (t - b) / (a - b))
             share_after, share_before = np.float32(1 / (a - t)), np.float32(1 / (t - b))
-            above, here, under, score_of = binned[a], binned[t], binned[b], score[t]
+            sum_after, sum_here, sum_before, score_of = binned[a], binned[t], binned[b], score[t]
             for s in range(columns):
-                d = (above[s] - here[s]) * share_after - (here[s] - under[s]) * share_before
+                d = (sum_after[s] - sum_here[s]) * share_after - (sum_here[s] - sum_before[s]) * share_before
                 score_of[s] += factor * d * d
     noise_power = np.float32(noise * noise / group_size * max(groups, 1))
     return score / noise_power - np.float32(1.0)
@@ -292,15 +292,15 @@ def mean_appearance(
                 continue
             counts[k, low - begin : high - begin] += np.float32(1.0)
             for u in range(rows):
-                values, line = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
+                values, row_sums = strip[t, u, low:high], sums[k, u, low - begin : high - begin]
                 for s in range(high - low):
-                    line[s] += np.float32(values[s]) * gain + level
+                    row_sums[s] += np.float32(values[s]) * gain + level
     for k in range(2):
-        known = np.flatnonzero(counts[k] > 0)
+        visible = np.flatnonzero(counts[k] > 0)
         for s in range(end - begin):
             source = s
-            if len(known) and counts[k, s] == 0:
-                source = known[np.argmin(np.abs(known - s))]
+            if len(visible) and counts[k, s] == 0:
+                source = visible[np.argmin(np.abs(visible - s))]
             share = 1 / max(counts[k, source], np.float32(1.0))
             for u in range(rows):
                 if source <= s:

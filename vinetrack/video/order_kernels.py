@@ -173,7 +173,7 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
     index of the first picture after the step, and the power of the step, each of shape (n_pixels,).
     """
     n, pixels = pictures.shape
-    best, when = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
+    best, step_frame = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
     block = 512
     sums = np.zeros((n + 1, block), np.float32)
     for start in range(0, pixels, block):
@@ -185,14 +185,14 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
             a, b = min(n, t + window), max(0, t - window)
             after, before = np.float32(a - t), np.float32(t - b)
             factor = np.float32((a - t) * (t - b) / (a - b))
-            above, here, under = sums[a], sums[t], sums[b]
-            top, place = best[start:stop], when[start:stop]
+            sum_after, sum_here, sum_before = sums[a], sums[t], sums[b]
+            top, place = best[start:stop], step_frame[start:stop]
             for k in range(stop - start):
-                step = (above[k] - here[k]) / after - (here[k] - under[k]) / before
+                step = (sum_after[k] - sum_here[k]) / after - (sum_here[k] - sum_before[k]) / before
                 score = factor * step * step
                 place[k] = t if score > top[k] else place[k]
                 top[k] = max(score, top[k])
-    return when, best
+    return step_frame, best
 
 
 @njit(cache=True, nogil=True)

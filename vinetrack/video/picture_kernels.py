@@ -152,15 +152,15 @@ def _gather_rows(
     """Add rows `low` to `high` of one frame to `sums`; see `gather`."""
     unit = np.float32(1.0)
     for u in range(low, high):
-        at = edge - lag[u]
-        whole_px, j, f, _ = subpixel_index(at)
+        row_edge = edge - lag[u]
+        whole_px, j, f, _ = subpixel_index(row_edge)
         behind = min(max(whole_px - mixed + 1, first), last)
         ahead = min(max(whole_px + mixed + 1, first), last)
         values, brightness_of = picture[u, first:last], brightness[first:last]
         for s in range(last - first):
             brightness_of[s] = np.float32(values[s]) * gain + level
         centre = (len(shading) - 1) // 2
-        fraction = at - whole_px
+        fraction = row_edge - whole_px
         for s in range(max(first, whole_px - centre + 1), min(last, whole_px + centre)):
             d = s - whole_px + centre
             brightness[s] -= np.float32(shading[d] + fraction * (shading[d - 1] - shading[d]))
@@ -280,5 +280,5 @@ def _variance(weight: float, total: float, squares: float, noise: float) -> floa
     """Variance of the values of a pixel, at least that of the noise, shrunk towards it if there are few frames."""
     if weight <= 0:
         return noise**2
-    seen = max(squares / weight - (total / weight) ** 2, 0.0)
-    return max((weight * seen + 2 * noise**2) / (weight + 2), noise**2)
+    observed = max(squares / weight - (total / weight) ** 2, 0.0)
+    return max((weight * observed + 2 * noise**2) / (weight + 2), noise**2)

@@ -283,9 +283,9 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
 
     along, across = axis.direction, axis.normal
     start = axis.points(reference.along_px, reference.across_px)
-    whole = np.rint(start)
-    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - whole).max() < WHOLE_PIXEL_TOLERANCE):
-        x, y = (np.clip(whole[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
+    rounded = np.rint(start)
+    if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - rounded).max() < WHOLE_PIXEL_TOLERANCE):
+        x, y = (np.clip(rounded[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
         return _whole_pixels(luma, x, y)
     # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
     n_rows = -(-len(start) // 1000)
@@ -294,8 +294,8 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
     for i, frame in enumerate(luma):
         moved = place if shift_px is None else place + shift_px[i, 0] * along + shift_px[i, 1] * across
         x, y = moved[..., 0].astype(np.float32), moved[..., 1].astype(np.float32)
-        seen = np.asarray(cv2.remap(frame, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
-        out[i] = seen.ravel()[: len(start)]
+        interpolated = np.asarray(cv2.remap(frame, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        out[i] = interpolated.ravel()[: len(start)]
     return out
 
 

@@ -95,10 +95,10 @@ def _weights(x: np.float32) -> tuple[np.float32, np.float32, np.float32, np.floa
     """Bicubic weights of four neighbours; the position lies `x` after the second of them."""
     unit, a = np.float32(1.0), CUBIC_COEFFICIENT
     two, three, five, eight = np.float32(2.0), np.float32(3.0), np.float32(5.0), np.float32(8.0)
-    far, y = x + unit, unit - x
-    before = ((a * far - five * a) * far + eight * a) * far - np.float32(4.0) * a
+    from_first, from_third = x + unit, unit - x
+    before = ((a * from_first - five * a) * from_first + eight * a) * from_first - np.float32(4.0) * a
     left = ((a + two) * x - (a + three)) * x * x + unit
-    right = ((a + two) * y - (a + three)) * y * y + unit
+    right = ((a + two) * from_third - (a + three)) * from_third * from_third + unit
     return before, left, right, unit - before - left - right
 
 
@@ -146,7 +146,7 @@ def _interpolate_one(
             vector_length = vector_length if place + begin + vector_length <= row_out.size else end - begin
             at, j = begin + column_offset, y - top
             a, b, c, d = rows[j, at:], rows[j + 1, at:], rows[j + 2, at:], rows[j + 3, at:]
-            p, q, line = fractions[0, u, begin:], fractions[1, u, begin:], row_out[place + begin :]
+            p, q, out_run = fractions[0, u, begin:], fractions[1, u, begin:], row_out[place + begin :]
             for s in range(vector_length):
                 x0, x1, x2, x3 = _weights(p[s])
                 y0, y1, y2, y3 = _weights(q[s])
@@ -154,7 +154,7 @@ def _interpolate_one(
                 value += y1 * (x0 * b[s] + x1 * b[s + 1] + x2 * b[s + 2] + x3 * b[s + 3])
                 value += y2 * (x0 * c[s] + x1 * c[s + 1] + x2 * c[s + 2] + x3 * c[s + 3])
                 value += y3 * (x0 * d[s] + x1 * d[s + 1] + x2 * d[s + 2] + x3 * d[s + 3])
-                line[s] = np.int32((min(max(value, zero), max_value) + ROUNDING_CONSTANT) - ROUNDING_CONSTANT)
+                out_run[s] = np.int32((min(max(value, zero), max_value) + ROUNDING_CONSTANT) - ROUNDING_CONSTANT)
         for s in range(first, last):
             if begin <= s < end:
                 continue

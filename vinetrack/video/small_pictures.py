@@ -123,9 +123,9 @@ def _frames_with_change(small: NDArray[np.float32]) -> tuple[NDArray[np.float32]
 
 
 def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
-    when, weight = _changes(busy, noise_power)
+    frame, weight = _changes(busy, noise_power)
     rows, columns = np.nonzero(weight > 0)
-    time = when[rows, columns].astype(float)
+    time = frame[rows, columns].astype(float)
     return columns.astype(float), rows.astype(float), time, weight[rows, columns].astype(float), len(busy)
 
 
@@ -162,9 +162,9 @@ def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[n
     """Frame of the largest lasting change of each pixel, and its weight; shapes (height, width)."""
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
-    when, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
+    frame, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
     floor = max(30.0 * noise_power, 0.02 * float(np.quantile(best, 0.995)))
-    return when, np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
+    return frame, np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
 
 
 def _noise_power(frames: NDArray[np.float32]) -> float:
@@ -174,16 +174,16 @@ def _noise_power(frames: NDArray[np.float32]) -> float:
     return max(noise, 0.7) ** 2
 
 
-def _step_fraction(values: Floats, when: NDArray[np.int_], noise_power: float) -> Floats:
-    """Fraction of each pixel's variance, beyond noise, that a single step at `when` explains, shape (n_pixels,).
+def _step_fraction(values: Floats, frame: NDArray[np.int_], noise_power: float) -> Floats:
+    """Fraction of each pixel's variance, beyond noise, that a single step at `frame` explains, shape (n_pixels,).
 
     `values` has shape (n_frames, n_pixels). A passing object leaves a pixel as it was, so that a step explains hardly
     any.
     """
     n, sums = len(values), np.cumsum(values, axis=0)
-    before = np.take_along_axis(sums, np.maximum(when - 1, 0)[None], axis=0)[0]
-    step = before / np.maximum(when, 1) - (sums[-1] - before) / np.maximum(n - when, 1)
-    explained = when * (n - when) / n * step**2
+    before = np.take_along_axis(sums, np.maximum(frame - 1, 0)[None], axis=0)[0]
+    step = before / np.maximum(frame, 1) - (sums[-1] - before) / np.maximum(n - frame, 1)
+    explained = frame * (n - frame) / n * step**2
     unexplained = np.maximum(n * values.var(axis=0) - explained - n * noise_power, 0.0)
     return explained / np.maximum(explained + unexplained, 1e-9)
 
@@ -227,14 +227,14 @@ def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         height, width = picture.shape
         shrunk = cv2.resize(picture, (-(-width // reach), -(-height // reach)), interpolation=cv2.INTER_AREA)
         size = 2 * min(round(3 * SURROUNDINGS_PX), max(shrunk.shape)) + 1
-        whole = cv2.getGaussianKernel(size, SURROUNDINGS_PX, cv2.CV_32F).ravel()
-        back, ahead = whole.copy(), whole.copy()
+        kernel = cv2.getGaussianKernel(size, SURROUNDINGS_PX, cv2.CV_32F).ravel()
+        back, ahead = kernel.copy(), kernel.copy()
         back[size // 2 + 1 :] = ahead[: size // 2] = 0.0
         for side, (along, across) in zip(
-            out, ((back, whole), (ahead, whole), (whole, back), (whole, ahead)), strict=True
+            out, ((back, kernel), (ahead, kernel), (kernel, back), (kernel, ahead)), strict=True
         ):
-            seen = cv2.sepFilter2D(shrunk, -1, along, across, borderType=cv2.BORDER_CONSTANT)
-            side += share * (seen if reach == 1 else cv2.resize(seen, (width, height)))
+            filtered = cv2.sepFilter2D(shrunk, -1, along, across, borderType=cv2.BORDER_CONSTANT)
+            side += share * (filtered if reach == 1 else cv2.resize(filtered, (width, height)))
     return out
 
 

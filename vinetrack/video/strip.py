@@ -133,9 +133,9 @@ def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np
         rows = np.arange(half + BAND_GAP_PX, half + BAND_GAP_PX + depth) * side
         ends = axis.points(np.array([[0.0], [axis.length_px]]), rows[None, :].astype(float))
         inside = ((ends > -0.5) & (ends < [width - 0.5, height - 0.5])).all(axis=(0, 2))
-        kept = np.sort(rows[inside])
-        if len(kept) >= 6:
-            bands.append(kept)
+        inside_rows = np.sort(rows[inside])
+        if len(inside_rows) >= 6:
+            bands.append(inside_rows)
     return bands
 
 
