@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.command_frame import errors_as_sentences
 from vinetrack.cli.output import MORE, JsonFile, print_result
 
 
@@ -38,9 +39,7 @@ def _campaign(
                                              show_default=False)] = None,
 ) -> None:  # fmt: skip
     """Look at a running campaign: verdict, next trials, and whether it may stop at the stated risk."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.sequence_stage import ledger_lines, look_at_folder
 
         ledger = look_at_folder(target, risk, experiment)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.command_frame import errors_as_sentences
 from vinetrack.cli.design_options import (
     INPUTS,
     OUT,
@@ -84,9 +85,7 @@ def _predict(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.predict_stage import predict_conditions
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
@@ -156,9 +155,7 @@ def _vine(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_vine
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
@@ -226,9 +223,7 @@ def _reservoir(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_reservoir
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 
@@ -328,9 +323,7 @@ def _campaign(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Choose pressures, payloads and replicates that reach wanted standard errors of n and B, and simulate them."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.campaign_stage import CampaignRequest, design_campaign
         from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
 

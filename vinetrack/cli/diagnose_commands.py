@@ -10,6 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vinetrack.cli.command_frame import (
+    ExperimentPath,
+    LogPath,
+    ResultsPath,
+    SettingsText,
+    errors_as_sentences,
+    settings_from_json,
+)
 from vinetrack.cli.output import MORE, JsonFile, print_result
 from vinetrack.core.problems import UserError
 
@@ -19,7 +27,6 @@ if TYPE_CHECKING:
 Moved = Annotated[
     Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
 ]
-LogFile = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -43,12 +50,10 @@ def _diagnose(
         typer.Option("--json", help="Write the diagnosis to this file only; - for the terminal.", show_default=False),
     ] = None,
     experiment: Moved = None,
-    log: LogFile = None,
+    log: LogPath = None,
 ) -> None:
     """Diagnose what the model lacks: verdict, candidates with sizes, errors before and after, next experiment."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.experiment.provenance import PROVENANCE
         from vinetrack.pipeline.run_folders import find_experiment
@@ -71,16 +76,14 @@ def _diagnose(
 
 def _add(
     effect: Annotated[str, typer.Argument(help="Name of the effect, or its file.", metavar="EFFECT")],
-    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    results: ResultsPath,
     save: Annotated[bool, typer.Option("--save", help="Write it to `model:` in experiment.yaml.")] = False,
     experiment: Moved = None,
     json_file: JsonFile = None,
-    log: LogFile = None,
+    log: LogPath = None,
 ) -> None:
     """Add an effect to the model, refit, and show the error before and after."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.diagnosis_stage import add_effect
         from vinetrack.pipeline.source_experiment import read_source_experiment
 
@@ -103,16 +106,14 @@ def _add(
 
 
 def _propose(
-    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    results: ResultsPath,
     to: Annotated[Path | None, typer.Option("--to", help="Write the effect to this file.", show_default=False)] = None,
     experiment: Moved = None,
     json_file: JsonFile = None,
-    log: LogFile = None,
+    log: LogPath = None,
 ) -> None:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.proposed_effects import propose_effect
         from vinetrack.pipeline.source_experiment import read_source_experiment
 
@@ -123,23 +124,21 @@ def _propose(
 
 
 def _diagnosis(
-    experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
-    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
-    settings: Annotated[
-        str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")
-    ] = "{}",
-    log: LogFile = None,
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    log: LogPath = None,
 ) -> None:
     """Diagnose what the model lacks: diagnosis.json, ladder.csv and the folder diagnosis."""
-    from vinetrack.cli.main import _errors_as_sentences, _run_settings
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.experiment.folder import read_experiment
         from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
         from vinetrack.pipeline.run_folders import find_experiment
 
         with _progress_line() as report:
-            diagnose_results(read_experiment(find_experiment(experiment)), results, report, _run_settings(settings))
+            diagnose_results(
+                read_experiment(find_experiment(experiment)), results, report, settings_from_json(settings)
+            )
         for line in diagnosis_lines(results):
             typer.echo(line)
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.command_frame import errors_as_sentences
 from vinetrack.cli.output import START
 
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
@@ -51,9 +52,7 @@ def _explore(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """Open a local page that shows where the model fails, to try effects, refit, and compare errors."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.explorer.command import ExploreOptions, explore
 
         options = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)

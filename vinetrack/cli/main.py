@@ -10,14 +10,22 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vinetrack.cli.campaign_commands import register as register_campaign
+from vinetrack.cli.command_frame import (
+    ExperimentPath,
+    LogPath,
+    ResultsPath,
+    SettingsText,
+    activity_sign,
+    errors_as_sentences,
+    settings_from_json,
+)
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
@@ -29,7 +37,6 @@ from vinetrack.core.local_page import THREAD_PREFIX
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import RunSettings
 
 app = typer.Typer(
     name="vinetrack",
@@ -40,14 +47,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
-ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
-SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
 TrialNames = Annotated[
     str | None, typer.Option("--trials", help="Names of the trials, a JSON list; all by default.", show_default=False)
 ]
 Threads = Annotated[int, typer.Option("--threads", min=1, help="Processes to use.")]
-LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")]
 
 
 def main() -> None:
@@ -105,7 +108,7 @@ def _settings(
     ] = None,
 ) -> None:
     """List all columns of the sheet and all keys of the settings, with unit, default, bounds and meaning."""
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.core.tables import write_text
         from vinetrack.experiment.reference import reference_content, reference_lines, reference_page
 
@@ -127,7 +130,7 @@ def _effects(
     json_file: JsonFile = None,
 ) -> None:
     """List all effects with formulas, parameters and units, or explain one."""
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.pipeline.effects_stage import describe_effects, effects_content
         from vinetrack.pipeline.run_folders import find_experiment
 
@@ -138,7 +141,7 @@ def _effects(
 @app.command("compare", rich_help_panel=MORE)
 def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
     """Compare model and measurement of every condition, with the scatter of replicates."""
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.pipeline.model_stage import comparison_lines
         from vinetrack.results.folder_layout import Results, read_result
 
@@ -159,10 +162,10 @@ def _overlay(
     json_file: JsonFile = None,
 ) -> None:
     """Write a slowed-down clip of one trial with tracked and modelled edges."""
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.pipeline.overlays_stage import overlay_one
 
-        with _activity_sign(f"drawing over {trial}", None):
+        with activity_sign(f"drawing over {trial}", None):
             path = overlay_one(results, trial, experiment, seconds)
         print_result([f"Clip: {path}"], {"clip": path}, json_file)
 
@@ -176,10 +179,10 @@ def _overlays(
     log: LogPath = None,
 ) -> None:
     """Write clips of the recordings that the settings choose, with tracked and modelled edges."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.overlays_stage import draw_overlays
 
-        for line in draw_overlays(_read(experiment), results, _run_settings(settings).overlays, threads):
+        for line in draw_overlays(_read(experiment), results, settings_from_json(settings).overlays, threads):
             typer.echo(f"  {line}")
 
 
@@ -198,14 +201,14 @@ def _recording(
     log: LogPath = None,
 ) -> None:
     """Analyse one recording: track, kinematics and strip figure."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.recordings_stage import analyse_recording
 
         read = _read(experiment)
         if trial not in [filmed.name for filmed in read.trials if filmed.video is not None]:
             raise typer.BadParameter(f"{trial!r} is not a trial with a recording in {experiment}", param_hint="TRIAL")
-        with _activity_sign(f"tracking {trial}", log):
-            outcome = analyse_recording(read, trial, results, _run_settings(settings))
+        with activity_sign(f"tracking {trial}", log):
+            outcome = analyse_recording(read, trial, results, settings_from_json(settings))
         typer.echo(outcome)
 
 
@@ -219,11 +222,11 @@ def _tracks(
     log: LogPath = None,
 ) -> None:
     """Analyse trials that are tracks: tracks, kinematics and steady windows."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import analyse_tracks
 
         read = _read(experiment)
-        failed = analyse_tracks(read, results, _run_settings(settings), threads, _trial_names(trials, read))
+        failed = analyse_tracks(read, results, settings_from_json(settings), threads, _trial_names(trials, read))
         for line in failed[:10]:
             typer.echo(f"  {line}")
 
@@ -233,22 +236,22 @@ def _gather(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Gather the results of all trials in trials.csv, conditions.csv, steady.csv and damping_points.csv."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.tracks_stage import gather as gather_trials
 
-        table = gather_trials(_read(experiment), results, _run_settings(settings))
+        table = gather_trials(_read(experiment), results, settings_from_json(settings))
         typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
 
 
 @app.command("damping", rich_help_panel="Stages of the workflow")
 def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Fit the damping law to the steady points: damping.json."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.narrative.law_text import damping_headline
         from vinetrack.pipeline.damping_stage import fit_law
 
-        with _activity_sign("fitting the damping law, with bootstrap", log):
-            law = fit_law(results, _run_settings(settings).damping)
+        with activity_sign("fitting the damping law, with bootstrap", log):
+            law = fit_law(results, settings_from_json(settings).damping)
         typer.echo(damping_headline(law))
 
 
@@ -257,11 +260,11 @@ def _model(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Fit the model in use to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.model_stage import comparison_lines, fit_model
 
-        with _activity_sign("fitting the model", log):
-            fit_model(_read(experiment), results, _run_settings(settings))
+        with activity_sign("fitting the model", log):
+            fit_model(_read(experiment), results, settings_from_json(settings))
         for line in comparison_lines(results):
             typer.echo(line)
 
@@ -277,17 +280,17 @@ def _figures(
     log: LogPath = None,
 ) -> None:
     """Draw the figures of the trials, of the whole experiment, or both."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
 
         if of not in ("trials", "campaign", "all"):
             raise typer.BadParameter(f"{of!r} is not one of trials, campaign, all", param_hint="--of")
-        chosen = _run_settings(settings).figures
+        chosen = settings_from_json(settings).figures
         read = _read(experiment)
         if of != "campaign":
             draw_trials(read, results, chosen, threads, _trial_names(trials, read))
         if of != "trials":
-            with _activity_sign("drawing the experiment", log):
+            with activity_sign("drawing the experiment", log):
                 draw_campaign(read, results, chosen)
 
 
@@ -296,12 +299,12 @@ def _paper(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Compare with the published numbers and figures of the paper: paper.csv."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.paper_stage import compare_with_paper, draw_paper
         from vinetrack.report.paper_section import tally
 
         typer.echo(f"Comparison with the paper: {tally(compare_with_paper(_read(experiment), results))}")
-        draw_paper(results, _run_settings(settings).figures)
+        draw_paper(results, settings_from_json(settings).figures)
 
 
 @app.command("report", rich_help_panel="Stages of the workflow")
@@ -309,23 +312,16 @@ def _report(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Write report.html and provenance.json."""
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.pipeline.report_stage import write_report
 
-        with _activity_sign("writing the report", log):
+        with activity_sign("writing the report", log):
             path = write_report(
                 _read(experiment),
                 results,
-                _run_settings(settings).model_dump(mode="json", exclude={"experiment", "results"}),
+                settings_from_json(settings).model_dump(mode="json", exclude={"experiment", "results"}),
             )
         typer.echo(f"Report: {path}")
-
-
-def _activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
-    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log."""
-    from vinetrack.core.terminal import waiting
-
-    return waiting(what) if log is None else nullcontext()
 
 
 def _read(folder: Path) -> Experiment:
@@ -333,20 +329,6 @@ def _read(folder: Path) -> Experiment:
     from vinetrack.pipeline.run_folders import find_experiment
 
     return read_experiment(find_experiment(folder))
-
-
-def _run_settings(text: str) -> RunSettings:
-    import json
-
-    from vinetrack.experiment.settings import run_settings
-
-    try:
-        values = json.loads(text)
-    except ValueError as error:
-        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--settings") from None
-    if not isinstance(values, dict):
-        raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
-    return run_settings(values)
 
 
 def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
@@ -363,55 +345,6 @@ def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
     if unknown := [name for name in names if name not in experiment.names]:
         raise typer.BadParameter(f"{unknown[0]!r} is not a trial of the sheet", param_hint="--trials")
     return names
-
-
-@contextmanager
-def _errors_as_sentences(log: Path | None) -> Iterator[None]:
-    """Report every exception in a sentence and exit with status 1; tracebacks go to the log."""
-    from vinetrack.core.files import is_disk_full
-    from vinetrack.core.problems import ExperimentError, UserError, format_problems
-
-    try:
-        _log_to(log)
-        yield
-    except (typer.Exit, typer.BadParameter, typer.Abort):
-        raise
-    except ExperimentError as error:
-        _exit_with("\n".join(format_problems(error.problems)))
-    except KeyboardInterrupt:
-        _exit_with("Stopped; finished results are kept.")
-    except BrokenPipeError:
-        # The reader (such as `| head`) has closed the pipe; redirect it, or Python reports the error again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(1) from None
-    except Exception as error:
-        if is_disk_full(error):
-            _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
-        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
-        if isinstance(error, UserError):
-            _exit_with(str(error))
-        place = f"; the traceback is in {log}" if log else "; run it again with --log FILE for the traceback"
-        _exit_with(
-            f"An internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}."
-        )
-
-
-def _exit_with(message: str) -> None:
-    from vinetrack.core.terminal import severity_first
-
-    typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)
-    raise typer.Exit(1)
-
-
-def _log_to(path: Path | None) -> None:
-    """Send log messages of all modules to a file only, never to the terminal."""
-    handler: logging.Handler = logging.NullHandler()
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
-    logging.basicConfig(
-        handlers=[handler], level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
-    )
 
 
 if __name__ == "__main__":

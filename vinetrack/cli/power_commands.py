@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.command_frame import errors_as_sentences
 from vinetrack.cli.design_options import INPUTS, OUT, FigurePath, LogPath
 from vinetrack.cli.output import MORE, print_result
 
@@ -110,9 +111,7 @@ def _power(
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Calculate the power of trials: detectable sizes of all effects, confusions between them, false-alarm rate."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         import pandas as pd
 
         from vinetrack.core.tables import write_csv

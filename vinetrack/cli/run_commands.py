@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from vinetrack.cli.command_frame import errors_as_sentences
 from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
@@ -27,9 +28,7 @@ def _check(
     json_file: JsonFile = None,
 ) -> None:
     """Check sheet, settings, effects, tracks and recordings in seconds; list facts about each recording."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.pipeline.check_stage import check_folder
         from vinetrack.pipeline.run_folders import find_experiment
 
@@ -57,9 +56,7 @@ def _run(
     json_file: JsonFile = None,
 ) -> None:  # fmt: skip
     """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(None):
+    with errors_as_sentences(None):
         from vinetrack.pipeline.run_stage import check_before_run, run_chain, run_lines, run_paths
         from vinetrack.results.folder_layout import Results, read_json
 

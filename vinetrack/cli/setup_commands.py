@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from vinetrack.cli.command_frame import activity_sign, errors_as_sentences
 from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
@@ -33,9 +34,7 @@ def _setup(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """Create trials.csv and experiment.yaml from a folder of recordings, on a local page or with blanks to fill in."""
-    from vinetrack.cli.main import _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         if page:
             from vinetrack.setup_page.page_server import serve
 
@@ -78,9 +77,7 @@ def _track(
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
-    from vinetrack.cli.main import _activity_sign, _errors_as_sentences
-
-    with _errors_as_sentences(log):
+    with errors_as_sentences(log):
         from vinetrack.core.numbers import or_nan
         from vinetrack.pipeline.track_stage import TrackOptions, track_file
 
@@ -91,7 +88,7 @@ def _track(
         )  # fmt: skip
         lines: list[str] = []
         say = lines.append if json_to_terminal(json_file) else _say
-        with _activity_sign(f"tracking {recording.name}", log):
+        with activity_sign(f"tracking {recording.name}", log):
             content = track_file(recording, options, say)
         print_result((), content, json_file)
 

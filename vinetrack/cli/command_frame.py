@@ -1,0 +1,130 @@
+"""What commands share: their arguments, errors as sentences, the spinner, the log, and settings given as JSON."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.settings import RunSettings
+
+ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
+ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
+SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
+LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", show_default=False)]
+
+
+def activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
+    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log.
+
+    Parameters
+    ----------
+    what : what is being done, in a few words.
+    log : log of the stage; None where it is run by hand.
+
+    Returns
+    -------
+    context manager
+    """
+    from vinetrack.core.terminal import waiting
+
+    return waiting(what) if log is None else nullcontext()
+
+
+def settings_from_json(text: str) -> RunSettings:
+    """Settings of a run from the option `--settings`.
+
+    Parameters
+    ----------
+    text : a JSON object of the settings that differ from the defaults.
+
+    Returns
+    -------
+    RunSettings
+
+    Raises
+    ------
+    typer.BadParameter
+        If the text is no JSON object.
+    """
+    import json
+
+    from vinetrack.experiment.settings import run_settings
+
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--settings") from None
+    if not isinstance(values, dict):
+        raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
+    return run_settings(values)
+
+
+@contextmanager
+def errors_as_sentences(log: Path | None) -> Iterator[None]:
+    """Report every exception in a sentence and exit with status 1; tracebacks go to the log.
+
+    Parameters
+    ----------
+    log : file for messages and tracebacks; None for none.
+
+    Yields
+    ------
+    None
+
+    Raises
+    ------
+    typer.Exit
+        With status 1, after any exception.
+    """
+    from vinetrack.core.files import is_disk_full
+    from vinetrack.core.problems import ExperimentError, UserError, format_problems
+
+    try:
+        _log_to(log)
+        yield
+    except (typer.Exit, typer.BadParameter, typer.Abort):
+        raise
+    except ExperimentError as error:
+        _exit_with("\n".join(format_problems(error.problems)))
+    except KeyboardInterrupt:
+        _exit_with("Stopped; finished results are kept.")
+    except BrokenPipeError:
+        # The reader (such as `| head`) has closed the pipe; redirect it, or Python reports the error again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(1) from None
+    except Exception as error:
+        if is_disk_full(error):
+            _exit_with("The disk is full: free some space and run the same command again; finished results are kept.")
+        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
+        if isinstance(error, UserError):
+            _exit_with(str(error))
+        place = f"; the traceback is in {log}" if log else "; run it again with --log FILE for the traceback"
+        _exit_with(
+            f"An internal error of the program, not a fault of your data ({type(error).__name__}: {error}){place}."
+        )
+
+
+def _exit_with(message: str) -> None:
+    from vinetrack.core.terminal import severity_first
+
+    typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)
+    raise typer.Exit(1)
+
+
+def _log_to(path: Path | None) -> None:
+    """Send log messages of all modules to a file only, never to the terminal."""
+    handler: logging.Handler = logging.NullHandler()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    logging.basicConfig(
+        handlers=[handler], level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
+    )
