@@ -60,10 +60,6 @@ CONVERGED_PX = 0.2
 fastest, blurred frames; at half more iterations are made, at twice fewer."""
 SAME_PATH_PX = 1.0
 """Two paths are the same if they nowhere differ by more than this. Derived: paths are in whole pixels."""
-SUBSAMPLED_ROWS = 48
-"""Strips of at least this many rows are fitted with every second row until the final iterations. Chosen: 24 rows
-resolve the shape of a tip; only computing time depends on it, since the final iterations use all rows. At half, thin
-vines would start with 12 rows."""
 OUT_OF_FOCUS_FACTOR = 3.0
 """Factor on the disagreement of the bands when the fitted blur is at its upper bound: the errors of all rows are then
 correlated. Chosen: out-of-focus recordings then state errors of a pixel. At half or twice they state half or twice as
@@ -144,7 +140,6 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     path, passed = initial_front_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
-    full_strip, strip = strip, _every_other_row(strip)
     state = initial_state(strip, path, exposure)
     change = _frame_changes(strip)
     for iteration in range(3):
@@ -155,8 +150,6 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     fit = _fit_frames(strip, state, informative_frames(state.edge))
     for iteration in range(3 * rounds):
         before = fit[:, 0]
-        if iteration == rounds - 1:
-            strip, state = full_strip, _expand_to_all_rows(state, full_strip)
         state = _update_state(strip, state, fit, exposure)
         informative = informative_frames(state.edge)
         if iteration == 1 and not np.isfinite(exposure_frames):
@@ -178,22 +171,6 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
         return finished
     blur_exposure, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=blur_exposure, fast_px_per_frame=speed)
-
-
-def _every_other_row(strip: Strip) -> Strip:
-    """Return every second row of a strip of at least SUBSAMPLED_ROWS rows; otherwise the strip itself."""
-    if strip.values.shape[1] < SUBSAMPLED_ROWS:
-        return strip
-    return replace(strip, values=np.ascontiguousarray(strip.values[:, ::2]))
-
-
-def _expand_to_all_rows(state: EdgeState, strip: Strip) -> EdgeState:
-    """Expand a state fitted to every second row to all rows of a strip; its appearance has yet to be re-estimated."""
-    rows = strip.values.shape[1]
-    if len(state.lag) == rows:
-        return state
-    lag = np.interp(np.arange(rows), np.arange(0, rows, 2), state.lag)
-    return replace(state, lag=lag, appearance=np.repeat(state.appearance, 2, axis=1)[:, :rows])
 
 
 def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT_ROUNDS) -> Floats:
