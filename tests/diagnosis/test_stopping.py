@@ -27,7 +27,7 @@ from vinetrack.diagnosis.result import (
     limit_reason,
 )
 from vinetrack.diagnosis.stopping import GO_ON, STOP, CampaignLook, look_at, trials_to_go
-from vinetrack.pipeline import sequence_stage
+from vinetrack.pipeline import power_stage, sequence_stage
 from vinetrack.pipeline.sequence_stage import LEDGER, Ledger, look_at_folder, read_ledger
 
 
@@ -124,7 +124,9 @@ def test_a_ledger_stores_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(sequence_stage, "_diagnose_target", diagnosed)
     monkeypatch.setattr(sequence_stage, "_data_fingerprint", lambda pairs: pairs[0].decode())
+    monkeypatch.setattr(power_stage, "recommended_trials", lambda *_: "Make 2 trials at 40 kPa.")
     first = look_at_folder(tmp_path, 0.05)
+    assert first.next_text.startswith("Make 2 trials at 40 kPa. With trials like those so far, about ")
     assert [look.decision for look in first.looks] == [GO_ON]
     again = look_at_folder(tmp_path)
     assert len(again.looks) == 1

@@ -44,8 +44,17 @@ def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
     assert origins["noise of a position"] == ("0.2 mm, correlation 0.00", "stated")
     assert origins["spread of B from trial to trial"][1].startswith("guess")
     assert origins["frame rate"][1] == "guess"
+    assert origins["systematic error of positions"] == ("0.1 mm", "guess: positions by a scale, lens uncorrected")
     assert [entry.effect for entry in power.effects] == ["leak", "air_drag"]
     assert list(power.not_testable) == ["payload_drag"]
+
+
+def test_a_plan_counts_the_systematic_error_that_its_recordings_will_have(folder: Path) -> None:
+    uncorrected = power_of_target(PowerRequest(folder))
+    corrected = power_of_target(PowerRequest(folder, systematic_mm=0.0))
+    assert ("0 mm", "stated") in {(entry.value, entry.origin) for entry in corrected.inputs}
+    for name in ("leak", "air_drag"):
+        assert corrected[name].size_at(0.9) < 0.9 * uncorrected[name].size_at(0.9)
 
 
 def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> None:

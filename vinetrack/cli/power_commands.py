@@ -61,6 +61,12 @@ def _power(
         typer.Option("--capture-fps", min=1, max=1e6, rich_help_panel=INPUTS, show_default=False,
                      help="Frames per second, for a sheet without recordings."),
     ] = None,
+    systematic: Annotated[
+        float | None,
+        typer.Option("--systematic-mm", min=0, max=50, rich_help_panel=INPUTS, show_default=False,
+                     help="Smooth error of positions that trials share, for a sheet without recordings; default 0.1, "
+                          "or 0 with a calibration target."),
+    ] = None,
     B: Annotated[
         float | None,
         typer.Option("--B", min=1e-9, rich_help_panel=INPUTS, show_default=False,
@@ -128,6 +134,7 @@ def _power(
                 spread_P=_or_nan(scatter_P) / 100,
                 spread_B=_or_nan(scatter_B) / 100,
                 capture_fps=_or_nan(capture_fps),
+                systematic_mm=_or_nan(systematic),
                 B=_or_nan(B),
                 n=_or_nan(n),
                 simulate=simulate,

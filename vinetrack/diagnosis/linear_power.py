@@ -154,20 +154,21 @@ def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
     )
 
 
-def typical_shape_index(tests: MisfitTests, name: str) -> int:
-    """Index of the shape by which an effect is represented.
+def typical_shape_index(tests: MisfitTests, name: str) -> int | None:
+    """Index of the shape by which an effect is represented; None where no trial has information about it.
 
     Parameters
     ----------
     tests : the misfit tests of the fit with candidates.
-    name : of an effect among them to which a trial responds.
+    name : of an effect among them.
 
     Returns
     -------
-    int
+    int or None
     """
     effect = next(effect for effect in tests.effects if effect.name == name)
-    return _typical_shapes(tests, effect)[-1]
+    indices = _typical_shapes(tests, effect)
+    return indices[-1] if indices else None
 
 
 def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:

@@ -326,5 +326,21 @@ def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any])
     if "track" not in values and "video" not in values:
         return math.nan
     measured = "track" in values or "mm_per_px" in values
-    knows_lens = isinstance(settings.calibration, (Charuco, Checkerboard)) and not measured
-    return 0.0 if knows_lens else POSITION_SYSTEMATIC_M
+    return POSITION_SYSTEMATIC_M if measured else expected_systematic_m(settings)
+
+
+def expected_systematic_m(settings: ExperimentSettings) -> float:
+    """Standard deviation of smooth position errors, m, of trials that are still to be filmed.
+
+    Parameters
+    ----------
+    settings : of the experiment.
+
+    Returns
+    -------
+    float
+        As stated; else 0 where the calibration is a target with many corners, and the default where it is not.
+    """
+    if settings.position_systematic_mm is not None:
+        return settings.position_systematic_mm / 1e3
+    return 0.0 if isinstance(settings.calibration, (Charuco, Checkerboard)) else POSITION_SYSTEMATIC_M

@@ -84,8 +84,17 @@ def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
     return " ".join(sentences)
 
 
-def _trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
-    """The trials to make, as a list in one sentence."""
+def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
+    """Return the trials to make, as a list within a sentence.
+
+    Parameters
+    ----------
+    trials : entries of `trial_entries`.
+
+    Returns
+    -------
+    str
+    """
     return "; ".join(_trial_in_words(trial) for trial in trials)
 
 
@@ -187,7 +196,7 @@ def advice_text(
             f"No trials within `limits` separate the tied hypotheses by {least:g} σ; the best would separate"
             f" {promise}. {advice}".rstrip()
         )
-    text = f"Make {_trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
+    text = f"Make {trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
     if any(trial["new_vine"] for trial in trials):
         text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
     if left:

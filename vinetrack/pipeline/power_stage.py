@@ -15,12 +15,14 @@ from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerIn
 from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
-from vinetrack.experiment.settings import Limits
+from vinetrack.experiment.settings import ExperimentSettings, Limits
+from vinetrack.experiment.sheet import expected_systematic_m
 from vinetrack.pipeline.simulated_answers import Simulation, simulate_answers, simulate_null_tests, size_key
 from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
     from vinetrack.core.records import Track, Trial
+    from vinetrack.diagnosis.stopping import CampaignLook
     from vinetrack.effects import Effect
     from vinetrack.experiment.planned import PlannedTrials
     from vinetrack.inference.fit_data import Pairs
@@ -48,6 +50,7 @@ class PowerRequest:
     spread_P: float = math.nan
     spread_B: float = math.nan
     capture_fps: float = math.nan
+    systematic_mm: float = math.nan
     B: float = math.nan
     n: float = math.nan
     simulate: int = 0
@@ -118,6 +121,40 @@ def _further_trials(request: PowerRequest, campaign: _Campaign) -> Iterator[Furt
         value = _size_of(text, campaign.power[name])
         with waiting(f"searching for trials that detect {name}"):
             yield further_trials(campaign.design, campaign.power[name], value, request.reach, campaign.limits)
+
+
+def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook) -> str:
+    """Recommend the further trials of a campaign that goes on, in words; blank where none can be recommended.
+
+    Parameters
+    ----------
+    target : a results folder or an experiment of measured tracks.
+    experiment : new path of the experiment of a results folder, if it has moved.
+    look : the last one. If it names one effect, the trials tell most about it and its rival; if it names none, they
+        reveal most of what could be missing.
+
+    Returns
+    -------
+    str
+    """
+    from vinetrack.core.terminal import waiting
+    from vinetrack.diagnosis.informative_trials import confirming_trials, exploratory_trials
+    from vinetrack.narrative.power_text import informative_text
+
+    request = PowerRequest(target=target, experiment=experiment)
+    measured = _measured_trials(request)
+    if measured is None:
+        return ""
+    names = tuple(name for name in measured.names if name not in look.names)
+    with waiting("searching for the trials to make next"):
+        campaign = _measured_campaign(request, replace(measured, names=names))
+        given = campaign.design, campaign.power
+        if not look.names:
+            plan = exploratory_trials(*given, campaign.limits)
+            return "" if plan is None else informative_text(plan)
+        named, rival = look.names[0], look.rival if look.rival in {e.effect for e in campaign.power.effects} else ""
+        plan = confirming_trials(*given, named, rival, campaign.limits)
+        return "" if plan is None else informative_text(plan, named, rival)
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:
@@ -291,7 +328,11 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> _Campaig
     noise = _stated_noise(request, DEFAULT_NOISE_MM / 1e3, 0.0)
     noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
     spreads = _stated_spreads(request, first.spreads)
-    trials = tuple(_with_yield(trial, by_vine[trial.vine].trial) for trial in planned.trials)
+    systematic_m, systematic_origin = _planned_systematic(request, settings)
+    trials = tuple(
+        replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)
+        for trial in planned.trials
+    )
     filmed_fps = [request.capture_fps if math.isfinite(request.capture_fps) else trial.capture_fps for trial in trials]
     cameras = tuple(
         FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
@@ -299,6 +340,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> _Campaig
     origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
     inputs = [
         *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
+        PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
         PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(request, trials)),
         *(
             PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
@@ -316,6 +358,16 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> _Campaig
         candidates=settings.candidates,
     )
     return _Campaign(design_power(design, inputs), design, settings.limits)
+
+
+def _planned_systematic(request: PowerRequest, settings: ExperimentSettings) -> tuple[float, str]:
+    """Return the systematic error of positions of planned trials, m, and where it comes from."""
+    if math.isfinite(request.systematic_mm):
+        return request.systematic_mm / 1e3, "stated"
+    systematic_m = expected_systematic_m(settings)
+    if settings.position_systematic_mm is not None:
+        return systematic_m, "experiment.yaml"
+    return systematic_m, "guess: positions by a scale, lens uncorrected" if systematic_m else "lens known from a target"
 
 
 def _fps_origin(request: PowerRequest, trials: Sequence[Trial]) -> str:

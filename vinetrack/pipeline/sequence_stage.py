@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_json
-from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.diagnosis.result import ADEQUATE, ARTEFACT, MISSING
 from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.experiment.provenance import PROVENANCE
 
@@ -79,7 +79,9 @@ def look_at_folder(target: Path, risk: float | None = None, experiment: Path | N
     looks, marks = ledger.looks, ledger.marks
     if marks and marks[-1] == mark:
         looks, marks = looks[:-1], marks[:-1]
-    ledger = replace(ledger, looks=(*looks, look), marks=(*marks, mark), next_text=_next_step(diagnosis, look))
+    ledger = replace(
+        ledger, looks=(*looks, look), marks=(*marks, mark), next_text=_next_step(diagnosis, look, target, experiment)
+    )
     write_json(folder / LEDGER, ledger.to_json())
     return ledger
 
@@ -119,22 +121,44 @@ def _data_fingerprint(pairs: Sequence[tuple[Trial, Track]]) -> str:
     return code.hexdigest()[:12]
 
 
-def _next_step(diagnosis: Diagnosis, look: CampaignLook) -> str:
+def _next_step(diagnosis: Diagnosis, look: CampaignLook, target: Path, experiment: Path | None) -> str:
     """Say what to do next, in one or two sentences."""
     if look.decision == STOP:
         return "Stop: this question needs no further trials."
     advice = diagnosis.next_experiment
     if advice is not None and advice.get("text"):
         return str(advice["text"])
-    further = trials_to_go(look)
-    if further:
-        return f"Run about {further} further trials like those so far, by the growth of the log-likelihood ratio."
+    text = _recommendation(look, target, experiment)
     if look.verdict == ADEQUATE:
         return (
-            "Vary more: other pressures, payloads, chambers, connectors or vines. Or choose an effect and a size that "
-            "matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says which trials would detect it."
+            f"{text or VARY_MORE} Or choose an effect and a size that matter: `vinetrack power TARGET --effect "
+            "NAME=SIZE --reach 0.9` says which trials would detect it."
         )
-    return "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
+    further = trials_to_go(look)
+    if further and text:
+        return f"{text} With trials like those so far, about {further} would be needed."
+    if further:
+        return f"Run about {further} further trials like those so far, by the growth of the log-likelihood ratio."
+    return text or VARY_MORE
+
+
+VARY_MORE = "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
+"""What to do next where no particular trials can be recommended."""
+
+
+def _recommendation(look: CampaignLook, target: Path, experiment: Path | None) -> str:
+    """The trials that reveal most, or that confirm the one effect named; blank where none can be recommended."""
+    from vinetrack.dynamics.simulate import SimulationError
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.pipeline.power_stage import recommended_trials
+
+    one_named = look.verdict in (MISSING, ARTEFACT) and len(look.names) == 1
+    if not (look.verdict == ADEQUATE or one_named):
+        return ""
+    try:
+        return recommended_trials(target, experiment, look)
+    except (FitError, SimulationError):
+        return ""
 
 
 def read_ledger(path: Path) -> Ledger | None:
