@@ -21,7 +21,7 @@ from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.stopping import GO_ON, CampaignLook
 from vinetrack.experiment.settings import Limits
-from vinetrack.narrative.power_text import informative_text
+from vinetrack.narrative.further_text import informative_text
 from vinetrack.pipeline.power_stage import recommended_trials
 from vinetrack.planning.campaign_information import FilmingPlan
 from vinetrack.planning.feasible_trials import feasible_conditions

@@ -19,7 +19,8 @@ from vinetrack.diagnosis.null_calibration import TESTS, CampaignPValues
 from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis
 from vinetrack.figures.registry import draw
 from vinetrack.pipeline import simulated_answers
-from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
+from vinetrack.pipeline.power_campaigns import PowerRequest
+from vinetrack.pipeline.power_stage import power_of_target
 from vinetrack.pipeline.simulated_answers import fingerprint, stored_answers
 
 SHEET = (

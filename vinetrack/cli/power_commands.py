@@ -121,7 +121,8 @@ def _power(
         import pandas as pd
 
         from vinetrack.core.tables import write_csv
-        from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
+        from vinetrack.pipeline.power_campaigns import PowerRequest
+        from vinetrack.pipeline.power_stage import power_of_target, sheet_rows
         from vinetrack.pipeline.prediction_inputs import check_figure, write_figure
 
         check_figure(figure)

@@ -153,8 +153,8 @@ class _Search(DesignInformation):
         information = self.information_of(totals)
         alone = np.maximum(np.diagonal(information, axis1=1, axis2=2), 0.0)
         shared = information**2 / np.maximum(alone, 1e-300)[:, None, :]
-        own = np.arange(len(self.effects))
-        shared[:, own, own] = 0.0
+        diagonal = np.arange(len(self.effects))
+        shared[:, diagonal, diagonal] = 0.0
         return np.asarray(np.maximum(alone - shared.max(axis=2), 0.0))
 
     def distinct_information(self, totals: Floats) -> Floats:

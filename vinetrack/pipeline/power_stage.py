@@ -3,72 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
+from vinetrack.diagnosis.campaign_power import design_of_fit
 from vinetrack.diagnosis.null_calibration import NullCalibration, calibrate, p_values_of
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
-from vinetrack.experiment.settings import ExperimentSettings, Limits
-from vinetrack.experiment.sheet import expected_systematic_m
+from vinetrack.pipeline.power_campaigns import (
+    MeasuredTrials,
+    PowerCampaign,
+    PowerRequest,
+    campaign_in_memory,
+    campaign_of_target,
+    measured_campaign,
+    trials_of_target,
+)
 from vinetrack.pipeline.simulated_answers import Simulation, simulate_answers, simulate_null_tests, size_key
-from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
-    from vinetrack.core.records import Track, Trial
     from vinetrack.diagnosis.stopping import CampaignLook
-    from vinetrack.effects import Effect
-    from vinetrack.experiment.planned import PlannedTrials
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
-
-DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0
-"""Default noise of a position, and default frame rate. Chosen: those of `vinetrack design campaign`. At half the noise,
-effects limited by noise are detected at half the size; those limited by between-trial scatter are not."""
-
-
-@dataclass(frozen=True)
-class PowerRequest:
-    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
-
-    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
-    with each. `reach` is the probability with which further trials shall detect each effect; the fewest such trials are
-    determined. `calibrate` is the number of simulated null campaigns against which the tests of the first model are
-    calibrated.
-    """
-
-    target: Path
-    effects: tuple[str, ...] = ()
-    noise_mm: float = math.nan
-    noise_correlation: float = math.nan
-    spread_P: float = math.nan
-    spread_B: float = math.nan
-    capture_fps: float = math.nan
-    systematic_mm: float = math.nan
-    B: float = math.nan
-    n: float = math.nan
-    simulate: int = 0
-    jobs: int = 1
-    first_seed: int = 1
-    answers: Path | None = None
-    reach: float = math.nan
-    calibrate: int = 0
-    experiment: Path | None = None
-
-
-@dataclass(frozen=True)
-class _Campaign:
-    """The power of a campaign by linear theory, its design for simulations, and constraints on further trials."""
-
-    power: Power
-    design: CampaignDesign
-    limits: Limits = field(default_factory=Limits)
 
 
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
@@ -92,7 +53,7 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     from vinetrack.core.terminal import waiting
 
     with waiting("calculating the power of the trials"):
-        campaign = _campaign(request) if given is None else _campaign_in_memory(request, given)
+        campaign = campaign_of_target(request) if given is None else campaign_in_memory(request, given)
     names = [text.partition("=")[0] for text in request.effects]
     power = campaign.power
     for name in names:
@@ -107,7 +68,7 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
     return power.of_effects(names)
 
 
-def _further_trials(request: PowerRequest, campaign: _Campaign) -> Iterator[FurtherTrials]:
+def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[FurtherTrials]:
     """Determine the fewest further trials that detect each requested effect of given size."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.further_trials import further_trials
@@ -139,15 +100,15 @@ def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.informative_trials import confirming_trials, exploratory_trials
-    from vinetrack.narrative.power_text import informative_text
+    from vinetrack.narrative.further_text import informative_text
 
     request = PowerRequest(target=target, experiment=experiment)
-    measured = _measured_trials(request)
+    measured = trials_of_target(request)
     if measured is None:
         return ""
     names = tuple(name for name in measured.names if name not in look.names)
     with waiting("searching for the trials to make next"):
-        campaign = _measured_campaign(request, replace(measured, names=names))
+        campaign = measured_campaign(request, replace(measured, names=names))
         given = campaign.design, campaign.power
         if not look.names:
             plan = exploratory_trials(*given, campaign.limits)
@@ -188,205 +149,7 @@ def _refuse_effect(name: str, power: Power) -> None:
     raise ExperimentError([Problem(message=message, column="--effect", value=name, remedy=remedy)])
 
 
-@dataclass(frozen=True)
-class _MeasuredTrials:
-    """Measured trials; `names` are the effects of the model, `added` those of them that a diagnosis added."""
-
-    pairs: Sequence[tuple[Trial, Track]]
-    names: tuple[str, ...]
-    added: tuple[str, ...] = ()
-    user_effects: Mapping[str, Effect] = field(default_factory=dict)
-    candidates: Sequence[str] | None = None
-    limits: Limits = field(default_factory=Limits)
-
-
-def _campaign(request: PowerRequest) -> _Campaign:
-    """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
-    from vinetrack.experiment.planned import planned_sheet
-
-    measured = _measured_trials(request)
-    if measured is not None:
-        return _measured_campaign(request, measured)
-    return _planned_campaign(request, planned_sheet(request.target, every_row=True))
-
-
-def _measured_trials(request: PowerRequest) -> _MeasuredTrials | None:
-    """Read the trials of a results folder or of an experiment with tracks; None for a target without measurements."""
-    from vinetrack.effects import own_effects
-    from vinetrack.experiment.folder import read_experiment
-    from vinetrack.inference.fit_data import pairs_of
-
-    if (request.target / PROVENANCE).exists():
-        return _trials_of_results(request)
-    if not request.target.is_dir():
-        return None
-    try:
-        read = read_experiment(request.target)
-    except ExperimentError:
-        return None  # recordings that do not exist yet: a plan
-    if all(trial.track is None for trial in read.trials):
-        return None
-    settings = read.settings
-    user_effects = dict(own_effects([read.folder / path for path in settings.effects]))
-    pairs, _ = pairs_of(read)
-    return _MeasuredTrials(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
-
-
-def _campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> _Campaign:
-    """Return the campaign of a fit, or of trials in memory with the base model."""
-    from vinetrack.inference.fit_result import Fit
-
-    if isinstance(given, Fit):
-        return _Campaign(fit_power(given), design_of_fit(given))
-    return _measured_campaign(request, _MeasuredTrials(list(given), BASE_EFFECTS))
-
-
-def _trials_of_results(request: PowerRequest) -> _MeasuredTrials:
-    from vinetrack.diagnosis.result import ADEQUATE
-    from vinetrack.effects import own_effects
-    from vinetrack.pipeline.model_stage import measured_trials
-    from vinetrack.pipeline.source_experiment import read_source_experiment
-    from vinetrack.results.folder_layout import Results
-    from vinetrack.results.stored_diagnosis import read_diagnosis
-
-    results = Results(request.target)
-    experiment = read_source_experiment(request.target, request.experiment)
-    settings = experiment.settings
-    diagnosis = read_diagnosis(results)
-    accepted = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
-    added = tuple(name for name in accepted if name not in settings.model)
-    user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
-    pairs = measured_trials(experiment, results)[0]
-    return _MeasuredTrials(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
-
-
-def _measured_campaign(request: PowerRequest, measured: _MeasuredTrials) -> _Campaign:
-    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
-    from vinetrack.diagnosis.initial_fit import candidates_of, host_for
-    from vinetrack.dynamics.model import make_model
-    from vinetrack.inference.fit import fit
-
-    pairs, candidates = measured.pairs, measured.candidates
-    model = make_model(measured.names, measured.user_effects)
-    host = host_for(model, candidates_of(model, candidates, measured.user_effects))
-    first = fit(model, pairs, host=host, profile=False, thorough=False)
-    stated = _stated_noise(request, first.noise_m, first.noise_correlation)
-    spreads = _stated_spreads(request, (float(first.state.spread[0]), float(first.state.spread[1])))
-    inputs: list[PowerInput] = []
-    if stated is not None or spreads is not None:
-        first = fit(model, pairs, spreads=spreads, noise=stated, host=host, profile=False, thorough=False)
-        inputs = _input_rows(
-            first.noise_m, first.noise_correlation, tuple(first.state.spread),
-            ("stated" if stated else "fit", "stated" if spreads else "fit"),
-        )  # fmt: skip
-    return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
-
-
-def _stated_noise(request: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
-    if math.isnan(request.noise_mm) and math.isnan(request.noise_correlation):
-        return None
-    return (
-        noise_m if math.isnan(request.noise_mm) else request.noise_mm / 1e3,
-        correlation if math.isnan(request.noise_correlation) else request.noise_correlation,
-    )
-
-
-def _stated_spreads(request: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
-    if math.isnan(request.spread_P) and math.isnan(request.spread_B):
-        return None
-    return (
-        otherwise[0] if math.isnan(request.spread_P) else request.spread_P,
-        otherwise[1] if math.isnan(request.spread_B) else request.spread_B,
-    )
-
-
-def _input_rows(
-    noise_m: float, correlation: float, spreads: Sequence[float], origins: tuple[str, str]
-) -> list[PowerInput]:
-    return [
-        PowerInput("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
-        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", origins[1]),
-        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", origins[1]),
-    ]
-
-
-def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> _Campaign:
-    """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
-    from vinetrack.effects import own_effects
-    from vinetrack.inference.parameters import DAMPING, EXPONENT
-    from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-
-    folder, settings = planned.folder or Path(), planned.settings
-    user_effects = dict(own_effects([folder / path for path in settings.effects]))
-    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=user_effects)
-    by_vine = {}
-    for trial in planned.trials:
-        if trial.vine not in by_vine:
-            by_vine[trial.vine] = predictive_inputs(trial, stated)
-    vine_inputs = list(by_vine.values())
-    first = vine_inputs[0]
-    noise = _stated_noise(request, DEFAULT_NOISE_MM / 1e3, 0.0)
-    noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
-    spreads = _stated_spreads(request, first.spreads)
-    systematic_m, systematic_origin = _planned_systematic(request, settings)
-    trials = tuple(
-        replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)
-        for trial in planned.trials
-    )
-    filmed_fps = [request.capture_fps if math.isfinite(request.capture_fps) else trial.capture_fps for trial in trials]
-    cameras = tuple(
-        FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
-    )
-    origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
-    inputs = [
-        *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
-        PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
-        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(request, trials)),
-        *(
-            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
-            for vine, of_vine in by_vine.items()
-            for symbol, key in (("B", DAMPING), ("n", EXPONENT))
-        ),
-    ]  # fmt: skip
-    design = CampaignDesign(
-        model=joint_model(vine_inputs),
-        trials=trials,
-        cameras=cameras,
-        spreads=spreads or first.spreads,
-        slow_error_m=(math.nan,) * len(trials),
-        has_trace=(False,) * len(trials),
-        candidates=settings.candidates,
-    )
-    return _Campaign(design_power(design, inputs), design, settings.limits)
-
-
-def _planned_systematic(request: PowerRequest, settings: ExperimentSettings) -> tuple[float, str]:
-    """Return the systematic error of positions of planned trials, m, and where it comes from."""
-    if math.isfinite(request.systematic_mm):
-        return request.systematic_mm / 1e3, "stated"
-    systematic_m = expected_systematic_m(settings)
-    if settings.position_systematic_mm is not None:
-        return systematic_m, "experiment.yaml"
-    return systematic_m, "guess: positions by a scale, lens uncorrected" if systematic_m else "lens known from a target"
-
-
-def _fps_origin(request: PowerRequest, trials: Sequence[Trial]) -> str:
-    if math.isfinite(request.capture_fps):
-        return "stated"
-    return "sheet" if all(math.isfinite(trial.capture_fps) for trial in trials) else "guess"
-
-
-def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
-    """Return the trial with the assumed yield pressure of its vine and the default error, if it states none."""
-    from vinetrack.experiment.sheet import YIELD_SIGMA_KPA
-
-    if math.isfinite(trial.yield_pressure_Pa):
-        return trial
-    default_Pa = 1e3 * YIELD_SIGMA_KPA
-    return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=default_Pa)
-
-
-def _simulated_sizes(request: PowerRequest, campaign: _Campaign) -> list[tuple[str, float, float]]:
+def _simulated_sizes(request: PowerRequest, campaign: PowerCampaign) -> list[tuple[str, float, float]]:
     """Return effect, size in SI and predicted rate of every kind of campaign to simulate, the null campaign first."""
     power = campaign.power
     wanted = [("", math.nan, power.false_alarm_rate)]
@@ -413,7 +176,7 @@ def _size_of(text: str, entry: EffectPower) -> float:
         raise ExperimentError([problem]) from None
 
 
-def _simulated_rates(request: PowerRequest, campaign: _Campaign) -> Iterator[SimulatedRates]:
+def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator[SimulatedRates]:
     """Simulate and diagnose campaigns; yield the rate of each kind. Answers of an earlier run are reused."""
     wanted = _simulated_sizes(request, campaign)
     simulation = Simulation(
@@ -440,7 +203,7 @@ def _null_calibration(request: PowerRequest, given: Fit | Pairs | None) -> NullC
         questioned = candidates_of(given.model, None, given.model.user_effects)
         fitted = with_host(given, host_for(given.model, questioned))
     else:
-        measured = _measured_trials(request) if given is None else _MeasuredTrials(list(given), BASE_EFFECTS)
+        measured = trials_of_target(request) if given is None else MeasuredTrials(list(given), BASE_EFFECTS)
         if measured is None:
             problem = Problem(
                 message="needs measured trials", column="--calibrate", value=str(request.target),
