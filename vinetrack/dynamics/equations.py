@@ -24,6 +24,7 @@ _FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, 
 
 compiled: Any = njit(**_FLAGS, forceinline=False)
 inlined: Any = njit(**_FLAGS, forceinline=True)
+merged: Any = njit(**_FLAGS, inline="always")
 """Options with which every function of the integrator is compiled: it releases the interpreter's lock, divides by zero
 as NumPy does, and does not count references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two
 together make it three times as fast; in return no function may allocate an array. Python cannot call these functions,
@@ -34,6 +35,10 @@ compile a model.
 it, a trajectory takes 1.8 times as long on 36 trials, for the base model as for a catalogue of 36 effects. Either
 option is stated for every function: otherwise numba takes it from whichever caller it compiles first, and the same
 model was up to twice as slow in a process that had called its rates alone.
+
+`merged` is for a large function with a single caller: numba copies it into the caller before it infers types. Otherwise
+all that it calls is optimised for the function and once more for its caller, which takes a seventh of the time to
+compile the whole catalogue. Trajectories are the same to the last bit.
 """
 
 

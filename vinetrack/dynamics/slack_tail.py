@@ -51,6 +51,12 @@ class SlackState(NamedTuple):
 
 
 @compiled
+def _tip_tension(equations, time, x, v, chamber, resting, trial):
+    """`equations.tip_tension`, compiled once instead of into each of its nine callers."""
+    return equations.tip_tension(time, x, v, chamber, resting, trial)
+
+
+@compiled
 def slack_at_rest(equations, trial, time, x, chamber):
     """Whether the tail of a vine at rest would be under compression.
 
@@ -66,7 +72,7 @@ def slack_at_rest(equations, trial, time, x, chamber):
     """
     if trial.inputs[FREE] <= 0:
         return False
-    tension, _rate = equations.tip_tension(time, x, 0.0, chamber, True, trial)
+    tension, _rate = _tip_tension(equations, time, x, 0.0, chamber, True, trial)
     return tension < 0
 
 
@@ -87,7 +93,7 @@ def slack_fraction(equations, trial, h, start, end):
     """
     if trial.inputs[FREE] <= 0:
         return 2.0
-    tension, _rate = equations.tip_tension(end.time, end.x, end.v, end.chamber, False, trial)
+    tension, _rate = _tip_tension(equations, end.time, end.x, end.v, end.chamber, False, trial)
     if tension >= 0:
         return 2.0
     low, high = 0.0, 1.0
@@ -95,7 +101,7 @@ def slack_fraction(equations, trial, h, start, end):
         middle = 0.5 * (low + high)
         x, v, _a = quintic(middle, h, start, end)
         pressure = start.chamber + middle * (end.chamber - start.chamber)
-        tension, _rate = equations.tip_tension(start.time + middle * h, x, v, pressure, False, trial)
+        tension, _rate = _tip_tension(equations, start.time + middle * h, x, v, pressure, False, trial)
         if tension < 0:
             high = middle
         else:
@@ -106,20 +112,20 @@ def slack_fraction(equations, trial, h, start, end):
 @compiled
 def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
     """Tail speed r·ẏ at a tip without tension, at which its forces balance, by the Illinois method; x = r·y."""
-    f_low, _r = equations.tip_tension(time, x, 0.0, chamber, not moving, trial)
+    f_low, _r = _tip_tension(equations, time, x, 0.0, chamber, not moving, trial)
     if f_low <= 0:
         return 0.0
     low, high = 0.0, max(guess, 1e-6)
-    f_high, _r = equations.tip_tension(time, x, high, chamber, False, trial)
+    f_high, _r = _tip_tension(equations, time, x, high, chamber, False, trial)
     factor = 1.01
     while f_high > 0 and high < 1e6:
         low, f_low = high, f_high
         high *= factor
         factor = min(factor * factor, 10.0)
-        f_high, _r = equations.tip_tension(time, x, high, chamber, False, trial)
+        f_high, _r = _tip_tension(equations, time, x, high, chamber, False, trial)
     if low == 0.0 and guess > 0:
         near = 0.99 * guess
-        f_near, _r = equations.tip_tension(time, x, near, chamber, False, trial)
+        f_near, _r = _tip_tension(equations, time, x, near, chamber, False, trial)
         if f_near > 0:
             low, f_low = near, f_near
         else:
@@ -130,7 +136,7 @@ def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
         middle = high - f_high * (high - low) / (f_high - f_low)
         if not low < middle < high:
             middle = 0.5 * (low + high)
-        f, _r = equations.tip_tension(time, x, middle, chamber, False, trial)
+        f, _r = _tip_tension(equations, time, x, middle, chamber, False, trial)
         if f * f_high < 0:
             low, f_low = high, f_high
         else:
@@ -146,7 +152,7 @@ def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
     """Write the rates of a `SlackState` into `rates`, shape (4,); return the tail speed of the film at the tip, m/s."""
     r = trial.inputs[RATIO]
     u = _free_tip_speed(equations, trial, time, r * s.y, s.chamber, tip_speed, moving)
-    _tension, chamber_rate = equations.tip_tension(time, r * s.y, u, s.chamber, False, trial)
+    _tension, chamber_rate = _tip_tension(equations, time, r * s.y, u, s.chamber, False, trial)
     fall = equations.free_fall(time, s.y, u / r, s.x, s.v, s.chamber, trial)
     rates[0] = s.v
     rates[1] = 0.0 if s.v <= 0 and fall < 0 else fall
