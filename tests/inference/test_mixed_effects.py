@@ -9,8 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.linalg import toeplitz
-from scipy.optimize import lsq_linear
+from mixed_problem import RHO, SIGMA, columns_of, covariance, frame_of, state_of
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
@@ -19,8 +18,6 @@ from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
     at_zero_deviations,
-    bounded_solve,
-    levenberg_marquardt_step,
     sum_matrix_blocks,
     trial_deviation_sd,
 )
@@ -28,45 +25,6 @@ from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.variance_kernels import decrease_within_bounds, normal_equations_without_deviations
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
-
-RHO, SIGMA = 0.45, 0.3
-
-
-def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
-    return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
-
-
-def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
-    return MixedProblem(
-        index=np.tile(np.arange(keys), (n_trials, 1)),
-        has_deviation=np.tile([False, True], (n_trials, 1)),
-        gauge_error=np.zeros(n_trials),
-        release_origin_mean=np.zeros((n_trials, 2)),
-        release_origin_precision=np.full((n_trials, 2), flat_sd**-2),
-        prior_mean=np.zeros(keys),
-        prior_precision=np.zeros(keys),
-        lower=np.full(keys, -np.inf),
-        upper=np.full(keys, np.inf),
-        free=np.ones(keys, dtype=bool),
-        points=np.full(n_trials, float(count)),
-        stretches=np.ones(n_trials),
-    )
-
-
-def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> FitState:
-    variance = np.full(n_trials, sigma**2 * (1 - rho**2))
-    return FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
-
-
-def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarray]:
-    """Random columns; the pressure deviation is silent, the deviation of B moves what the first key moves."""
-    draw = np.random.default_rng(seed)
-    out = []
-    for _ in range(n_trials):
-        shared = draw.standard_normal((count, keys))
-        own = np.column_stack([draw.standard_normal(count), np.ones(count), np.zeros(count), shared[:, 0]])
-        out.append(np.column_stack([own, shared, draw.standard_normal(count)]))
-    return out
 
 
 def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
@@ -118,25 +76,6 @@ def test_residuals_at_zero_deviations_are_restored() -> None:
     assert at_zero_deviations(white, state, -1) == pytest.approx(
         at_correlation(all_products(whole, first), RHO), rel=1e-9
     )
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_the_compiled_decrease_agrees_with_the_bounded_step(seed: int) -> None:
-    draw, size = np.random.default_rng(seed), 6
-    rows = draw.standard_normal((30, size)) * [1, 10, 0.1, 1e3, 1, 1]
-    square, slope = rows.T @ rows, rows.T @ draw.standard_normal(30)
-    reach = np.abs(np.linalg.solve(square, slope))
-    theta = draw.uniform(-1, 1, size) * reach
-    held = np.arange(size) == (seed % 9)
-    problem = replace(frame_of(1, 5, size), lower=-1.1 * reach, upper=1.3 * reach, free=~held)
-    step, moving = bounded_solve(square, slope, problem, theta)
-    solved, decrease, log_det = decrease_within_bounds(
-        square, slope, theta - problem.lower, problem.upper - theta, problem.free
-    )
-    k = np.flatnonzero(moving)
-    assert solved
-    assert decrease == pytest.approx(step @ (2 * slope - square @ step))
-    assert log_det == pytest.approx(np.linalg.slogdet(square[np.ix_(k, k)])[1])
 
 
 def test_nearly_collinear_deviations_are_integrated_out_of_precise_positions() -> None:
@@ -262,33 +201,6 @@ def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
     assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
 
-def test_a_step_ends_at_the_first_bound_and_continues_along_it() -> None:
-    # ½xᵀHx − gᵀx in the unit square: its minimum (14/3, 7/3) lies outside; on the side x₁ = 1 it is at x₂ = ½.
-    square, slope = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([7.0, 0.0])
-    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2), upper=np.ones(2))
-    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
-    assert step == pytest.approx([1.0, 0.5])
-    assert list(moving) == [False, True]
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_a_bounded_step_lowers_the_sum_of_squares_even_for_nearly_collinear_parameters(seed: int) -> None:
-    draw = np.random.default_rng(seed)
-    columns = draw.standard_normal((50, 6))
-    columns[:, 5] = columns[:, 4] * (1 + 1e-7 * draw.standard_normal(50))
-    square, slope = columns.T @ columns, columns.T @ draw.standard_normal(50) * 30
-    problem = replace(frame_of(1, 5, 6), lower=np.full(6, -1.0), upper=np.full(6, 2.0))
-    theta = draw.uniform(-1, 2, 6)
-    step, _ = bounded_solve(square, slope, problem, theta)
-    assert np.all(theta + step >= problem.lower - 1e-12)
-    assert np.all(theta + step <= problem.upper + 1e-12)
-    assert step @ (2 * slope - square @ step) > 0
-    # Held against the exact minimum in the box.
-    exact = lsq_linear(columns, 1.0 * columns @ np.linalg.lstsq(square, slope, rcond=None)[0], (-1 - theta, 2 - theta))
-    best = exact.x @ (2 * slope - square @ exact.x)
-    assert step @ (2 * slope - square @ step) > 0.8 * best
-
-
 def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
     draw = np.random.default_rng(7)
     n_trials, count, rho = 300, 30, 0.4
@@ -329,33 +241,6 @@ def test_a_measured_pressure_has_the_standard_deviation_of_its_gauge() -> None:
     assert trial_deviation_sd(frame, (0.01, 0.03)) == pytest.approx(
         np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]])
     )
-
-
-def test_one_step_solves_a_linear_problem() -> None:
-    columns = columns_of(3, 25, 2, seed=8)
-    truth = np.array([0.3, -0.7])
-    for c in columns:
-        c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
-    frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
-    step, own, predicted_decrease = levenberg_marquardt_step(
-        all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0
-    )
-    assert step == pytest.approx(truth, abs=1e-6)
-    assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
-    assert predicted_decrease > 0
-
-
-def test_a_parameter_at_its_bound_does_not_leave_it() -> None:
-    columns = columns_of(3, 25, 2, seed=9)
-    for c in columns:
-        c[:, -1] = c[:, 4:6] @ np.array([0.3, -0.7])
-    frame = frame_of(3, 25, 2)
-    bounded = MixedProblem(**{**frame.__dict__, "lower": np.array([-np.inf, 0.0])})
-    step, _, _ = levenberg_marquardt_step(
-        all_products(columns, [np.arange(25) == 0] * 3), bounded, state_of(3, 2, 0.1), 0.0
-    )
-    assert step[1] == 0.0
-    assert step[0] > 0
 
 
 def test_collinear_parameters_are_detected() -> None:

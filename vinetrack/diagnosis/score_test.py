@@ -148,7 +148,7 @@ def projected(fit: Fit, products: Products, state: FitState) -> Projection:
         total += _sum_of_blocks(blocks[part, C, C], places[part], n_tested + 1)
     np.add.at(score, places, blocks[:, C, r])
     cross, total, score = cross[:size, :n_tested], total[:n_tested, :n_tested], score[:n_tested]
-    estimated = np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~_at_bound(fit))
+    estimated = _adapting(fit, hessian)
     inverse = inverse_of_block(hessian, estimated)
     lever, step = inverse @ cross, inverse @ gradient
     information, empty = _without_rounding(total - cross.T @ lever, total)
@@ -288,7 +288,7 @@ def _shape_information(fit: Fit, information: Floats, n_shapes: int) -> Floats:
     problem = fit.solution.problem
     size = problem.prior_mean.size
     hessian = information[:size, :size] + np.diag(problem.prior_precision)
-    estimated = np.flatnonzero(problem.free & (np.diag(hessian) > 0) & ~_at_bound(fit))
+    estimated = _adapting(fit, hessian)
     cross = information[:size, size:]
     before = information[size:, size:]
     projected_off, _ = _without_rounding(before - cross.T @ inverse_of_block(hessian, estimated) @ cross, before)
@@ -329,9 +329,10 @@ def _marginalised(score: Floats, information: Floats, matrix: Floats) -> tuple[F
     return shape_score, of_shapes
 
 
-def _at_bound(fit: Fit) -> NDArray[np.bool_]:
-    """Which parameters are at a bound and cannot adapt."""
-    return np.array([math.isfinite(number.bound) for number in fit.numbers], dtype=bool)
+def _adapting(fit: Fit, hessian: Floats) -> NDArray[np.intp]:
+    """Indices of the parameters that adapt to an effect: those estimated that are not at a bound."""
+    at_bound = np.array([math.isfinite(number.bound) for number in fit.numbers], dtype=bool)
+    return np.flatnonzero(fit.solution.problem.free & (np.diag(hessian) > 0) & ~at_bound)
 
 
 def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floats]:
@@ -360,7 +361,7 @@ def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floa
         projection = projected(fit, products, trial_state)
         marginalisation = _marginalisation(projection.information, products.n_shapes)
         score, information = _marginalised(projection.score, projection.information, marginalisation)
-        residual_sum = _residual_sum(fit, projection.blocks, products.n_keys, trial_state)
+        residual_sum = _residual_sum(fit, projection, products.n_keys, trial_state)
         variance = np.full_like(variance, float(np.mean(variance)) * max(residual_sum / total, 1e-6))
     diagonal = np.maximum(np.diag(information), 1e-300)
     size = np.where(np.diag(information) > 0, score / diagonal, 0.0)
@@ -368,12 +369,13 @@ def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floa
     return np.asarray(total * np.log(residual_sum / reduced_sum)), size
 
 
-def _residual_sum(fit: Fit, blocks: Floats, p: int, state: FitState) -> float:
-    """Residual sum of squares, in units of the noise, with the fit's parameters at their best; priors included."""
-    problem = fit.solution.problem
-    hessian = sum_matrix_blocks(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
+def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> float:
+    """Residual sum of squares, in units of the noise, with the fit's parameters at their best; priors included.
+
+    Parameters at a bound, or fixed, stay where they are, as in `projected`: their steps there are 0.
+    """
+    problem, blocks = fit.solution.problem, projection.blocks
     deviation = state.theta - problem.prior_mean
     gradient = sum_vector_blocks(blocks[:, :p, p], problem) - problem.prior_precision * deviation
-    step = np.linalg.lstsq(hessian, gradient, rcond=1e-11)[0]
     total = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * deviation**2))
-    return max(float(total - step @ gradient), 1e-9 * float(total))
+    return max(float(total - projection.step @ gradient), 1e-9 * float(total))

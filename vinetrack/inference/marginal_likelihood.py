@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.inference.gauss_newton import bounded_solve
 from vinetrack.inference.mixed_effects import (
     LEAST_BETWEEN_TRIAL_SD,
     FitState,
     MixedProblem,
     at_zero_deviations,
-    bounded_solve,
     solve_per_trial,
     trial_deviation_sd,
     trial_effect_prior,

@@ -16,9 +16,10 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import estimable, variance_floor
+from vinetrack.inference.gauss_newton import levenberg_marquardt_step
 from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.marginal_likelihood import estimate_between_trial_sd, estimate_noise, marginal
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step, shared_penalty
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import (
     ReleaseSearch,
@@ -189,7 +190,9 @@ def solve(
             predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
         )
         variances_moved = variance_change(before, state)
-        step, effect_step, predicted_decrease = levenberg_marquardt_step(cross_products, problem, state, damping)
+        (step, effect_step, predicted_decrease), damping = _next_step(
+            cross_products, problem, state, damping, least_decrease
+        )
         if watch is not None:
             watch(_step_report(predictor, state, iteration, predicted_decrease))
         small_step = predicted_decrease < least_decrease
@@ -240,6 +243,19 @@ def solve(
             break
         state = accepted
     return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
+
+
+def _next_step(
+    cross_products: Floats, problem: MixedProblem, state: FitState, damping: float, least_decrease: float
+) -> tuple[tuple[Floats, Floats, float], float]:
+    """The damped step, or the full one where the damped one looks converged; and the damping of the step returned.
+
+    A damped step is short wherever the minimum lies, so only the full step tells whether a fit has converged.
+    """
+    damped = levenberg_marquardt_step(cross_products, problem, state, damping)
+    if damping == 0 or damped[2] >= least_decrease:
+        return damped, damping
+    return levenberg_marquardt_step(cross_products, problem, state, 0.0), 0.0
 
 
 def _with_fixed_terms(state: FitState, fixed_terms: FixedTerms) -> FitState:

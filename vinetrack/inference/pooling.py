@@ -33,13 +33,13 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import variance_floor
+from vinetrack.inference.gauss_newton import trial_effect_step
 from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
     DEVIATION_COLUMNS,
     FitState,
     MixedProblem,
     inverse_of_block,
-    trial_effect_step,
     trial_effects_eliminated,
 )
 from vinetrack.inference.optimiser import Solution

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_problem import variance_floor
+from vinetrack.inference.gauss_newton import levenberg_marquardt_step
 from vinetrack.inference.intervals import LEAST_INFORMATION
 from vinetrack.inference.marginal_likelihood import (
     deviance,
@@ -29,7 +30,7 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
     normal_equations,
 )
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, levenberg_marquardt_step
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import CONVERGED_VARIANCES, FixedTerms, Solution, variance_change
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten

@@ -18,9 +18,9 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.gauss_newton import bounded_solve
 from vinetrack.inference.goodness_of_fit import is_poor_fit
 from vinetrack.inference.mixed_effects import (
-    bounded_solve,
     solve_per_trial,
     sum_matrix_blocks,
     sum_vector_blocks,

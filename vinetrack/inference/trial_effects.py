@@ -15,13 +15,8 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.mixed_effects import (
-    FitState,
-    MixedProblem,
-    trial_effect_penalty,
-    trial_effect_prior,
-    trial_effect_step,
-)
+from vinetrack.inference.gauss_newton import trial_effect_step
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_penalty, trial_effect_prior
 from vinetrack.inference.part_of_trials import parameters_of_trials, subset_predictor, subset_problem, subset_state
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.sensitivity import (
