@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from hidden_truth import grown
 
 import vinetrack as vt
 import vinetrack.inference.fit
+from vinetrack.diagnosis import candidate_fits
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
 from vinetrack.diagnosis.multi_start import SubsetFitter, full_fit
+from vinetrack.effects import find_effect
 from vinetrack.inference.parameters import YIELD_PRESSURE
 from vinetrack.inference.solving import solve_onward
 
@@ -60,3 +66,31 @@ def test_an_effect_that_adds_nothing_makes_no_fit_worse():
         found = vt.refit(base, base.model + getattr(vt.effects, name))
         assert found.log_likelihood > base.log_likelihood - 0.5
         assert np.isfinite(found.chi2_per_dof)
+
+
+@pytest.mark.parametrize(("gained", "kept"), [(-0.5, False), (0.6, True)])
+def test_a_rival_that_ends_higher_from_where_the_best_ended_is_kept(
+    monkeypatch: pytest.MonkeyPatch, gained: float, kept: bool
+) -> None:
+    """Its −2 ln L lies 10 above the best, outside the answer set; with 1.2 less it is a member."""
+
+    def ratio(name: str, log_likelihood: float) -> Any:
+        fit: Any = SimpleNamespace(
+            log_likelihood=log_likelihood, predictor=None, solution=None, model=SimpleNamespace(values={})
+        )
+        return LikelihoodRatio((find_effect(name),), fit, 0.0, 0.0, plausible=True, reason="")
+
+    best, rival = ratio("leak", -100.0), ratio("air_drag", -105.0)
+    refitted = SimpleNamespace(log_likelihood=-105.0 + gained)
+    monkeypatch.setattr(candidate_fits, "is_poor_fit", lambda *_: False)
+    monkeypatch.setattr(candidate_fits, "refit", lambda *_, **__: refitted)
+    monkeypatch.setattr(candidate_fits, "likelihood_ratio", lambda _before, _effects, fit: fit)
+    model = SimpleNamespace(with_effects=lambda _: SimpleNamespace(parameter_names=()))
+    fits: Any = SimpleNamespace(
+        credible_fits=[best, rival],
+        fitted={"leak": best, "air_drag": rival},
+        tests=SimpleNamespace(fit=SimpleNamespace(model=model)),
+    )
+    candidate_fits.CandidateFits._refit_rivals_from_best(fits)
+    assert (fits.fitted["air_drag"] is refitted) == kept
+    assert fits.fitted["leak"] is best

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from vinetrack.core.records import Bend, Kinematics, Trial
-from vinetrack.dynamics.audit import COLUMNS, Audit, AuditedMotion, audit, measured_motion
+from vinetrack.dynamics.audit import COLUMNS, TENSION_RULE, Audit, AuditedMotion, audit, measured_motion
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import catalogue
@@ -167,13 +167,15 @@ def test_compression_in_the_tail_is_found(P: float, onset_s: float, within_s: fl
     tension = row(found, "tail_tension")
     assert abs(tension["slack_from_s"] - onset_s) < within_s
     assert tension["force_N"] < 0
-    assert any("predicts compression in the tail" in words for words in found.warnings)
+    (violation,) = (each for each in found.violations if each.rule == TENSION_RULE)
+    assert violation.sentence in found.warnings
+    assert violation.sentence.startswith(f"Trial {of.name}: the model predicts compression in the tail from ")
 
 
 def test_a_tail_that_may_go_slack_gives_no_warning() -> None:
     found = audit(BASE, [steady(trial(tail_slack="free"), 5.0)])
     assert row(found, "tail_tension")["force_N"] < 0
-    assert not any("push" in words for words in found.warnings)
+    assert not any(violation.rule == TENSION_RULE for violation in found.violations)
 
 
 def test_a_measured_motion_starts_at_release_and_at_zero() -> None:

@@ -68,10 +68,17 @@ SAME_MINIMUM_PER_POINT = 0.01
 noise s is n ln s², so their misfits agree to half a per cent; such fits end before they have settled. At half more
 starts are tried (time), at twice fewer."""
 
-LINEAR_REACH = 16.0
-"""Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted: this value, or
-40 % of the best gain where that is more, but never more than 75 % of it. Chosen: nearly twice the difference within
-which a hypothesis belongs to the answer set, for linear predictions err; at half fewer, at twice more are fitted."""
+LINEAR_REACH, LINEAR_REACH_SHARE, MAX_LINEAR_REACH_SHARE = 16.0, 0.4, 0.75
+"""Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted: the first number,
+or the second's share of the best gain where that is more, but never more than the third's share of it. Chosen: 16 is
+nearly twice the difference within which a hypothesis belongs to the answer set, for linear predictions err; the shares
+are for time, so that strong effects are compared with all that gain more than 60 % of what they do, and weak ones with
+none that gains less than a quarter. At half fewer, at twice more are fitted."""
+
+PREDICTED_GAIN_SHARE = 0.7
+"""Share of its predicted gain that a fit to all trials must reach for no other shape of the effect to be tried. Chosen:
+the linear prediction of a strong effect errs by a quarter of Δχ² (√LR 22 against 25, see LINEAR_PREDICTION_LIMIT). At
+half a fit that ended in a local minimum stands, at twice every effect is fitted from all of its starts (time)."""
 
 ALIKE_COSINE = 0.95
 """Cosine from which two effects count as alike. Chosen: with one of them in the model, a tenth of the information on
@@ -256,7 +263,7 @@ class CandidateFits:
             }
             with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
                 fit = refit(best.fit, model, start=values, thorough=False)
-                if fit.log_likelihood > rival.fit.log_likelihood - FAILED_FIT_DELTA_CHI2:
+                if fit.log_likelihood > rival.fit.log_likelihood:
                     self.fitted[rival.label] = likelihood_ratio(self.tests.fit, rival.effects, fit)
 
     def _fit_simpler_forms(self) -> None:
@@ -318,8 +325,9 @@ class CandidateFits:
         if not names:
             return []
         top, highest_score = self.tests.predicted_gain(names[0]), self._highest_scores()[:1]
+        reach = min(max(LINEAR_REACH, LINEAR_REACH_SHARE * top), MAX_LINEAR_REACH_SHARE * top)
         for name in names:
-            promising = self.tests.predicted_gain(name) > max(min(top - LINEAR_REACH, 0.6 * top), 0.25 * top)
+            promising = self.tests.predicted_gain(name) > top - reach
             alike = self.tests.cosine(name, names[0]) > ALIKE_COSINE or name in highest_score
             if (promising or alike or all_of_them) and name not in self.fitted and name not in self.failed:
                 self.report(f"fitting {name}")
@@ -333,7 +341,8 @@ class CandidateFits:
         for index in self.tests.ranked_shapes(name)[:STARTS_PER_EFFECT]:
             shape = self.tests.sensitivities.shapes[index]
             self._fit(SubsetFit((shape.effect,), math.nan, start_values(shape, float(sizes[index]))))
-            if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.tests.predicted_gain(name):
+            required = PREDICTED_GAIN_SHARE * self.tests.predicted_gain(name)
+            if name in self.fitted and self.fitted[name].delta_chi2 > required:
                 break
             if self._is_hopeless(name):
                 break

@@ -30,6 +30,9 @@ DRAG_SHARE, PRESSURE_SHARE, NEGLIGIBLE_LENGTH_M = 0.05, 0.05, 0.30
 along the length and bends. They decide which warnings are printed, and no fitted number; at half there are more, at
 twice fewer."""
 
+DRAG_RULE, LENGTH_RULE, BEND_RULE, RESERVOIR_RULE, TENSION_RULE = "drag", "length", "bends", "reservoir", "tension"
+"""The rules that a trial may violate, see `RuleViolation`."""
+
 TENSION = "tail_tension"
 COLUMNS = (
     "trial",
@@ -80,17 +83,36 @@ class AuditedMotion:
 
 
 @dataclass(frozen=True)
+class RuleViolation:
+    """A rule for neglecting an effect that a trial violates, such as `DRAG_RULE`, and how it does, in words."""
+
+    trial: str
+    rule: str
+    words: str
+
+    @property
+    def sentence(self) -> str:
+        """The violation as a sentence that names the trial."""
+        return f"Trial {self.trial}: {self.words}."
+
+
+@dataclass(frozen=True)
 class Audit:
     """Result of an audit: a table of neglected terms and tensions by trial, and warnings.
 
     `table`, columns `COLUMNS`, has a row per trial for each neglected term and one for the tension. `force_N` is the
     force on the tail where it is largest relative to the drive (negative: it opposes growth), with time and place;
     `shift_m` is the displacement that the camera would see. The row `tail_tension` has the least tension, and the time
-    at which it first was negative. `warnings` are sentences.
+    at which it first was negative. `violations` are the rules that trials violate, `warnings` the same in sentences.
     """
 
     table: pd.DataFrame
-    warnings: tuple[str, ...]
+    violations: tuple[RuleViolation, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each violation."""
+        return tuple(violation.sentence for violation in self.violations)
 
 
 def measured_motion(
@@ -138,17 +160,18 @@ def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effe
     """
     candidates = list(catalogue().values()) if effects is None else list(effects)
     rows: list[dict[str, Any]] = []
-    warnings: list[str] = []
+    violations: list[RuleViolation] = []
     for motion in (motion.thinned() for motion in motions):
         terms = _terms_along(model, motion)
         neglected = [e for e in candidates if e.kind != "measurement" and not _in_model(e, model, motion)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
         rows += [*left_out, tension]
-        warnings += [
-            f"Trial {motion.trial.name}: {words}." for words in _rule_warnings(model, motion, left_out, tension)
+        violations += [
+            RuleViolation(motion.trial.name, rule, words)
+            for rule, words in _violated_rules(model, motion, left_out, tension)
         ]
-    return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(warnings))
+    return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(violations))
 
 
 def _terms_along(model: Model, motion: AuditedMotion) -> Terms:
@@ -255,37 +278,44 @@ def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:
     }
 
 
-def _rule_warnings(
+def _violated_rules(
     model: Model, motion: AuditedMotion, rows: Sequence[dict[str, Any]], tension: dict[str, Any]
-) -> Iterator[str]:
+) -> Iterator[tuple[str, str]]:
+    """Each rule that the trial violates, and how, in words."""
     trial = motion.trial
     neglected = {row["term"]: row for row in rows}
     drag = neglected.get("air_drag")
     if drag and abs(drag["share_of_drive"]) > DRAG_SHARE:
         yield (
+            DRAG_RULE,
             f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
-            f"({drag['size']}), above {DRAG_SHARE:.0%}; add air_drag to the model"
+            f"({drag['size']}), above {DRAG_SHARE:.0%}; add air_drag to the model",
         )
     if "tail_friction" in neglected and trial.length_m >= NEGLIGIBLE_LENGTH_M:
         yield (
+            LENGTH_RULE,
             f"friction along the length is neglected in a vine of {100 * trial.length_m:.0f} cm, which is safe below "
-            f"{100 * NEGLIGIBLE_LENGTH_M:.0f} cm; add tail_friction to the model"
+            f"{100 * NEGLIGIBLE_LENGTH_M:.0f} cm; add tail_friction to the model",
         )
     bent = sum(bend.arc_m / bend.radius_m for bend in trial.bends)
     if "capstan_friction" in neglected and bent >= NEGLIGIBLE_BEND_RAD:
         yield (
+            BEND_RULE,
             f"the path bends by {math.degrees(bent):.0f}° in all, which is safe to neglect below "
-            f"{math.degrees(NEGLIGIBLE_BEND_RAD):.0f}°; add capstan_friction to the model"
+            f"{math.degrees(NEGLIGIBLE_BEND_RAD):.0f}°; add capstan_friction to the model",
         )
-    yield from _reservoir_warning(model, motion, neglected)
+    yield from _reservoir_rule(model, motion, neglected)
     if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
         yield (
+            TENSION_RULE,
             f"the model predicts compression in the tail from {1e3 * tension['slack_from_s']:.0f} ms on (tension down "
-            f"to {tension['force_N']:.2f} N); `tail_slack: free` lets it go slack"
+            f"to {tension['force_N']:.2f} N); `tail_slack: free` lets it go slack",
         )
 
 
-def _reservoir_warning(model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]) -> Iterator[str]:
+def _reservoir_rule(
+    model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]
+) -> Iterator[tuple[str, str]]:
     """The reservoir's rule, by the gas law in absolute pressure, for slow and for fast expansion."""
     row = neglected.get("reservoir_depletion")
     pressure = motion.trial.pressure_Pa
@@ -298,7 +328,8 @@ def _reservoir_warning(model: Model, motion: AuditedMotion, neglected: dict[str,
         shares.append(1 - float(np.min(lowest_Pa)) / pressure)
     if shares[1] > PRESSURE_SHARE:
         yield (
+            RESERVOIR_RULE,
             f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
             f"(fast) of its gauge pressure while the vine grows, above {PRESSURE_SHARE:.0%}, unless a supply refills "
-            "it; add reservoir_depletion or supply_refill to the model, or measure the pressure"
+            "it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
         )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.audit import AuditedMotion, audit
+from vinetrack.dynamics.audit import TENSION_RULE, AuditedMotion, audit
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, EffectError, catalogue
@@ -145,10 +145,8 @@ def _rules(prediction: VinePrediction) -> Iterator[str]:
     (moved,), _ = follow(inputs, *_medians(inputs))
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
-    for sentence in audit(inputs.model, [motion]).warnings:
-        words = sentence.partition(": ")[2].rstrip(".")
-        if not words.startswith("the model predicts compression in the tail"):
-            yield words
+    violations = audit(inputs.model, [motion]).violations
+    yield from (violation.words for violation in violations if violation.rule != TENSION_RULE)
 
 
 def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
