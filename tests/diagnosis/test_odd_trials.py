@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from lsoda_vine import grown_position, vine_trial
 from vine_truth import make_track
 
+import vinetrack.diagnosis.odd_trials as odd_trials_module
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
@@ -182,3 +184,32 @@ def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(c
     (slip,) = odd_trials(data)
     assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
     assert slip.implied_pressure_Pa == pytest.approx(21e3, rel=0.05)
+
+
+def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
+    """Normal scatter of 24 trials of six vines; the curves take a third of the degrees of freedom."""
+    monkeypatch.setattr(odd_trials_module, "CHANCE", 1e-2)
+    monkeypatch.setattr(odd_trials_module, "middle_speed", lambda data: data.speed)
+    monkeypatch.setattr(odd_trials_module, "_stated_Pa", lambda _: math.nan)
+    monkeypatch.setattr(odd_trials_module, "_force_N", lambda trial, _: trial.force_N)
+    monkeypatch.setattr(odd_trials_module, "_implied_pressure_Pa", lambda *_: math.nan)
+    draw = np.random.default_rng(20050)
+    campaigns_with_odd = 0
+    for _ in range(150):
+        log_speed = draw.uniform(0, 1.5, 24)
+        force_N = np.exp(0.37 * log_speed + 0.05 * draw.standard_normal(24))
+        data = [
+            SimpleNamespace(
+                speed=math.exp(log_speed[k]),
+                trial=SimpleNamespace(
+                    travel_ratio=2, force_N=force_N[k], name=str(k), vine=str(k % 6), condition=str(k)
+                ),
+            )
+            for k in range(24)
+        ]
+        campaigns_with_odd += bool(odd_trials(data))
+    assert campaigns_with_odd <= 6
+
+
+def test_curves_that_take_every_degree_of_freedom_say_nothing(campaign):
+    assert odd([(replace(trial, vine=str(k % 10)), track) for k, (trial, track) in enumerate(campaign)]) == {}
