@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.notebook import plot
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_of
@@ -103,6 +104,7 @@ class Comparison:
         return str(self.table._repr_html_())  # type: ignore[operator]
 
 
+@in_one_blas_thread
 def compare(
     fit: Fit,
     experiment: Experiment | Path | str | Pairs,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Track
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
@@ -66,6 +67,7 @@ def _quiet(_: str) -> None:
     pass
 
 
+@in_one_blas_thread
 def diagnose(
     source: Fit | Experiment | Path | str | Pairs,
     *,

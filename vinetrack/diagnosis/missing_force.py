@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.cubic_splines import uniform_splines
 from vinetrack.diagnosis.force_inversion import LinearInversion
@@ -101,6 +101,7 @@ class MissingForce:
         }
 
 
+@in_one_blas_thread
 def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
     """Estimate the force that a fit lacks and compare it with simple laws.
 
@@ -147,6 +148,7 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
     )
 
 
+@in_one_blas_thread
 def learn_missing_force(fit: Fit) -> LearnedForce | None:
     """Estimate the force that a fit lacks as a smooth function, without comparing it with laws.
 
@@ -167,13 +169,9 @@ def learn_missing_force(fit: Fit) -> LearnedForce | None:
 
 
 def _learned(fit: Fit, linear: LinearMisfit) -> LearnedForce | None:
-    """The force as a smooth function; None also where the motions under it cannot be simulated.
-
-    In one thread: matrices of 160 rows are too small for more, and on busy cores threads wait for each other a hundred
-    times as long as the work takes.
-    """
+    """The force as a smooth function; None also where the motions under it cannot be simulated."""
     try:
-        with threadpool_limits(1), np.errstate(all="raise", under="ignore"):
+        with np.errstate(all="raise", under="ignore"):
             return learned_force(fit, linear.inversion, linear.motions, linear.inversion.scatter.dof)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None

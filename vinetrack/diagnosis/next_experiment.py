@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.settings import Limits
@@ -137,6 +138,7 @@ class _Option:
         return min(_by_pair(self.separations).values())
 
 
+@in_one_blas_thread
 def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
     """Recommend trials that separate hypotheses which fit the same trials equally well.
 

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.diagnosis.add import both_fits
 from vinetrack.diagnosis.force_laws import EDGE_FRACTION
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
@@ -177,6 +178,7 @@ class Proposal:
         return lines
 
 
+@in_one_blas_thread
 def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Proposal:
     """Find laws of force that explain the misfit of a model, and fit each in the equation of motion.
 

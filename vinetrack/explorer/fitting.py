@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, TypeVar
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.problems import UserError
 from vinetrack.diagnosis.compare import compare
@@ -97,6 +98,7 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
     return _evaluated(campaign, choice, result, time.perf_counter() - started)
 
 
+@in_one_blas_thread
 def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
     """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects.
 

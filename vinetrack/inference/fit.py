@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Track
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
@@ -46,6 +47,7 @@ STANDSTILL_M = 1e-9
 """Travel below which a simulated trial counts as standing still. Derived: no camera resolves a nanometre."""
 
 
+@in_one_blas_thread
 def fit(
     model: Model,
     experiment: Experiment | Path | str | Pairs,

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import design_of_fit
 from vinetrack.diagnosis.null_calibration import NullCalibration, calibrate, p_values_of
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
 
+@in_one_blas_thread
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
     """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns.
 

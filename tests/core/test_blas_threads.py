@@ -1,0 +1,47 @@
+"""Linear algebra of fits uses one thread, and gives the others back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import vinetrack as vt
+from vinetrack.core.blas_threads import in_one_blas_thread
+from vinetrack.diagnosis.diagnose import diagnose
+
+
+def threads() -> set[int]:
+    """Numbers of threads of the loaded libraries of linear algebra."""
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_threads_are_limited_within_a_function_only() -> None:
+    np.ones((2, 2)) @ np.ones((2, 2))
+
+    @in_one_blas_thread
+    def asked(text: str, *, fails: bool = False) -> tuple[str, set[int]]:
+        if fails:
+            raise ValueError(text)
+        return text, threads()
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        assert asked("kept") == ("kept", {1})
+        with pytest.raises(ValueError, match="kept"):
+            asked("kept", fails=True)
+        assert threads() == before
+    assert asked.__name__ == "asked"
+
+
+def test_a_diagnosis_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[set[int]] = []
+
+    def noted(*_args: object, **_options: object) -> None:
+        seen.append(threads())
+        raise vt.FitError("enough")
+
+    monkeypatch.setattr("vinetrack.diagnosis.diagnose.initial_fit", noted)
+    with threadpool_limits(2, user_api="blas"), pytest.raises(vt.FitError, match="enough"):
+        diagnose([])
+    assert seen == [{1}]
