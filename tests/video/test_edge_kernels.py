@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from vinetrack.video import edge_cover, picture_kernels
+from vinetrack.video import edge_cover, picture_kernels, residual_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
 from vinetrack.video.order_kernels import median, monotone_path_sums
@@ -100,7 +100,7 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     start[5] = np.nan
     fit = kernels.fit_edges(
         strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-        NO_SHADING, np.arange(16),
+        NO_SHADING, np.arange(16), (0, 9),
     )  # fmt: skip
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5
@@ -116,7 +116,7 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     known, ignored = (
         kernels.fit_edges(
             strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
-            shading, np.arange(16),
+            shading, np.arange(16), (0, 9),
         )[:, 0] - edge
         for shading in (RIM, NO_SHADING)
     )  # fmt: skip
@@ -146,13 +146,14 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     blur, margin = 0.8, 6.0
     fit = np.column_stack([edge, np.zeros((16, 2)), np.full(16, 0.03), np.full(16, -0.02), np.zeros(16)])
     use = np.arange(16) % 3 != 0
-    found = kernels.residual_sums(
-        strip, np.ones(16), np.zeros(16), fit, np.zeros(16), LAG, blur, pictures, margin, use, 0.5 * RIM
-    )
+    steady, frames = (strip, np.ones(16), np.zeros(16)), np.flatnonzero(use)
+    arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
+    sums = "distance_sums", "row_sums", "misfit_sums", "place_sums"
+    found = [getattr(residual_kernels, name)(*arguments).sum(axis=0) for name in sums]
     half = edge_cover.coverage_reach(0.0, blur) + margin
     by_distance, by_row, by_place, logs = np.zeros_like(found[0]), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
-        sums: dict[int, np.ndarray] = {}
+        columns: dict[int, np.ndarray] = {}
         for u in range(9):
             for s in range(120):
                 x = edge[t] - LAG[u] - s
@@ -168,15 +169,15 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
                 by_place[int(ahead) + 32] += (1 - part) * w * np.array([r, 1.0])
                 by_place[int(ahead) + 33] += part * w * np.array([r, 1.0])
                 i = int(len(by_distance) // 2 - x)
-                sums[i] = sums.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
+                columns[i] = columns.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
                 by_row[u] += w * g * np.array([r, g])
                 logs.append(math.log(1 + r * r / (4.5 * (va + vb))))
-        for i, (top, square) in sums.items():
+        for i, (top, square) in columns.items():
             by_distance[i] += top**2 / square, 1
     assert np.allclose(found[0], by_distance, rtol=0.01, atol=0.02)
     assert np.allclose(found[1], by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
-    assert found[2] == pytest.approx(np.mean(logs), rel=1e-3)
-    assert np.allclose(found[3], by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
+    assert found[2] == pytest.approx([np.sum(logs), len(logs)], rel=1e-3)
+    assert np.allclose(found[3].T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 
 def test_paths_across_a_fan_collect_what_a_plain_search_collects() -> None:

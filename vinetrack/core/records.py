@@ -180,7 +180,7 @@ class Trial:
 
 def join_flags(*flags: str) -> str:
     """Join flags by `;` in the order of FLAGS, without repetitions and blanks."""
-    present = {part for flag in flags for part in split_flags(flag)}
+    present = {part for flag in flags if flag for part in split_flags(flag)}
     return ";".join(flag for flag in FLAGS if flag in present)
 
 

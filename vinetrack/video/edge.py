@@ -10,7 +10,6 @@ optical blur, the exposure and the light and shade that the tip carries with it 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,18 +24,20 @@ from vinetrack.video.edge_state import (
     EdgeState,
     blur_lengths,
     core_frames,
+    distance_sums,
     estimate_appearance,
     fit_edges,
     hold_at_rest,
     informative_frames,
     initial_state,
     moving_frames,
-    residuals,
 )
 from vinetrack.video.first_path import appearance_about_path, front_path_by_change, initial_front_path
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
+from vinetrack.video.order_kernels import mean_changes
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 from vinetrack.video.tip_shape import (
     ASSUMED_EXPOSURE,
     OPTICAL_BLUR_PX,
@@ -299,9 +300,14 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
     """Find the monotone path that best divides pixels that look like film from pixels that look like background."""
     contrast = np.abs(state.appearance[0] - state.appearance[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
-    evidence = kernels.film_evidence(
-        strip.values, strip.scale, strip.offset, state.appearance, width, EVIDENCE_CLIP
-    )  # fmt: skip
+
+    def evidence_of(first: int, last: int) -> NDArray[np.float32]:
+        part = slice(first, last)
+        return kernels.film_evidence(
+            strip.values[part], strip.scale[part], strip.offset[part], state.appearance, width, EVIDENCE_CLIP
+        )
+
+    evidence = np.concatenate(in_parts(evidence_of, len(strip.values), FEWEST_PICTURES))
     evidence[:, : max(passed[0] - kernels.COLUMNS_BEHIND, 0)] = evidence[:, passed[1] + kernels.COLUMNS_AHEAD :] = 0.0
     path = ky.dividing_path(evidence * _frame_weights(change, state.edge)[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.COLUMNS_BEHIND, passed[1] + 2)
@@ -309,11 +315,8 @@ def _path_from_appearance(strip: Strip, state: EdgeState, passed: tuple[int, int
 
 def _frame_changes(strip: Strip) -> Floats:
     """Return the mean absolute difference of each frame from the one before it, shape (n_frames,)."""
-    import cv2
-
     change = np.zeros(len(strip.values))
-    pairs = pairwise(np.ascontiguousarray(strip.values[:, ::2, ::2]))
-    change[1:] = [cv2.absdiff(before, after).mean() for before, after in pairs]
+    change[1:] = mean_changes(strip.values, 2)
     change[0] = change[1] if len(change) > 1 else 1.0
     return change
 
@@ -336,7 +339,7 @@ def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) 
     edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = estimate_appearance(strip, state, 4 * strip.noise + 4)
-    by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
+    by_distance = distance_sums(strip, state, fit, core_frames(state, fit))
     counted = by_distance[:, 1] > 4
     ratio = np.where(counted, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
     smoothed = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")

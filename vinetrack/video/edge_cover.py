@@ -24,8 +24,6 @@ MIN_MOTION_BLUR_PX = 0.02
 than the error due to TABLE_STEP_PX."""
 SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)
 """Entries of the coverage table per pixel. Derived from TABLE_STEP_PX."""
-VECTOR = 8
-"""Pixels computed at a time. Derived: 512 bits hold eight doubles; smaller processors split them."""
 NO_REFCOUNT: dict[str, Any] = {"_nrt": False}
 """Numba option for functions that allocate nothing: slices of arrays are then used without reference counting, which
 takes longer than the work on a row of 20 px. Measured: a fit of an edge takes 0.75 of the time."""
@@ -70,22 +68,25 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
 
     Returns
     -------
-    p and dp/dx, shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2 + VECTOR).
+    p and dp/dx, shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2).
     """
     middle = math.ceil(half) + 1
     length = max(length, MIN_MOTION_BLUR_PX)
     reach = coverage_reach(length, blur)
-    table = np.zeros((2, SUBPIXEL_STEPS + 1, 2 * middle + 2 + VECTOR))
-    for k in range(2 * middle + 2):
+    table = np.zeros((2, SUBPIXEL_STEPS + 1, 2 * middle + 2))
+    last = 2 * middle + 1
+    # One half is the other one mirrored: p(−x) = 1 − p(x).
+    for k in range(middle + 1):
         for j in range(SUBPIXEL_STEPS + 1):
             x = middle - k + j * TABLE_STEP_PX
-            if x >= reach:
-                table[0, j, k] = 1.0
-            elif x > -reach:
+            table[0, j, k] = 1.0
+            if x < reach:
                 cdf_a, sum_a = _normal((x + length / 2) / blur)
                 cdf_b, sum_b = _normal((x - length / 2) / blur)
                 table[0, j, k] = (sum_a - sum_b) * blur / length
                 table[1, j, k] = (cdf_a - cdf_b) / length
+                table[0, SUBPIXEL_STEPS - j, last - k] = 1.0 - table[0, j, k]
+                table[1, SUBPIXEL_STEPS - j, last - k] = table[1, j, k]
     return table
 
 

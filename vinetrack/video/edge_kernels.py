@@ -16,7 +16,6 @@ from vinetrack.video.edge_cover import (
     FASTMATH,
     MIN_MOTION_BLUR_PX,
     NO_REFCOUNT,
-    VECTOR,
     coverage_reach,
     coverage_table,
     subpixel_index,
@@ -96,6 +95,7 @@ def fit_edges(
     rounds: int,
     shading: np.ndarray,
     frames: np.ndarray,
+    rows: tuple[int, int],
 ) -> np.ndarray:
     """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6).
 
@@ -114,30 +114,17 @@ def fit_edges(
     margin : pixels beyond the blurred edge that are used on either side.
     rounds : maximum number of Gauss-Newton steps.
     shading : brightness of the tip in excess of film and background, by distance ahead of the edge, 1 px per bin, edge
-        at the middle bin; shape (n_distances,), VECTOR + 4 px wider than the pixels used; grey levels.
+        at the middle bin; shape (n_distances,), 4 px wider than the pixels used; grey levels.
     frames : frame of each search, shape (n_searches,).
+    rows : first row that is used, and the one behind the last.
 
     Returns
     -------
     one row per search, NaN where `start` is NaN.
     """
-    _, rows, columns = strip.shape
+    columns = strip.shape[2]
     out = np.full((len(frames), 6), np.nan)
-    max_lag = lag.max()
-    max_length = 0.0
-    for t in frames:
-        max_length = max(max_length, lengths[t])
-    capacity = rows * (2 * math.ceil(coverage_reach(max_length, blur) + margin) + 4) + VECTOR
-    coverages, slopes, contrasts = (
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-    )
-    excesses, variances, shading_slopes = (
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-    )
+    max_lag = lag[rows[0] : rows[1]].max()
     half, middle, table_length = 0.0, 0, -1.0
     table, bin_inflation = np.empty((0, 0, 0), np.float32), np.empty(0, np.float32)
     shading32 = shading.astype(np.float32)
@@ -158,16 +145,10 @@ def fit_edges(
         for _ in range(rounds):
             first = max(0, math.ceil(y - half - max_lag))
             last = min(columns, int(y + half) + 1)
-            # Pixels of all rows are stored in one array first: sums over them are then one long loop.
-            used = _gather_pixels(
-                strip[t], np.float32(scale[t]), np.float32(offset[t]), appearance, y, lag, half, first, last, middle,
-                table, bin_inflation, shading32, coverages, slopes, contrasts, excesses, variances, shading_slopes,
+            used, (yy, yg, yl, gg, gl, ll, ry, rg, rl, chi) = _normal_sums(
+                strip[t], rows, np.float32(scale[t]), np.float32(offset[t]), appearance, y, lag, half, first, last,
+                middle, table, bin_inflation, shading32, np.float32(1 + amplitude), np.float32(level),
             )  # fmt: skip
-            sums = _normal_sums(
-                coverages[:used], slopes[:used], contrasts[:used], excesses[:used], variances[:used],
-                shading_slopes[:used], np.float32(1 + amplitude), np.float32(level),
-            )  # fmt: skip
-            yy, yg, yl, gg, gl, ll, ry, rg, rl, chi = sums
             yy, gg, ll = yy + 1e-12, gg + prior_sd**-2, ll + prior_sd**-2
             rg, rl = rg - amplitude * prior_sd**-2, rl - level * prior_sd**-2
             # Level and amplitude eliminated from the 3 by 3 normal equations.
@@ -193,204 +174,64 @@ def fit_edges(
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
 def _normal_sums(
-    coverages: np.ndarray, slopes: np.ndarray, contrasts: np.ndarray, excesses: np.ndarray, variances: np.ndarray,
-    shading_slopes: np.ndarray, gain: np.float32, level: np.float32,
-) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
-    """Sums of the normal equations for edge, amplitude and level, and the weighted sum of squared residuals.
+    picture: np.ndarray, rows: tuple[int, int], scale: np.float32, offset: np.float32, appearance: np.ndarray, y: float,
+    lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
+    shading: np.ndarray, gain: np.float32, level: np.float32,
+) -> tuple[int, tuple[float, float, float, float, float, float, float, float, float, float]]:  # fmt: skip
+    """Number of pixels near the edge, and over them the sums of the normal equations for edge, amplitude and level.
 
-    The weights 1/(variance + r²/9), as of Student's t with nine degrees of freedom, limit the influence of outliers.
-    In single precision, sixteen pixels at a time: a relative error of 1e-6 is far below that of the edge.
+    The last sum is that of squared residuals, weighted. The weights 1/(variance + r²/9), as of Student's t with nine
+    degrees of freedom, limit the influence of outliers. In single precision, sixteen pixels at a time: a relative error
+    of 1e-6 is far below that of the edge. The loop over pixels writes to no array; it would otherwise have to make sure
+    that none overlaps with those it reads, which takes longer than its work.
     """
     zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
     yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = zero
-    for k in range(len(coverages)):
-        contrast = contrasts[k]
-        dg = contrast * coverages[k]
-        dy = contrast * gain * slopes[k] + shading_slopes[k]
-        r = excesses[k] - gain * dg - contrast * level
-        w = unit / (variances[k] + r * r * ninth)
-        wy, wg, wl = w * dy, w * dg, w * contrast
-        yy += wy * dy
-        yg += wy * dg
-        yl += wy * contrast
-        gg += wg * dg
-        gl += wg * contrast
-        ll += wl * contrast
-        ry += wy * r
-        rg += wg * r
-        rl += wl * r
-        chi += w * r * r
-    return (
-        float(yy), float(yg), float(yl), float(gg), float(gl), float(ll), float(ry), float(rg), float(rl), float(chi),
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
-def _gather_pixels(
-    picture: np.ndarray, gain: np.float32, level: np.float32, appearance: np.ndarray, y: float, lag: np.ndarray,
-    half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray, shading: np.ndarray,
-    coverages: np.ndarray, slopes: np.ndarray, contrasts: np.ndarray, excesses: np.ndarray, variances: np.ndarray,
-    shading_slopes: np.ndarray,
-) -> int:  # fmt: skip
-    """Write the terms of the fit for each pixel near the edge into the last six arrays; return the number of pixels.
-
-    The terms are the coverage and its slope, the contrast of film and background, the brightness less background and
-    shading, the variance, and the slope of the shading; pixels are stored row after row.
-    """
-    columns, unit = picture.shape[1], np.float32(1.0)
     used = 0
-    for u in range(picture.shape[0]):
+    for u in range(rows[0], rows[1]):
         row_edge = y - lag[u]
         whole_px, j, table_fraction, on_grid = subpixel_index(row_edge)
         a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
         if b <= a:
             continue
         k, m = a - whole_px + middle, b - a
-        # Whole vectors are computed; the excess of the last one is overwritten by the next row, or never read.
-        full = m + (-m) % VECTOR if b + VECTOR <= columns else m
-        b, stop = a + full, used + full
-        low, high = table[0, j, k : k + full], table[0, j + 1, k : k + full]
-        low_slope, high_slope = table[1, j, k : k + full], table[1, j + 1, k : k + full]
-        inflation = bin_inflation[k + on_grid : k + on_grid + full]
+        low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+        low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
+        inflation = bin_inflation[k + on_grid : k + on_grid + m]
         values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
         film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
-        coverage, slope, contrast_of = coverages[used:stop], slopes[used:stop], contrasts[used:stop]
-        excess_of, variance_of, shading_slope = excesses[used:stop], variances[used:stop], shading_slopes[used:stop]
         f, fraction, first_bin = (
             np.float32(table_fraction),
             np.float32(row_edge - whole_px),
             a - whole_px + (len(shading) - 1) // 2,
         )
         shade_before, shade_after = (
-            shading[first_bin - 1 : first_bin - 1 + full],
-            shading[first_bin : first_bin + full],
+            shading[first_bin - 1 : first_bin - 1 + m],
+            shading[first_bin : first_bin + m],
         )
-        for i in range(full):
+        for i in range(m):
             p = low[i] + f * (high[i] - low[i])
-            coverage[i] = p
-            slope[i] = low_slope[i] + f * (high_slope[i] - low_slope[i])
-            contrast_of[i] = film[i] - background[i]
-            shading_slope[i] = shade_before[i] - shade_after[i]
-            excess_of[i] = (
-                np.float32(values[i]) * gain + level - background[i] - shade_after[i] - fraction * shading_slope[i]
-            )
-            variance_of[i] = (
-                p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]
-            ) * inflation[i]  # fmt: skip
+            slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
+            contrast = film[i] - background[i]
+            shading_slope = shade_before[i] - shade_after[i]
+            excess = np.float32(values[i]) * scale + offset - background[i] - shade_after[i] - fraction * shading_slope
+            variance = (p * p * film_variance[i] + (unit - p) * (unit - p) * background_variance[i]) * inflation[i]
+            dg = contrast * p
+            dy = contrast * gain * slope + shading_slope
+            r = excess - gain * dg - contrast * level
+            w = unit / (variance + r * r * ninth)
+            wy, wg, wl = w * dy, w * dg, w * contrast
+            yy += wy * dy
+            yg += wy * dg
+            yl += wy * contrast
+            gg += wg * dg
+            gl += wg * contrast
+            ll += wl * contrast
+            ry += wy * r
+            rg += wg * r
+            rl += wl * r
+            chi += w * r * r
         used += m
-    return used
-
-
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
-def residual_sums(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    fit: np.ndarray,
-    lengths: np.ndarray,
-    lag: np.ndarray,
-    blur: float,
-    appearance: np.ndarray,
-    margin: float,
-    use: np.ndarray,
-    shading: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Sum the residuals of a fit: by distance from the edge, by row, over all pixels, and for the shading.
-
-    First result, shape (n_bins, 2), 1 px per bin, edge at the middle: the sum over frames of z² / var z, with z = Σ C r
-    / v over the rows of a column (C the contrast, r the residual, v the variance), and the number of terms. Their ratio
-    is 1 on average for white noise, more where noise is correlated between rows (grain of the film, the tail moving
-    inside). Second, shape (n_across, 2): Σ g r and Σ g², with g the derivative of the model with respect to the row's
-    lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean of the variances of film and background: a robust misfit for
-    comparing blurs. Fourth, shape (n_distances, 2): Σ w r and Σ w by distance from the row's own edge, in the bins of
-    `shading`.
-
-    Parameters
-    ----------
-    strip, scale, offset, lengths, lag, blur, appearance, margin, shading : as in `fit_edges`.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    use : mask of the frames to sum over, shape (n_frames,).
-
-    Returns
-    -------
-    the four results described above.
-    """
-    n, rows, columns = strip.shape
-    bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
-    centre_bin = bins // 2
-    by_distance = np.zeros((bins, 2))
-    by_row = np.zeros((rows, 2))
-    by_place = np.zeros((len(shading), 2))
-    misfit, count = 0.0, 0
-    for t in range(n):
-        if not use[t]:
-            continue
-        y = fit[t, 0]
-        half = coverage_reach(lengths[t], blur) + margin
-        table = coverage_table(lengths[t], blur, half)
-        middle = math.ceil(half) + 1
-        first = max(0, math.ceil(y - half - lag.max()))
-        last = min(columns, int(y + half) + 1)
-        # Indexed by k, the position in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
-        column_sums = np.zeros((2, table.shape[2] + 1))
-        log_terms = np.empty(table.shape[2])
-        for u in range(rows):
-            row_edge = y - lag[u]
-            whole_px, j, f, on_grid = subpixel_index(row_edge)
-            a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
-            if b <= a:
-                continue
-            k = a - whole_px + middle
-            m = b - a
-            count += m
-            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
-            low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-            values, film, background = strip[t, u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
-            film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
-            numerators, denominators = (
-                column_sums[0, k + on_grid : k + on_grid + m],
-                column_sums[1, k + on_grid : k + on_grid + m],
-            )
-            fraction, first_bin = row_edge - whole_px, a - whole_px + (len(shading) - 1) // 2
-            gradient_sum, curvature_sum = 0.0, 0.0
-            for i in range(m):
-                p = low[i] + f * (high[i] - low[i])
-                slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
-                contrast = film[i] - background[i]
-                r = values[i] * scale[t] + offset[t] - background[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
-                d = first_bin + i
-                r -= shading[d] + fraction * (shading[d - 1] - shading[d])
-                v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
-                w = 1 / (v + r * r / 9)
-                numerators[i] += w * contrast * r
-                denominators[i] += w * contrast * contrast
-                by_place[d, 0] += w * (1 - fraction) * r
-                by_place[d, 1] += w * (1 - fraction)
-                by_place[d - 1, 0] += w * fraction * r
-                by_place[d - 1, 1] += w * fraction
-                g = -contrast * slope
-                gradient_sum += w * g * r
-                curvature_sum += w * g * g
-                # The variance does not depend on the blur: otherwise a wider blur would lower its own misfit.
-                log_terms[i] = 1 + r * r / (4.5 * (film_variance[i] + background_variance[i]))
-            by_row[u, 0] += gradient_sum
-            by_row[u, 1] += curvature_sum
-            misfit += _log_of_product(log_terms[:m])
-        for k in range(column_sums.shape[1]):
-            if column_sums[1, k] > 0:
-                i = min(max(centre_bin - middle + k - 1, 0), bins - 1)
-                by_distance[i, 0] += column_sums[0, k] * column_sums[0, k] / column_sums[1, k]
-                by_distance[i, 1] += 1
-    return by_distance, by_row, misfit / max(count, 1), by_place
-
-
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
-def _log_of_product(factors: np.ndarray) -> float:
-    """Sum the logarithms of factors between 1 and 1e18, sixteen at a time: their product is still a finite number."""
-    total = 0.0
-    for start in range(0, len(factors), 16):
-        product = 1.0
-        for factor in factors[start : start + 16]:
-            product *= min(factor, 1e18)
-        total += math.log(product)
-    return total
+    return used, (
+        float(yy), float(yg), float(yl), float(gg), float(gl), float(ll), float(ry), float(rg), float(rl), float(chi),
+    )  # fmt: skip

@@ -263,12 +263,7 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
     for low, high in pairwise(limits):
         if high - low < FEWEST_ROWS:
             continue
-        part = replace(strip, values=np.ascontiguousarray(strip.values[:, low:high]))
-        state_of_rows = replace(
-            state, edge=edge, lag=np.ascontiguousarray(state.lag[low:high]),
-            appearance=np.ascontiguousarray(state.appearance[:, low:high]),
-        )  # fmt: skip
-        fit = fit_edges(part, state_of_rows)
+        fit = fit_edges(strip, replace(state, edge=edge), rows=(int(low), int(high)))
         edges.append(fit[:, 0])
         sigmas.append(fit[:, 1])
     return np.stack(edges, axis=1), np.stack(sigmas, axis=1)

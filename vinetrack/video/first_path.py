@@ -17,6 +17,7 @@ from vinetrack.core.records import Floats
 from vinetrack.video import kymograph as ky
 from vinetrack.video.motion_end import growth_end
 from vinetrack.video.strip import Strip
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 MIN_LOG_CHANGE = 5.0
 """Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed. Chosen: about 360
@@ -111,9 +112,14 @@ def _residual_of_path(strip: Strip, front_path: _FrontPath, columns: tuple[int, 
     """Residual sum of a path over some columns, with the film and background that follow from it."""
     path, _ = front_path
     pictures = appearance_about_path(strip, path, columns)
-    return float(
-        ky.clipped_residual_sum(strip.values, strip.scale, strip.offset, strip.noise, path, pictures, *columns)
-    )
+
+    def residuals(first: int, last: int) -> Floats:
+        part = slice(first, last)
+        return ky.clipped_residual_sums(
+            strip.values[part], strip.scale[part], strip.offset[part], strip.noise, path[part], pictures, *columns
+        )
+
+    return float(np.concatenate(in_parts(residuals, len(strip.values), FEWEST_PICTURES)).sum())
 
 
 def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:

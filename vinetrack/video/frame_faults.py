@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
@@ -115,14 +116,10 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
     mask, shape (n_frames,).
     """
     n, _, columns = strip.values.shape
-    change = np.full(n, np.inf)
-    for i in range(1, n):
-        if not np.isfinite(edge_px[i]):
-            continue
-        low = int(np.clip(edge_px[i] - AROUND_PX, 0, columns - 1))
-        high = int(np.clip(edge_px[i] + AROUND_PX, 1, columns))
-        pair = strip.values[i - 1 : i + 1, ::2, low : max(high, low + 1)].astype(np.float32)
-        change[i] = float(np.mean(np.abs(pair[1] - pair[0]))) * float(strip.scale[i])
+    seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
+    low = np.clip(seen_px - AROUND_PX, 0, columns - 1).astype(int)
+    high = np.maximum(np.clip(seen_px + AROUND_PX, 1, columns).astype(int), low + 1)
+    change = np.where(np.isfinite(edge_px), _changes_between(strip.values, low, high) * strip.scale, np.inf)
     moving = np.zeros(n, dtype=bool)
     moving[1:] = np.diff(edge_px) > CLEAR_STEP_PX / 2
     median_change = float(np.median(change[moving])) if moving.any() else np.inf
@@ -132,3 +129,21 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
         stands = abs(edge_px[i] - edge_px[i - 1]) < COPY_STEP_PART * mean_step
         repeated[i] = mean_step > CLEAR_STEP_PX and stands and change[i] < COPY_CHANGE_PART * median_change
     return repeated
+
+
+@njit(cache=True, nogil=True)
+def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
+
+    The first has none before it: infinity.
+    """
+    n, rows, _ = values.shape
+    out = np.full(n, np.inf)
+    for t in range(1, n):
+        total = np.int64(0)
+        for u in range(0, rows, 2):
+            before, after = values[t - 1, u, low[t] : high[t]], values[t, u, low[t] : high[t]]
+            for s in range(len(before)):
+                total += abs(np.int32(after[s]) - np.int32(before[s]))
+        out[t] = total / ((rows + 1) // 2 * (high[t] - low[t]))
+    return out

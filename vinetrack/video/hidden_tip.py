@@ -129,10 +129,11 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     beside = BORDER_GAP_PX + BORDER_SIDE_PX
     film_picture = _middle_picture(strip, exited, slice(near[0] - beside, later[-1] + beside))
     near, film_columns = near - (near[0] - beside), later - (near[0] - beside)
-    border_steps = np.stack([_border(film_picture, int(column)) for column in near])
+    borders = _borders(film_picture)
+    border_steps = borders[:, near - beside].T
     border = border_steps[int(np.argmax(np.abs(np.median(border_steps, axis=1))))]
     border_step = float(np.median(border))
-    film_step = max(abs(float(np.median(_border(film_picture, int(column))))) for column in film_columns)
+    film_step = float(np.abs(np.median(borders[:, film_columns - beside], axis=0)).max())
     contrast = np.abs((state.appearance[0] - state.appearance[1]).mean(axis=0))[later]
     straight = float(np.mean(np.sign(border) == np.sign(border_step)))
     least_step = max(BORDER_TO_FILM * film_step, BORDER_TO_CONTRAST * float(np.median(contrast)))
@@ -220,11 +221,14 @@ def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> N
     return np.asarray(np.median(level, axis=0), dtype=np.float32)
 
 
-def _border(picture: NDArray[np.float32], column: int) -> NDArray[np.float32]:
-    """Step of brightness across a column, by row, shape (n_rows,)."""
-    ahead = picture[:, column + BORDER_GAP_PX : column + BORDER_GAP_PX + BORDER_SIDE_PX].mean(axis=1)
-    behind = picture[:, column - BORDER_GAP_PX - BORDER_SIDE_PX : column - BORDER_GAP_PX].mean(axis=1)
-    return np.asarray(ahead - behind, dtype=np.float32)
+def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX.
+
+    Shape (n_rows, n_columns).
+    """
+    sides = np.lib.stride_tricks.sliding_window_view(picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
+    apart = 2 * BORDER_GAP_PX + BORDER_SIDE_PX
+    return np.asarray(sides[:, apart:] - sides[:, :-apart], dtype=np.float32)
 
 
 def _moved_behind(edge: Floats, rest_px: float) -> bool:

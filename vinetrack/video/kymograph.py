@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.edge_cover import FASTMATH
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
@@ -66,17 +67,22 @@ least the second number, px. Chosen: starting from rest, steps increase. By reas
 once lose their start; at twice, a jerking tail passes for growth."""
 
 
+FEWEST_COLUMNS = 100
+"""Fewest columns of a strip for which another thread is used. Chosen; only time depends on it."""
+
+
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def _change_score(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, group_size: int, noise: float
-) -> np.ndarray:
-    """Score the change of each column at each frame, shape (n_frames, n_along).
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, group_size: int, noise: float, begin: int,
+    end: int,
+) -> np.ndarray:  # fmt: skip
+    """Score the change of columns `begin` up to `end`, excluded, at each frame, shape (n_frames, end − begin).
 
     The score is the sum over groups of rows of the squared difference between the means of the `window` frames before
     and from frame t on, divided by its expectation under noise, less 1.
     """
-    n, rows, columns = strip.shape
-    groups = rows // group_size
+    n, rows, _ = strip.shape
+    groups, columns = rows // group_size, end - begin
     binned = np.zeros((n + 1, columns), np.float32)
     score = np.zeros((n, columns), np.float32)
     group_sum = np.empty(columns, np.int32)
@@ -84,7 +90,7 @@ def _change_score(
         for t in range(n):
             group_sum[:] = 0
             for k in range(group_size):
-                values = strip[t, g * group_size + k]
+                values = strip[t, g * group_size + k, begin:end]
                 for s in range(columns):
                     group_sum[s] += values[s]
             gain, level = np.float32(scale[t] / group_size), np.float32(offset[t])
@@ -180,7 +186,13 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
     column of the front, shape (n_frames,), px
     log of each column's change relative to noise, less PEAK_FRACTION of its maximum; shape (n_along,)
     """
-    score = _change_score(strip.values, strip.scale, strip.offset, WINDOW, _group_size(strip), strip.noise)
+
+    def score_of(first: int, last: int) -> NDArray[np.float32]:
+        return _change_score(
+            strip.values, strip.scale, strip.offset, WINDOW, _group_size(strip), strip.noise, first, last
+        )
+
+    score = np.concatenate(in_parts(score_of, strip.values.shape[2], FEWEST_COLUMNS), axis=1)
     peak = score.max(axis=0)
     column_weight = np.where(peak > MIN_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(
         np.float32
@@ -211,7 +223,12 @@ def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
     change of each column from start to end, in the units of `path_by_change`; shape (n_along,)
     """
     first, last = _median_frame(strip, slice(0, END_FRAMES)), _median_frame(strip, slice(-END_FRAMES, None))
-    votes = _votes(strip.values, strip.scale, strip.offset, first, last, HALF_VOTE_NOISE * strip.noise)
+
+    def votes_of(begin: int, end: int) -> NDArray[np.float32]:
+        scale, offset = strip.scale[begin:end], strip.offset[begin:end]
+        return _votes(strip.values[begin:end], scale, offset, first, last, HALF_VOTE_NOISE * strip.noise)
+
+    votes = np.concatenate(in_parts(votes_of, len(strip.values), FEWEST_PICTURES))
     group_size = _group_size(strip)
     power = (last - first)[: len(first) // group_size * group_size].reshape(-1, group_size, first.shape[1]).mean(
         axis=1
@@ -311,7 +328,7 @@ def mean_appearance(
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
-def clipped_residual_sum(
+def clipped_residual_sums(
     strip: np.ndarray,
     scale: np.ndarray,
     offset: np.ndarray,
@@ -320,8 +337,8 @@ def clipped_residual_sum(
     appearance: np.ndarray,
     begin: int,
     end: int,
-) -> float:
-    """Sum the clipped squared residuals of a path: frames against film behind it and background ahead of it.
+) -> np.ndarray:
+    """Sum the clipped squared residuals of a path: a frame against film behind it and background ahead of it.
 
     Parameters
     ----------
@@ -334,10 +351,10 @@ def clipped_residual_sum(
 
     Returns
     -------
-    sum of squares in units of the noise variance, each at most RESIDUAL_CLIP².
+    sum of squares in units of the noise variance, each at most RESIDUAL_CLIP², shape (n_frames,).
     """
     n, rows, _ = strip.shape
-    unit, largest_square, total = np.float32(1 / noise), np.float32(RESIDUAL_CLIP * RESIDUAL_CLIP), 0.0
+    unit, largest_square, totals = np.float32(1 / noise), np.float32(RESIDUAL_CLIP * RESIDUAL_CLIP), np.zeros(n)
     for t in range(n):
         gain, level = np.float32(scale[t]), np.float32(offset[t])
         front = min(max(math.ceil(path[t]), begin), end)
@@ -349,8 +366,8 @@ def clipped_residual_sum(
                 for s in range(high - low):
                     off = (np.float32(values[s]) * gain + level - picture[s]) * unit
                     row_total += min(off * off, largest_square)
-            total += row_total
-    return total
+            totals[t] += row_total
+    return totals
 
 
 def column_after_leap(path: Floats) -> int:

@@ -6,13 +6,13 @@ obstacle stops it, or when the recording ends.
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.video.order_kernels import mean_changes
 from vinetrack.video.point_quality import PointQuality
 from vinetrack.video.strip import Strip
 
@@ -106,10 +106,7 @@ def growth_end_notes(
     n, last = len(edge_px), quality.last_moving
     if last < 0 or last >= n - FEWEST_STILL_FRAMES or quality.left_picture is not None:
         return []
-    import cv2
-
-    pairs = itertools.pairwise(np.ascontiguousarray(luma[:, ::5, ::5]))
-    change = np.array([cv2.absdiff(a, b).mean() for a, b in pairs])
+    change = mean_changes(luma, 5)
     before = float(np.median(change[quality.first_moving : last])) if last > quality.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))

@@ -5,8 +5,13 @@ Medians are exact; the range of the values must be known.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 LEVELS = 256
 """Range of the values of the histogram. Derived: brightness and its differences are in grey levels of 255."""
@@ -195,8 +200,7 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
     return step_frame, best
 
 
-@njit(cache=True, nogil=True)
-def block_means(luma: np.ndarray, side: int) -> np.ndarray:
+def block_means(luma: NDArray[Any], side: int) -> NDArray[np.float32]:
     """Shrink pictures by a whole factor: means of square blocks, rounded to whole grey levels as in OpenCV.
 
     Parameters
@@ -210,6 +214,14 @@ def block_means(luma: np.ndarray, side: int) -> np.ndarray:
     """
     n, height, width = luma.shape
     out = np.empty((n, height // side, width // side), np.float32)
+    in_parts(lambda first, last: _block_means(luma[first:last], side, out[first:last]), n, FEWEST_PICTURES)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _block_means(luma: np.ndarray, side: int, out: np.ndarray) -> None:
+    """Write the means of square blocks into `out`; see `block_means`."""
+    n, height, width = luma.shape
     total = np.empty(width, np.int32)
     weight = np.float32(1.0 / (side * side))
     for t in range(n):
@@ -230,7 +242,6 @@ def block_means(luma: np.ndarray, side: int) -> np.ndarray:
                 for j in range(side):
                     block += total[x * side + j]
                 line[x] = np.rint(block * weight)
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -305,3 +316,43 @@ def passing_times(table: np.ndarray) -> np.ndarray:
         else:
             break
     return passed
+
+
+def mean_changes(pictures: NDArray[Any], step: int) -> NDArray[np.float64]:
+    """Mean absolute change from each picture to the next, of every `step`-th row and column.
+
+    Parameters
+    ----------
+    pictures : as the camera wrote them, shape (n, height, width).
+    step : rows, and columns, from one pixel that counts to the next.
+
+    Returns
+    -------
+    in the camera's values, shape (n - 1,).
+    """
+    sums = in_parts(
+        lambda first, last: _sums_of_changes(pictures[first : last + 1], step), len(pictures) - 1, FEWEST_PICTURES
+    )
+    height, width = (-(-size // step) for size in pictures.shape[1:])
+    return np.concatenate(sums) / (height * width)
+
+
+@njit(cache=True, nogil=True)
+def _sums_of_changes(pictures: np.ndarray, step: int) -> np.ndarray:
+    """Sum the absolute changes of `mean_changes`."""
+    n, height, width = pictures.shape
+    out = np.zeros(n - 1)
+    for t in range(n - 1):
+        total = np.int64(0)
+        for y in range(0, height, step):
+            before, after = pictures[t, y], pictures[t + 1, y]
+            row_total = np.int64(0)
+            if step == 2:  # the usual case: with a constant step the compiler vectorises the sum
+                for x in range(0, width, 2):
+                    row_total += abs(np.int32(after[x]) - np.int32(before[x]))
+            else:
+                for x in range(0, width, step):
+                    row_total += abs(np.int32(after[x]) - np.int32(before[x]))
+            total += row_total
+        out[t] = total
+    return out

@@ -16,11 +16,11 @@ from vinetrack.video.edge_cover import (
     MIN_MOTION_BLUR_PX,
     NO_REFCOUNT,
     SUBPIXEL_STEPS,
-    VECTOR,
     coverage_reach,
     coverage_table,
     subpixel_index,
 )
+from vinetrack.video.threads import in_parts
 
 MEMORY_CUTOFF = 4.0
 """Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 %. Chosen for speed; at half 14 %
@@ -43,7 +43,6 @@ ROWS_PER_BLOCK = 8
 960 columns are 340 kB."""
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def gather(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -85,13 +84,33 @@ def gather(
     -------
     the sums.
     """
-    n, rows, columns = strip.shape
+    _, rows, columns = strip.shape
     sums = np.zeros((11, rows, columns), np.float32)
+    weights = _column_weights(columns, edge, early, late, memory_frames)
+    tables = _tables(edge, lengths, blur, weights[2])
     clip_weight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
-    # Common to all rows: weights of columns, the first column that counts and the one behind the last, coverage tables.
+
+    def gather_rows(first: int, last: int) -> None:
+        _gather_blocks(
+            strip, scale, offset, edge, lengths, lag, blur, early, late, appearance, clip_weight, shading, *weights,
+            *tables, first, last, sums,
+        )  # fmt: skip
+
+    in_parts(gather_rows, rows, ROWS_PER_BLOCK)
+    return sums
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _column_weights(
+    columns: int, edge: np.ndarray, early: np.ndarray, late: np.ndarray, memory_frames: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of columns for background and for film, and the first column that counts and the one behind the last.
+
+    Shapes (n_frames, n_along) twice and (n_frames, 2); common to all rows.
+    """
+    n = len(edge)
     bare_weights, film_weights = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
     limits = np.zeros((n, 2), np.int64)
-    max_reach = 0.0
     # Columns far from every position of the edge are skipped.
     low, high = columns, 0
     for t in range(n):
@@ -108,10 +127,19 @@ def gather(
                     film_weights[t, s] = bare_weights[t, s] if t >= late[s] else 0.0
                     first, last = min(first, s), s + 1
         limits[t, 0], limits[t, 1] = first, last
-        if last > first:
+    return bare_weights, film_weights, limits
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _tables(edge: np.ndarray, lengths: np.ndarray, blur: float, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coverage tables, shape (n_frames, SUBPIXEL_STEPS + 1, n_distances), and which of them each frame uses."""
+    n = len(edge)
+    max_reach = 0.0
+    for t in range(n):
+        if limits[t, 1] > limits[t, 0]:
             max_reach = max(max_reach, coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur))
     # Frames at rest (motion blur up to MIN_MOTION_BLUR_PX) share a table.
-    tables = np.zeros((n, SUBPIXEL_STEPS + 1, 2 * math.ceil(max_reach) + 4 + VECTOR))
+    tables = np.zeros((n, SUBPIXEL_STEPS + 1, 2 * math.ceil(max_reach) + 4))
     table_index, rest_table = np.empty(n, np.int64), -1
     for t in range(n):
         table_index[t] = t
@@ -123,9 +151,21 @@ def gather(
             tables[t, :, : table.shape[2]] = table[0]
             if lengths[t] <= MIN_MOTION_BLUR_PX:
                 rest_table = t
+    return tables, table_index
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _gather_blocks(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
+    blur: float, early: np.ndarray, late: np.ndarray, appearance: np.ndarray, clip_weight: np.float32,
+    shading: np.ndarray, bare_weights: np.ndarray, film_weights: np.ndarray, limits: np.ndarray, tables: np.ndarray,
+    table_index: np.ndarray, first_row: int, last_row: int, sums: np.ndarray,
+) -> None:  # fmt: skip
+    """Add rows `first_row` up to `last_row`, that one excluded, to `sums`; see `gather`."""
+    n, _, columns = strip.shape
     brightness = np.empty(columns, np.float32)
     # A few rows at a time, so that their sums stay in the cache.
-    for block in range(0, rows, ROWS_PER_BLOCK):
+    for block in range(first_row, last_row, ROWS_PER_BLOCK):
         for t in range(n):
             first, last = limits[t]
             if last <= first:
@@ -135,11 +175,10 @@ def gather(
             table, bare_weight, film_weight = tables[table_index[t]], bare_weights[t], film_weights[t]
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
-                strip[t], block, min(block + ROWS_PER_BLOCK, rows), gain, level, edge[t], lag, table, middle, mixed,
+                strip[t], block, min(block + ROWS_PER_BLOCK, last_row), gain, level, edge[t], lag, table, middle, mixed,
                 first, last, bare_weight, film_weight, early, late, t, appearance, clip_weight, shading, brightness,
                 sums,
             )  # fmt: skip
-    return sums
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
@@ -214,7 +253,6 @@ def _add_pure_pixels(
         squares[k] += w * value * value
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
     """Solve for the brightness of film and background at every pixel, and the variance about each.
 
@@ -234,11 +272,25 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
     -------
     film, background, variance of film, variance of background; shape (4, n_across, n_along).
     """
-    _, rows, columns = sums.shape
-    out = np.empty((4, rows, columns), np.float32)
+    out = np.empty((4, *sums.shape[1:]), np.float32)
+
+    def solve_rows(first: int, last: int) -> None:
+        _solve_rows(sums, ridge, decay, fallback, noise, texture, first, last, out)
+
+    in_parts(solve_rows, sums.shape[1], ROWS_PER_BLOCK)
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _solve_rows(
+    sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float, first_row: int,
+    last_row: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Solve for rows `first_row` up to `last_row`, that one excluded; see `solve`."""
+    columns = sums.shape[2]
     background_guess = np.empty(columns)
     variance_limit = (1.5 * texture) ** 2
-    for u in range(rows):
+    for u in range(first_row, last_row):
         total, count, film_guess = 0.0, 0.0, fallback
         for s in range(columns - 1, -1, -1):
             if count > 1e-3:
@@ -272,7 +324,6 @@ def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: 
             out[1, u, s] = (vq * pp - vp * qp) / det
             out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
             out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= variance_limit else 1.0) * texture**2
-    return out
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")

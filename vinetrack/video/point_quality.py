@@ -5,6 +5,7 @@ Works on positions alone, in pixels by frame, from any tracker.
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,11 +142,12 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
 def _first_moving_point(y: Floats, tolerance: float) -> int:
     """Index of the first point from which `y` stays above the resting level; 0 where the track starts in motion."""
     level = float(y[0])
-    last_at_rest = 0
+    last_at_rest, ordered = 0, [level]
     for i in range(1, len(y)):
+        bisect.insort(ordered, float(y[i]))
         if y[i] - level <= tolerance:
             last_at_rest = i
-            level = float(np.median(y[: last_at_rest + 1]))
+            level = (ordered[i // 2] + ordered[(i + 1) // 2]) / 2
         elif i + 1 >= len(y) or y[i + 1] - level > tolerance:
             break
     # Two equal positions may be a slow start; a rest has three.

@@ -18,6 +18,7 @@ from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
 from vinetrack.video.order_kernels import BINS_PER_LEVEL, median
 from vinetrack.video.resample import sample
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 REFERENCE_FRAMES = 15
 """Frames whose median is the reference. Derived: its noise is then a third of that of a frame, √(π/2)/√15. By
@@ -58,6 +59,10 @@ HALF_DISAGREEMENT = 0.7
 taken to have shaken. Measured on clips of seeds 1 to 6 of `benchmarks/tracking_accuracy.py`: 0.03 to 0.36 with shake,
 0.89 to 1.02 where film and doors move in one half only. The background beside a curved axis is judged in the same way.
 At half a shake remains; at twice, moving film is taken for shake."""
+
+FEWEST_MEDIANS = 1000
+"""Fewest pixels of a reference for which another thread is used. Chosen: they take half a millisecond; only time
+depends on it."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +212,10 @@ def _reference_at_whole_pixels(
     height, width = luma.shape[1:]
     place = np.rint(axis.points(along[::stride].astype(float), across[::stride].astype(float))).astype(int)
     x, y = np.clip(place[:, 0], 1, width - 2), np.clip(place[:, 1], 1, height - 2)
-    middle, left, right, above, below = _medians_about(luma, picks, x, y)
+    middle, left, right, above, below = np.concatenate(
+        in_parts(lambda first, last: _medians_about(luma, picks, x[first:last], y[first:last]), len(x), FEWEST_MEDIANS),
+        axis=1,
+    )
     right, below = (right - left) / 2, (below - above) / 2
     direction, normal, relative_px = (
         axis.direction,
@@ -286,7 +294,9 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floa
     rounded = np.rint(start)
     if shift_px is None and (max(abs(along)) > 1 - 1e-9 or np.abs(start - rounded).max() < WHOLE_PIXEL_TOLERANCE):
         x, y = (np.clip(rounded[:, i], 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
-        return _whole_pixels(luma, x, y)
+        return np.concatenate(
+            in_parts(lambda first, last: _whole_pixels(luma[first:last], x, y), len(luma), FEWEST_PICTURES)
+        )
     # In rows of a thousand, since OpenCV accepts no picture wider than 32767 pixels.
     n_rows = -(-len(start) // 1000)
     place = np.pad(start, ((0, n_rows * 1000 - len(start)), (0, 0)), mode="edge").reshape(n_rows, 1000, 2)
@@ -335,7 +345,11 @@ def register(
     level = float(np.abs(basis[0]).mean()) + 1e-9
     count = basis.shape[1]
     ridge = np.diag([0.0, 25.0 * count * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
-    solution, error = _robust_fits(_pixels(luma, axis, reference, shift_px), basis, ridge, unit)
+    pixels = _pixels(luma, axis, reference, shift_px)
+    parts = in_parts(
+        lambda first, last: _robust_fits(pixels[first:last], basis, ridge, unit), len(pixels), FEWEST_PICTURES
+    )
+    solution, error = (np.concatenate(part) for part in zip(*parts, strict=True))
     gain = np.maximum(solution[:, 0], 0.05)
     return np.column_stack([gain, solution[:, 1], solution[:, 2] / gain, solution[:, 3] / gain]), error
 

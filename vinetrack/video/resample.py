@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge_cover import NO_REFCOUNT
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 CUBIC_COEFFICIENT = np.float32(-0.75)
 """Coefficient a of the bicubic kernel (Keys 1981). Defined by OpenCV's INTER_CUBIC, which this reproduces up to
@@ -219,7 +220,10 @@ def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_r
     columns = np.clip(x, 0, luma.shape[2] - 1).astype(int)
     rows = np.clip(y, 0, luma.shape[1] - 1).astype(int)
     part = _take(_take(luma, rows, 1), columns, 2)
-    return np.ascontiguousarray(part if abs(along[0]) > 0.5 else part.transpose(0, 2, 1))
+    part = part if abs(along[0]) > 0.5 else part.transpose(0, 2, 1)
+    out = np.empty(part.shape, part.dtype)
+    in_parts(lambda first, last: np.copyto(out[first:last], part[first:last]), len(part), FEWEST_PICTURES)
+    return out
 
 
 def _take(luma: NDArray[Any], index: NDArray[np.int_], dim: int) -> NDArray[Any]:

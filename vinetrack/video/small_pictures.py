@@ -22,6 +22,7 @@ from vinetrack.video.order_kernels import (
     median,
     ratio_medians,
 )
+from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
 SMALL_PX = 240
 """Longer side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide; at half a
@@ -141,7 +142,10 @@ def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
         small = block_means(luma, side)
     else:
         small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
-    gain = ratio_medians(small[:, ::2, ::2], small[n // 2, ::2, ::2] + np.float32(1.0))
+    reference = small[n // 2, ::2, ::2] + np.float32(1.0)
+    gain = np.concatenate(
+        in_parts(lambda first, last: ratio_medians(small[first:last, ::2, ::2], reference), n, FEWEST_PICTURES)
+    )
     small /= np.clip(gain, 0.2, 5.0)[:, None, None]
     return small * np.float32(255.0 / max(float(small.max()), 1.0)), factor
 
@@ -151,7 +155,10 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     n = len(small)
     if n <= MAX_FRAMES:
         return np.arange(n)
-    activity = largest_changes(small.reshape(n, -1), BUSIEST_PIXELS)
+    flat = small.reshape(n, -1)
+    activity = np.concatenate(
+        in_parts(lambda first, last: largest_changes(flat[first : last + 1], BUSIEST_PIXELS), n - 1, FEWEST_PICTURES)
+    )
     floor = float(np.quantile(activity, 0.2))
     busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
     total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])

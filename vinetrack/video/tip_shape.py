@@ -17,7 +17,9 @@ from vinetrack.video.edge_state import (
     blur_lengths,
     core_frames,
     fit_edges,
-    residuals,
+    misfit,
+    place_sums,
+    row_sums,
 )
 from vinetrack.video.strip import Strip
 
@@ -72,7 +74,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        by_row = residuals(strip, state, fit, slow).by_row
+        by_row = row_sums(strip, state, fit, slow)
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
         step = np.clip(step, -LARGEST_LAG_STEP_PX, LARGEST_LAG_STEP_PX)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
@@ -82,18 +84,18 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
     # Over the same pixels for all blurs: pixels far from the edge, which always fit, would favour the widest.
     widest = MARGIN_PX + coverage_reach(0.0, float(candidates.max()))
 
-    def misfit(blur: float) -> float:
+    def misfit_of(blur: float) -> float:
         return _misfit_refitted(strip, replace(state, blur=blur), sampled, widest - coverage_reach(0.0, blur))
 
     if everywhere:
-        misfits = [misfit(float(blur)) for blur in candidates]
+        misfits = [misfit_of(float(blur)) for blur in candidates]
     else:
         # The outer two are tried only where the least lies at the border of the inner three.
-        misfits = [np.inf, *(misfit(float(blur)) for blur in candidates[1:-1]), np.inf]
+        misfits = [np.inf, *(misfit_of(float(blur)) for blur in candidates[1:-1]), np.inf]
         least = int(np.argmin(misfits))
         if least in (1, len(candidates) - 2):
             outer = 0 if least == 1 else len(candidates) - 1
-            misfits[outer] = misfit(float(candidates[outer]))
+            misfits[outer] = misfit_of(float(candidates[outer]))
         tried = np.isfinite(misfits)
         candidates, misfits = candidates[tried], [value for value in misfits if np.isfinite(value)]
     return replace(state, blur=float(np.clip(_least_misfit(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
@@ -117,7 +119,7 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        by_place = residuals(strip, state, fit, core).by_place
+        by_place = place_sums(strip, state, fit, core)
         middle = len(by_place) // 2
         residual, weight = by_place[middle - SHADING_REACH_PX : middle + SHADING_REACH_PX + 1].T
         step = residual / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
@@ -132,7 +134,7 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
     fit = fit_edges(strip, replace(state, edge=edge), EARLY_FIT_ROUNDS)
     use = np.isfinite(fit[:, 0])
     edge[use] = fit[use, 0]
-    return residuals(strip, replace(state, edge=edge), fit, use, margin_px).misfit
+    return misfit(strip, replace(state, edge=edge), fit, use, margin_px)
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
@@ -195,7 +197,7 @@ def _misfits_of_exposures(
     The tip's shading is left out: at constant speed it looks like any error of the exposure.
     """
     bare = replace(state, shading=np.zeros_like(state.shading))
-    return np.array([residuals(strip, replace(bare, lengths=speed * tau), fit, frames).misfit for tau in exposures])
+    return np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, frames) for tau in exposures])
 
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
