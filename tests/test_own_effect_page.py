@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
 from doc_commands import Shown, pieces
+from own_effect import PAGE, block, write_effect
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
@@ -15,20 +15,13 @@ from vinetrack.effects import EffectError, own_effects
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.pipeline.tracks_stage import model_of
 
-PAGE = Path(__file__).parents[1] / "docs" / "own_effect.md"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"
-
-
-def block(language: str) -> str:
-    found = re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    assert len(found) == 1
-    return str(found[0])
 
 
 @pytest.fixture
 def experiment(tmp_path: Path) -> Path:
     """A folder with the effect and the settings as the page writes them."""
-    (tmp_path / "spring_line.py").write_text(block("python"), encoding="utf-8")
+    write_effect(tmp_path)
     (tmp_path / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
     (tmp_path / "trials.csv").write_text(SHEET, encoding="utf-8")
     (tmp_path / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hidden_truth import Pairs, grown, sheet
+from own_effect import NAME, write_effect
 
 import vinetrack as vt
 from vinetrack.core.records import Track
@@ -23,22 +24,6 @@ from vinetrack.effects import EffectError, own_effects
 from vinetrack.laboratory.vine_campaigns import damping_values
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
-
-OWN_EFFECT = '''"""Ratchet: a force that grows with the square root of the growth.
-
-    tail force −F √(y/0.1 m)
-"""
-
-import numpy as np
-
-from vinetrack.effects import Parameter
-
-PARAMETERS = (Parameter("F", "F", "N", 0.1, bounds=(0.0, 10.0), plausible=(0.0, 2.0), meaning="force at 0.1 m"),)
-
-
-def tail_force(s, rig, F):
-    return -F * np.sqrt(np.maximum(s.lead_position, 0.0) / 0.1)
-'''
 
 
 @pytest.fixture(scope="module")
@@ -199,18 +184,16 @@ def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diag
 
 
 def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
-    path = tmp_path / "ratchet.py"
-    path.write_text(OWN_EFFECT)
-    own = own_effects([path])
-    pairs = _with_own(own["ratchet"], 0.25, seed=7003)
-    found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, "ratchet"), ladder=False, advice=False)
+    own = own_effects([write_effect(tmp_path)])
+    pairs = _with_own(own[NAME], "k", 1.5, seed=7003)
+    found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, NAME), ladder=False, advice=False)
     assert found.verdict == "missing"
-    assert found.effects == ("ratchet",)
-    size = found.fit["ratchet.F"]
-    assert abs(size.value - 0.25) < 4 * size.sigma
+    assert found.effects == (NAME,)
+    size = found.fit[f"{NAME}.k"]
+    assert abs(size.value - 1.5) < 4 * size.sigma
 
 
-def _with_own(effect: vt.effects.Effect, size: float, *, seed: int) -> Pairs:
+def _with_own(effect: vt.effects.Effect, symbol: str, size: float, *, seed: int) -> Pairs:
     """Trials grown with an effect that only its file knows; their B and P scatter, release lies between frames."""
     draw = np.random.default_rng(seed)
     trials = sheet()[::2]
@@ -220,7 +203,7 @@ def _with_own(effect: vt.effects.Effect, size: float, *, seed: int) -> Pairs:
         B = coefficients[trial.vine] * math.exp(0.02 * draw.standard_normal())
         true = replace(trial, pressure_Pa=trial.pressure_Pa * (1 + 0.005 * draw.standard_normal()))
         model = (vt.base_model() + effect).with_values(
-            {"eversion_damping.B": {trial.vine: B}, "eversion_damping.n": 0.37, f"{effect.name}.F": size}
+            {"eversion_damping.B": {trial.vine: B}, "eversion_damping.n": 0.37, f"{effect.name}.{symbol}": size}
         )
         since = np.arange(-20, 400) / trial.capture_fps + draw.uniform(0, 1) / trial.capture_fps
         y = vt.simulate(model, true, since).lead_position_m

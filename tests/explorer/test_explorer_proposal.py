@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from explorer_campaign import SETTINGS, write_diagnosis
+from own_effect import write_effect
 from page_browser import Browser
 
 from vinetrack.effects import EffectError, remember
@@ -21,13 +22,6 @@ from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.fitting import BackgroundFit
 from vinetrack.pipeline.proposed_effects import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
-
-SPRING = (
-    '"""Spring line: pulls the tail back.\n\n    tail force −k x\n\nShorten it.\n"""\n\n'
-    "from vinetrack.effects import Parameter\n\n"
-    'PARAMETERS = (Parameter("k", "k", "N/m", 0.5, bounds=(0.0, 20.0)),)\n\n\n'
-    "def tail_force(s, rig, k):\n    return -k * s.tail_position\n"
-)
 
 
 @pytest.fixture
@@ -68,8 +62,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
         assert (experiment.folder, results, to) == (folder, unexplained.folder, None)
         told("learning the missing force as a table")
         assert going_on.wait(60)
-        path = folder / "spring_line.py"
-        path.write_text(SPRING, encoding="utf-8")
+        path = write_effect(folder)
         remember(path)
         return WrittenProposal(("A law of the travel does.", f"Written to {path}."), (path,))
 

@@ -87,7 +87,7 @@ def _documented_arguments(docstring: str) -> set[str]:
 
 def _is_hook(path: Path, package: Path) -> bool:
     """Whether the file is an effect: its functions have the arguments that `effects/_base.py` documents once."""
-    return path.parent in (package / "effects", package / "diagnosis" / "probes") and not path.stem.startswith("_")
+    return path.parent in (package / "effects", package / "dynamics" / "probes") and not path.stem.startswith("_")
 
 
 def module_numbers(package: Path) -> Iterator[tuple[Path, ast.stmt, str, bool]]:

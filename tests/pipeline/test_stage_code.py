@@ -126,7 +126,7 @@ def test_templates_captions_and_tokens_rerun_the_report(copy: Path) -> None:
 
 def test_the_probe_of_a_diagnosis_and_the_truth_of_the_laboratory_count(copy: Path) -> None:
     # The initial fit is compiled with all that the diagnosis may ask about, the probe included.
-    assert changed_by_an_edit(copy / "diagnosis" / "probes" / "probe_force.py", copy) == {"diagnosis", "model"}
+    assert changed_by_an_edit(copy / "dynamics" / "probes" / "probe_force.py", copy) == {"diagnosis", "model"}
     assert changed_by_an_edit(copy / "laboratory" / "paper.yaml", copy) == {"laboratory"}
 
 

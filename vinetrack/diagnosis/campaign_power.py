@@ -13,10 +13,11 @@ import numpy as np
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.candidates import shapes_of, testable
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for
+from vinetrack.diagnosis.initial_fit import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import Power, PowerInput
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit

@@ -20,7 +20,7 @@ from vinetrack.core.records import Track
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
+from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.lost_frames import correct_dropped_frames, dropped_frames_in, with_lost_frames
@@ -42,6 +42,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.diagnosis.selection import SelectionStep, select_effects
 from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError

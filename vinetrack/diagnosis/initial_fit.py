@@ -9,17 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.model import Model
-from vinetrack.effects import Effect, catalogue, find_effect, load_effect
+from vinetrack.effects import Effect, catalogue, find_effect
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import Predictor
-
-PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 
 
 def candidates_of(
@@ -50,29 +47,6 @@ def candidates_of(
     names += [name for name in user_effects if name not in names]
     replaced = {name for effect in model for name in effect.replaces}
     return tuple(find_effect(name, user_effects) for name in names if name not in model and name not in replaced)
-
-
-@lru_cache(maxsize=1)
-def probe() -> Effect:
-    """The probe force (`probes/probe_force.py`)."""
-    return load_effect(PROBE_FILE)
-
-
-def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
-    """Return one model with all candidates, whose compiled form serves every hypothesis.
-
-    Parameters
-    ----------
-    model
-        The model to diagnose.
-    candidates : iterable of Effect
-
-    Returns
-    -------
-    Model
-    """
-    held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
-    return Model(tuple(held[name] for name in held))
 
 
 def with_host(fit: Fit, host: Model | None) -> Fit:

@@ -13,9 +13,10 @@ import numpy as np
 
 from vinetrack.diagnosis.campaign_power import CampaignDesign, with_measurement_errors
 from vinetrack.diagnosis.diagnose import diagnose
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for
+from vinetrack.diagnosis.initial_fit import candidates_of
 from vinetrack.diagnosis.power import Rate, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError

@@ -14,9 +14,9 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
-from vinetrack.diagnosis.initial_fit import probe
 from vinetrack.diagnosis.score_test import Scores, scores_of
 from vinetrack.diagnosis.shape_products import products_of
+from vinetrack.dynamics.host import probe
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.systematics import Systematics

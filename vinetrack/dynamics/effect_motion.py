@@ -10,7 +10,8 @@ import pandas as pd
 
 from vinetrack.core.records import Bend, Floats, Trial
 from vinetrack.dynamics.batch import Trace
-from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.host import host_for
+from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.effects import Effect, catalogue
 
@@ -126,7 +127,7 @@ def _models(effect: Effect) -> tuple[Model, Model]:
     if effect.kind == "base" and not effect.parameters:
         base = base_model().with_values(REFERENCE_VALUES)
         return base, base - effect
-    whole = make_model(catalogue()) if catalogue().get(effect.name) == effect else base_model() + effect
+    whole = host_for(base_model()) if catalogue().get(effect.name) == effect else base_model() + effect
     nothing = {f"{e.name}.{p.name}": p.zero for e in whole for p in e.parameters if e.kind != "base"}
     none = whole.with_values({**nothing, **REFERENCE_VALUES})
     sizes = {f"{effect.name}.{p.name}": p for p in effect.parameters}

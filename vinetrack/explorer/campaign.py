@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
-from vinetrack.diagnosis.initial_fit import host_for
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue

@@ -376,11 +376,12 @@ def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) 
 
 
 def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
-    from vinetrack.planning.design_checks import final_m_s, whole_model
+    from vinetrack.dynamics.host import host_for
+    from vinetrack.planning.design_checks import final_m_s
     from vinetrack.planning.reservoir_design import final_with
 
     if math.isinf(volume_m3):
-        return final_m_s(inputs, inputs.model, whole_model(inputs.model), at_fraction)
+        return final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
     return final_with(inputs, volume_m3, gamma, at_fraction)
 
 

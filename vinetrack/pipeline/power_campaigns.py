@@ -180,7 +180,8 @@ def measured_campaign(request: PowerRequest, measured: MeasuredTrials) -> PowerC
     -------
     PowerCampaign
     """
-    from vinetrack.diagnosis.initial_fit import candidates_of, host_for
+    from vinetrack.diagnosis.initial_fit import candidates_of
+    from vinetrack.dynamics.host import host_for
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit import fit
 

@@ -195,8 +195,9 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
 def _null_calibration(request: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
     """Calibrate the tests of the first model of measured trials with simulated null campaigns of the same design."""
     from vinetrack.diagnosis.candidates import testable
-    from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
+    from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
     from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
+    from vinetrack.dynamics.host import host_for
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit_result import Fit
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.audit import TENSION_RULE, AuditedMotion, audit
-from vinetrack.dynamics.model import Model, make_model
+from vinetrack.dynamics.host import host_for
+from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.planning.prediction import (
@@ -168,7 +169,7 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
     -------
     tuple of Neglected
     """
-    host = whole_model(inputs.model)
+    host = host_for(inputs.model)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
     neglected_effects = []
     for name in UNIVERSAL_EFFECTS:
@@ -184,21 +185,6 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
             continue
         neglected_effects.append(Neglected(name, _words(effect, sizes), final, without))
     return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
-
-
-def whole_model(model: Model) -> Model:
-    """Return the model of all effects of the catalogue and of this model, compiled once for every model used here.
-
-    Parameters
-    ----------
-    model : whose effects outside the catalogue are included.
-
-    Returns
-    -------
-    Model
-    """
-    further = {effect.name: effect for effect in model if effect.name not in catalogue()}
-    return make_model([*catalogue(), *further], further)
 
 
 def typical_sizes(name: str, trial: Trial) -> dict[str, float]:

@@ -18,10 +18,11 @@ from scipy.optimize import brentq
 
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.force_terms import pressure_along
+from vinetrack.dynamics.host import host_for
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
-from vinetrack.planning.design_checks import final_m_s, whole_model
+from vinetrack.planning.design_checks import final_m_s
 from vinetrack.planning.prediction import LONGEST_S, POINTS
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
@@ -174,10 +175,10 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
     """
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
-    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=whole_model(inputs.model))
+    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host_for(inputs.model))
     until = end.end_time_s if end.status in ("ended", "stalled") else LONGEST_S
     times = until * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
-    (moved,) = simulate_many(model, [trial], [times], host=whole_model(inputs.model))
+    (moved,) = simulate_many(model, [trial], [times], host=host_for(inputs.model))
     pressure = pressure_along(model, trial, times, moved.lead_position_m, moved.lead_velocity_m_s)
     return 1 - float(np.min(pressure)) / trial.pressure_Pa
 
@@ -232,7 +233,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
     """
     model = _with(inputs.model, "reservoir_depletion", gamma=gamma)
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
-    return final_m_s(replace(inputs, trial=trial, model=model), model, whole_model(inputs.model), at_fraction)
+    return final_m_s(replace(inputs, trial=trial, model=model), model, host_for(inputs.model), at_fraction)
 
 
 def _with(model: Model, name: str, **values: float) -> Model:
