@@ -19,7 +19,7 @@ from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.film_allowance import film_gain
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_none, _in_sigmas, answer_set
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_none, answer_set, in_sigmas, sizes_of
 from vinetrack.diagnosis.multi_start import distinct_starts, start_values
 from vinetrack.effects import catalogue
 from vinetrack.inference.systematics import FILM_ERROR
@@ -87,10 +87,10 @@ def test_a_fit_begins_from_the_vine_that_was_asked():
 @pytest.mark.parametrize("fall", [4.0, 30.0, 3000.0])
 def test_sizes_of_several_vines_count_as_so_many_numbers(answered, fall):
     fit = answered[1].fits[0]
-    assert _in_sigmas(fall, (DRAG,), fit) == math.sqrt(fall)
-    assert _in_sigmas(-fall, (FILM,), fit) == -math.sqrt(fall)
+    assert in_sigmas(fall, sizes_of((DRAG,), fit)) == math.sqrt(fall)
+    assert in_sigmas(-fall, sizes_of((FILM,), fit)) == -math.sqrt(fall)
     with_film = vt.refit(fit, fit.model + "film_mass")
-    got = _in_sigmas(fall, (FILM,), with_film)
+    got = in_sigmas(fall, sizes_of((FILM,), with_film))
     # Of two numbers the chance of such a fall is exp(−fall/2).
     assert got < math.sqrt(fall)
     assert norm.logsf(got) + math.log(2) == pytest.approx(-fall / 2, rel=1e-6)

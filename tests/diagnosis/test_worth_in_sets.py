@@ -8,19 +8,22 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from scipy.stats import chi2, norm
 
 from vinetrack.diagnosis import effect_sets
 from vinetrack.diagnosis.effect_sets import EffectSets
 from vinetrack.diagnosis.family_test import FamilyTest
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
 from vinetrack.effects import find_effect
 
 NAMES = ("air_drag", "leak", "tail_friction")
 TRIPLE = -1000.0
 
 
-def of(names: tuple[str, ...], log_likelihood: float, inflation: float = 1.0) -> LikelihoodRatio:
-    fit: Any = SimpleNamespace(log_likelihood=log_likelihood, model=())
+def of(
+    names: tuple[str, ...], log_likelihood: float, inflation: float = 1.0, numbers: tuple[Any, ...] = ()
+) -> LikelihoodRatio:
+    fit: Any = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
     effects = tuple(find_effect(name) for name in names)
     return LikelihoodRatio(effects, fit, 0.0, 0.0, plausible=True, reason="", inflation=inflation)
 
@@ -75,13 +78,46 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2)) == better
 
 
+@pytest.mark.parametrize(("gain", "better"), [(9.9, False), (10.1, True)])
+def test_a_larger_set_must_gain_more_where_trials_scatter_more_widely(gain: float, better: bool) -> None:
+    sets = sets_of([of(NAMES[:1], TRIPLE - 50)], {NAMES[1]: 5.0})
+    assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2, inflation=4.0)) == better
+
+
+def test_sizes_of_several_vines_are_as_many_degrees_of_freedom() -> None:
+    names = (*NAMES[:2], "film_mass")
+    numbers = tuple(SimpleNamespace(key=key) for key in ("film_mass.eps",) * 3 + ("leak.rate", "air_drag.C_D"))
+    triple = of(names, TRIPLE, numbers=numbers)
+    sets = sets_of([of(NAMES[:2], TRIPLE - 36.5 / 2)], dict.fromkeys(names, 4.0))
+    expected = -norm.ppf(chi2.sf(36.5, 3) / 2)
+    assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(expected)
+    assert expected < 6 < math.sqrt(36.5)
+    assert sizes_of(triple.effects, triple.fit) == 5
+    assert sets.is_better(triple, sets.of_size(2)[0]) == (expected >= 4.0)
+
+
+@pytest.mark.parametrize("delta_chi2", [30.0, 600.0, 1420.0, 1500.0, 4e4])
+@pytest.mark.parametrize("degrees", [1, 2, 5])
+def test_significance_is_that_of_the_tail_however_far_out(delta_chi2: float, degrees: int) -> None:
+    """Held against the logarithm of the tail probability where that has a closed form."""
+    sigmas = in_sigmas(delta_chi2, degrees)
+    if degrees == 1:
+        assert sigmas == pytest.approx(math.sqrt(delta_chi2))
+        return
+    # P(χ²₂ > x) = exp(−x/2), so the logarithms of both tails agree; more degrees of freedom are less significant.
+    log_tail = math.log(2) + norm.logsf(sigmas)
+    if degrees == 2:
+        assert log_tail == pytest.approx(-delta_chi2 / 2, rel=1e-9)
+    assert sigmas < in_sigmas(delta_chi2, degrees - 1)
+
+
 def test_a_smaller_set_that_is_better_than_all_of_its_size_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the pairs one was known; the best comes of taking the first effect out of the three."""
     fits = {NAMES[1:]: TRIPLE - 2.0, (NAMES[0], NAMES[2]): TRIPLE - 90.0, NAMES[:2]: TRIPLE - 45.0}
     found = {frozenset(names): log_likelihood for names, log_likelihood in fits.items()}
 
     def refitted(_sets: EffectSets, _fit: Any, effects: tuple[Any, ...]) -> Any:
-        return SimpleNamespace(log_likelihood=found[frozenset(effect.name for effect in effects)], model=())
+        return SimpleNamespace(log_likelihood=found[frozenset(effect.name for effect in effects)], model=(), numbers=())
 
     def ratio(_before: Any, effects: tuple[Any, ...], fit: Any) -> LikelihoodRatio:
         return of(tuple(effect.name for effect in effects), fit.log_likelihood)

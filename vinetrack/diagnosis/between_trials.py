@@ -166,7 +166,11 @@ def between_fits(
         fit = _fitted(before, difference)
         if fit is None:
             continue
-        ratio = likelihood_ratio(before, (_effect_of(difference),), fit, widened_by=_widened_by(difference))
+        # Exponents of several vines are as many sizes, less the one they had; random effects are integrated out.
+        sizes = max(len(fit.numbers) - len(before.numbers), 1) if difference.shared else 1
+        ratio = likelihood_ratio(
+            before, (_effect_of(difference),), fit, widened_by=_widened_by(difference), sizes=sizes
+        )
         fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference}))
     return fitted
 

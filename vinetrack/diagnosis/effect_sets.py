@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.fit_memory import drop_curves, with_curves
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, likelihood_ratio, sizes_of
 from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS
 from vinetrack.diagnosis.multi_start import MIN_SHARE_OF_BEST_GAIN
 from vinetrack.diagnosis.nested_forms import NestedForm, simpler_forms
@@ -186,7 +186,7 @@ class EffectSets:
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
         """Significance of a member of a set given the others, in standard deviations; 0 where it is not known.
 
-        It is √(Δχ² / inflation): one degree of freedom, also for an effect with several parameters.
+        Δχ² is divided by the inflation and has a degree of freedom for each size of the member (`sizes_of`).
 
         Parameters
         ----------
@@ -201,7 +201,7 @@ class EffectSets:
         if others is None:
             return 0.0
         delta_chi2 = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
-        return math.sqrt(max(delta_chi2, 0.0) / hypothesis.inflation)
+        return in_sigmas(max(delta_chi2, 0.0) / hypothesis.inflation, sizes_of((effect,), hypothesis.fit))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> str:
         """Find the first member of a set whose significance given the others is too low.
@@ -230,8 +230,9 @@ class EffectSets:
         """Whether a set is better than a smaller one by at least the threshold of its additional effect.
 
         The smaller set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any
-        nested one that was fitted, so the criterion is then the stricter. The difference of −2 ln L is not divided by
-        the inflation.
+        nested one that was fitted, so the criterion is then the stricter. The difference of −2 ln L is divided by the
+        inflation, as for single effects and members: where trials scatter more widely than the noise model predicts,
+        chance makes it larger by as much (Kent, Biometrika 69, 19, 1982).
 
         Parameters
         ----------
@@ -245,7 +246,9 @@ class EffectSets:
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
         family = self.search.tests_after(smaller.fit).family
         threshold = max(family.threshold(name) for name in hypothesis.names if name not in smaller.names)
-        return 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood) >= threshold**2
+        added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
+        delta_chi2 = 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood)
+        return in_sigmas(delta_chi2 / hypothesis.inflation, sizes_of(added, hypothesis.fit)) >= threshold
 
     def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.

@@ -77,9 +77,9 @@ class Candidate:
     """One candidate effect: a row of the ranking.
 
     `delta_chi2` is the fall of −2 ln L when it is added (predicted by the linear model where only `screened`), and
-    `sigma` its significance in standard deviations for the parameters added. `numbers` are its sizes with standard
-    errors and 95 % intervals, `along` the other parameters of the fit, where it is in the answer set. `largest` maps
-    each parameter to the upper limit of an undetected size, one-sided 95 %.
+    `sigma` its significance as a normal deviate, with one degree of freedom for each size. `numbers` are its sizes with
+    standard errors and 95 % intervals, `along` the other parameters of the fit, where it is in the answer set.
+    `largest` maps each parameter to the upper limit of an undetected size, one-sided 95 %.
     `reason` states in words why it is not testable, not plausible, or rejected. `posterior_weight` is its posterior
     probability among all that were refitted, with equal prior probabilities and plausible ranges as priors.
     `confounded_by` lists other effects that its sizes may include. `log_bayes` is the logarithm of the Bayes factor

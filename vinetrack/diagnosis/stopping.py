@@ -185,6 +185,7 @@ def _rivals(step: Round, best: Candidate) -> list[tuple[float, str]]:
         if rival.status == REFITTED and rival.posterior_weight > 0:
             ratios.append((math.log(best.posterior_weight / rival.posterior_weight), rival.effect))
         elif math.isfinite(rival.delta_chi2) and best.delta_chi2 > 0:
+            # One over the inflation; a little less where the best has several sizes, so that the ratio is no larger.
             tempering = best.sigma**2 / best.delta_chi2
             ratios.append((0.5 * tempering * (best.delta_chi2 - rival.delta_chi2), rival.effect))
     return ratios
