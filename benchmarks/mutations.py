@@ -1,6 +1,6 @@
 """Deliberate faults of the core, one at a time, and those of them that no test notices.
 
-    python benchmarks/mutations.py [--only WORD ...] [--list]
+    python benchmarks/mutations.py [--only WORD ...] [--sample N [--seed S]] [--list]
 
 Each mutation of `mutations.yaml` replaces one passage of one file in a copy of the package, and the tests named beside
 it run against the copy. Printed are the survivors, those that no test noticed, and the share that was caught. Text that
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import random
 import re
 import shutil
 import subprocess
@@ -87,9 +88,14 @@ def main() -> None:
     """Try the mutations one after the other; exit 1 if any survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", default=[""], help="those with one of these words in file or description")
+    parser.add_argument("--sample", type=int, help="only so many, drawn at random")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the drawing")
     parser.add_argument("--list", action="store_true", help="only check that every old text is there")
     wanted = parser.parse_args()
     chosen = [one for one in listed() if any(word in f"{one.file} {one.what}" for word in wanted.only)]
+    if wanted.sample is not None and wanted.sample < len(chosen):
+        drawn = set(random.Random(wanted.seed).sample(range(len(chosen)), wanted.sample))
+        chosen = [one for i, one in enumerate(chosen) if i in drawn]
     texts, stale = [], []
     for one in chosen:
         try:
