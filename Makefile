@@ -17,9 +17,10 @@ demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, t
 guide: demo  ## outputs and pictures of the docs, printed and drawn anew from the demonstration
 	$(BIN)/python benchmarks/guide_pages.py
 
-# Told to keep no compiled modules, each process that tests start would compile the package anew.
+# Told to keep no compiled modules, each process that tests start would compile the package anew. One thread of linear
+# algebra in each of as many processes as there are cores: more would wait for each other.
 test: $(STAMP)  ## all tests
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(CORES) --dist worksteal
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist worksteal
 
 lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .
