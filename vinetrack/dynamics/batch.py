@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.dynamics.host import shared_host
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted
 from vinetrack.effects import State, TrialInputs
@@ -143,6 +144,9 @@ def lay_out(
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
+    tail_free = bool(inputs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
+    if host is None and not tail_free:
+        host = shared_host(model.effects)
     if host is not None and host.names != model.names:
         resting = np.array([name not in model for name in host.names])
         model, thetas = host, hosted(host, model, thetas)
@@ -153,7 +157,6 @@ def lay_out(
     times = _true_times(model, inputs, thetas, on, stamps, starts)
     traces = _true_traces(model, inputs, thetas, on, traces) if traces is not None else [None] * count
     given = [trace for trace in traces if trace is not None]
-    tail_free = bool(inputs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
     return Batch(
         integrate_many=kernel(model.effects, tail_free).integrate_many,
         stamps=stamps,
