@@ -13,6 +13,8 @@ from hidden_truth import sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.diagnosis import add as fits
+from vinetrack.diagnosis.add import add
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow, write_experiment
 from vinetrack.laboratory.vine_campaigns import damping_values
 from vinetrack.pipeline.run_folders import command_for_results
@@ -87,7 +89,11 @@ def test_every_trial_has_what_both_models_say_of_it(results: Path) -> None:
     assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
 
 
-def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(results: Path) -> None:
+def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    added = []
+    monkeypatch.setattr(fits, "add", lambda *given: added.append(add(*given)) or added[-1])
     code, output = run("add", "air_drag", results)
     assert code == 0, output
     assert "air_drag added to" in output
@@ -95,7 +101,8 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(results: Path)
     assert "highest pressure" in output
     rows = list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
     assert [row["added"] for row in rows] == ["", "reservoir_depletion", "air_drag"]
-    run("add", "air_drag", results)
+    monkeypatch.setattr(fits, "add", lambda *_: added[0])  # the same once more, without the fits
+    assert run("add", "air_drag", results)[0] == 0
     assert len(list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))) == 3
 
 

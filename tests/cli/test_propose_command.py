@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.diagnosis import propose as search
 from vinetrack.diagnosis.propose import propose
+from vinetrack.dynamics.model import Model
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import write_experiment
@@ -62,6 +63,8 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     code, output = run("add", elsewhere, results, "--save")
     assert code == 1
     assert f"move the file into {experiment}" in output
+    # Without the rest of the catalogue, with which this effect would be compiled once more.
+    monkeypatch.setattr("vinetrack.diagnosis.initial_fit.host_for", lambda model, more: Model((*model.effects, *more)))
     code, output = run("add", path, results, "--save")
     assert code == 0, output
     assert "proposed_time added to" in output
