@@ -180,7 +180,7 @@ def solve(
     )
     searches_left, last_search, searched_in_vain = MOST_RELEASE_SEARCHES, 0, False
     deviances: list[float] = []
-    releases = ReleaseSearch(predictor, problem)
+    releases, at_corner = ReleaseSearch(predictor, problem), False
     for iteration in range(1, most_iterations + 1):
         close = predicted_decrease < FAR_FROM_OPTIMUM or iteration > MOST_FIRST_ITERATIONS
         first_phase = first_phase and not (iteration > FIRST_ITERATIONS and close)
@@ -190,12 +190,15 @@ def solve(
             predictor, problem, cross_products, state, estimable_sd, fixed_terms, first_phase=first_phase
         )
         variances_moved = variance_change(before, state)
+        damping_before = damping
         (step, effect_step, predicted_decrease), damping = _next_step(
             cross_products, problem, state, damping, least_decrease
         )
+        is_full_instead = damping_before > damping
         if watch is not None:
             watch(_step_report(predictor, state, iteration, predicted_decrease))
-        small_step = predicted_decrease < least_decrease
+        small_step = predicted_decrease < least_decrease or at_corner
+        at_corner = False
         # Now and then, and before the fit ends: does a trial have a likelier release far from the current one?
         if searches_left and (
             small_step
@@ -242,6 +245,10 @@ def solve(
             # A perturbed trajectory of the new state cannot be simulated: the last state is still a result.
             break
         state = accepted
+        if is_full_instead and damping > 0:
+            # A damped step looked converged, the full one was refused, and the damped one lowers the cost by little.
+            squares_now = cost(predictor, problem, state, residuals_in(columns))
+            at_corner = penalised_squares - squares_now < least_decrease
     return Solution(state, problem, cross_products, tuple(columns), estimable_sd, converged, iteration)
 
 
