@@ -45,8 +45,9 @@ def pairs(worth: float) -> list[LikelihoodRatio]:
 
 @pytest.fixture(autouse=True)
 def no_refit_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The likelihoods are given; tests of refits replace this."""
+    """The likelihoods and the scatter are given; tests of refits and of scatter replace this."""
     monkeypatch.setattr(EffectSets, "_refitted", lambda *_: None)
+    monkeypatch.setattr(effect_sets, "robust_ratio", lambda *_: 1.0)
 
 
 @pytest.mark.parametrize(("worth", "enough"), [(3.0, False), (5.9, False), (6.1, True)])
@@ -78,8 +79,11 @@ def test_a_larger_set_is_better_by_more_than_chance_gives_its_further_effect(gai
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2)) == better
 
 
-@pytest.mark.parametrize(("gain", "better"), [(9.9, False), (10.1, True)])
-def test_a_larger_set_must_gain_more_where_trials_scatter_more_widely(gain: float, better: bool) -> None:
+@pytest.mark.parametrize(("scattered", "gain", "better"), [(1, 9.9, False), (1, 10.1, True), (0, 5.1, True)])
+def test_a_larger_set_must_gain_more_where_the_size_it_adds_scatters_more_widely(
+    scattered: int, gain: float, better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(effect_sets, "robust_ratio", lambda _, names: 2.0 if NAMES[scattered] in names else 1.0)
     sets = sets_of([of(NAMES[:1], TRIPLE - 50)], {NAMES[1]: 5.0})
     assert sets.is_better(of(NAMES[:2], TRIPLE - 50 + gain**2 / 2, inflation=4.0)) == better
 

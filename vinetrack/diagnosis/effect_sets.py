@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.fit_memory import drop_curves, with_curves
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, likelihood_ratio, sizes_of
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, likelihood_ratio, robust_ratio, sizes_of
 from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS
 from vinetrack.diagnosis.multi_start import MIN_SHARE_OF_BEST_GAIN
 from vinetrack.diagnosis.nested_forms import NestedForm, simpler_forms
@@ -231,8 +231,9 @@ class EffectSets:
 
         The smaller set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any
         nested one that was fitted, so the criterion is then the stricter. The difference of −2 ln L is divided by the
-        inflation, as for single effects and members: where trials scatter more widely than the noise model predicts,
-        chance makes it larger by as much (Kent, Biometrika 69, 19, 1982).
+        inflation of the sizes added: where they scatter between trials more widely than the noise model predicts,
+        chance makes it larger by as much (Kent, Biometrika 69, 19, 1982). The scatter of a size that both sets have
+        does not count.
 
         Parameters
         ----------
@@ -248,7 +249,8 @@ class EffectSets:
         threshold = max(family.threshold(name) for name in hypothesis.names if name not in smaller.names)
         added = [effect for effect in hypothesis.effects if effect.name not in smaller.names]
         delta_chi2 = 2 * (hypothesis.fit.log_likelihood - smaller.fit.log_likelihood)
-        return in_sigmas(delta_chi2 / hypothesis.inflation, sizes_of(added, hypothesis.fit)) >= threshold
+        inflation = robust_ratio(hypothesis.fit, [effect.name for effect in added]) ** 2
+        return in_sigmas(delta_chi2 / inflation, sizes_of(added, hypothesis.fit)) >= threshold
 
     def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.
