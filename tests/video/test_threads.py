@@ -27,13 +27,13 @@ def test_a_range_is_divided_in_order(
 
 @pytest.mark.parametrize(("stated", "expected"), [("1", 1), ("2", 2), ("64", 4), ("", 4), ("0", 4), ("many", 4)])
 def test_the_usual_variable_limits_the_threads(monkeypatch: pytest.MonkeyPatch, stated: str, expected: int) -> None:
-    monkeypatch.setattr(threads, "_cores", lambda: 8)
+    monkeypatch.setattr(threads, "available_cores", lambda: 8)
     monkeypatch.setenv("OMP_NUM_THREADS", stated)
     assert threads.n_threads() == expected
 
 
 def test_a_worker_process_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "_cores", lambda: 8)
+    monkeypatch.setattr(threads, "available_cores", lambda: 8)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(multiprocessing, "parent_process", lambda: os.getpid())
     assert threads.n_threads() == 1

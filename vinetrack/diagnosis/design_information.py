@@ -45,8 +45,8 @@ NOMINAL_PRECISION = 1e-6
 standard deviation of a thousand, in ln B, is uninformative."""
 
 MAX_EXCHANGE_PASSES, LEAST_GAIN = 3, 1.002
-"""Most passes of the exchange, and the ratio of worth from which a trial is exchanged. Chosen: the exchange
-usually ends after two passes; a gain of 0.2 % is 0.1 % of a detectable size."""
+"""Most passes of the exchange, and the ratio of worth from which a trial is exchanged. Chosen: the exchange usually
+ends after two passes; a gain of 0.2 % in information is 0.1 % of a detectable size."""
 
 Worth = Callable[[Floats], Floats]
 """Worth of designs, shape (n_designs,), from their cross products, shape (n_designs, n, n)."""

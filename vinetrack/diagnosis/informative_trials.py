@@ -144,26 +144,14 @@ class _Search(DesignInformation):
         self.largest = np.array([abs(power[name].largest - power[name].zero) for name in self.effects])
         self.required = power.threshold
 
-    def alone(self, totals: Floats) -> Floats:
-        """Information about each effect, shape (n_designs, n_effects)."""
-        return np.asarray(np.maximum(np.diagonal(self.information_of(totals), axis1=1, axis2=2), 0.0))
-
-    def distinct(self, totals: Floats) -> Floats:
-        """Information about each effect with its most similar rival free, shape (n_designs, n_effects)."""
-        information = self.information_of(totals)
-        alone = np.maximum(np.diagonal(information, axis1=1, axis2=2), 0.0)
-        shared = information**2 / np.maximum(alone, 1e-300)[:, None, :]
-        diagonal = np.arange(len(self.effects))
-        shared[:, diagonal, diagonal] = 0.0
-        return np.asarray(np.maximum(alone - shared.max(axis=2), 0.0))
-
     def distinct_information(self, totals: Floats) -> Floats:
         """Information about the first effect with its rival free, shape (n_designs,)."""
-        return np.asarray(self.distinct(totals)[:, 0])
+        return np.asarray(_alone_and_distinct(self.information_of(totals))[1][:, 0])
 
     def expected_discoveries(self, totals: Floats) -> Floats:
         """Expected numbers of effects that are detected, and that are told from all others, added up."""
-        return np.asarray(sum(self._expected(information(totals)) for information in (self.alone, self.distinct)))
+        alone, distinct = _alone_and_distinct(self.information_of(totals))
+        return self._expected(alone) + self._expected(distinct)
 
     def _expected(self, information: Floats) -> Floats:
         """Expected number of effects detected with this information about each, shape (n_designs,)."""
@@ -176,3 +164,12 @@ class _Search(DesignInformation):
         for _ in range(count):
             chosen.append(int(np.argmax(worth(self.total(chosen) + self.each))))
         return self.exchanged(chosen, np.arange(len(self.conditions)), worth)
+
+
+def _alone_and_distinct(information: Floats) -> tuple[Floats, Floats]:
+    """Information about each effect, alone and with its most similar rival free, shape (n_designs, n_effects)."""
+    alone = np.maximum(np.diagonal(information, axis1=1, axis2=2), 0.0)
+    shared = information**2 / np.maximum(alone, 1e-300)[:, None, :]
+    diagonal = np.arange(alone.shape[1])
+    shared[:, diagonal, diagonal] = 0.0
+    return alone, np.maximum(alone - shared.max(axis=2), 0.0)

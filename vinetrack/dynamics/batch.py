@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Callable, Sequence, Sized
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.core.thread_pool import available_cores, thread_pool
 from vinetrack.dynamics.host import shared_host
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted
@@ -24,9 +22,6 @@ RELATIVE_TOLERANCE = 1e-4
 10⁻⁶ of the travel on every trial of the paper's protocol (measured by `benchmarks/integrator.py`)."""
 
 _NOTHING = State(*(math.nan,) * len(State._fields))
-
-CORES = os.cpu_count() or 1
-"""Cores of this machine, determined once: the call takes a tenth of the time of a small batch."""
 
 SMALLEST_SHARE = 64
 """Trials below which another thread costs more than it saves. Chosen: a millisecond of work; no result changes."""
@@ -75,14 +70,14 @@ class Batch:
         """
         count = self.starts.size - 1
         out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
-        threads = threads or max(1, min(CORES, count // SMALLEST_SHARE))
+        threads = threads or max(1, min(available_cores(), count // SMALLEST_SHARE))
         edges = np.linspace(0, count, threads + 1).astype(int).tolist()
         if threads == 1:
             self._part(0, count, relative_tolerance, out, ends)
         else:
             shared = relative_tolerance, out, ends
             (begin, end), *others = itertools.pairwise(edges)
-            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *shared) for a, b in others]
+            shares = [thread_pool(threads).submit(self._part, a, b, *shared) for a, b in others]
             self._part(begin, end, *shared)
             for share in shares:
                 share.result()
@@ -109,12 +104,6 @@ class Batch:
             np.empty((7, 4)),
             np.empty(int(np.diff(self.starts[a : b + 1]).max(initial=0))),
         )
-
-
-@lru_cache
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Thread pool of a process; a forked process gets its own."""
-    return ThreadPoolExecutor(threads)
 
 
 def lay_out(

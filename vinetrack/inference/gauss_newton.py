@@ -44,9 +44,7 @@ def levenberg_marquardt_step(
         Of the penalised sum of squares along this step, by the linear model without the damping.
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    centre, precision = trial_effect_prior(problem, state)
-    effect_information = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
-    effect_gradient = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
+    effect_information, effect_gradient = _trial_effect_equations(white, problem, state)
     damped = effect_information * (1 + damping * np.eye(N_TRIAL_EFFECTS))
     cross = white[:, :N_TRIAL_EFFECTS, N_TRIAL_EFFECTS:-1]
     solved = solve_per_trial(damped, np.concatenate([cross, effect_gradient[:, :, None]], axis=2))
@@ -91,13 +89,18 @@ def trial_effect_step(
     array, shape (n_trials, 4)
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
-    centre, precision = trial_effect_prior(problem, state)
-    square = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
-    slope = white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
+    square, slope = _trial_effect_equations(white, problem, state)
     if fixed_release:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
     return np.asarray(solve_per_trial(square, slope[:, :, None])[:, :, 0])
+
+
+def _trial_effect_equations(white: Floats, problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
+    """Information of the trial effects, and half the negative gradient of the sum of squares, their priors included."""
+    centre, precision = trial_effect_prior(problem, state)
+    information = white[:, :N_TRIAL_EFFECTS, :N_TRIAL_EFFECTS] + precision[:, :, None] * np.eye(N_TRIAL_EFFECTS)
+    return information, white[:, :N_TRIAL_EFFECTS, -1] - precision * (state.trial_effects - centre)
 
 
 def bounded_solve(

@@ -111,13 +111,14 @@ def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook
     names = tuple(name for name in measured.names if name not in look.names)
     with waiting("searching for the trials to make next"):
         campaign = measured_campaign(request, replace(measured, names=names))
-        given = campaign.design, campaign.power
-        if not look.names:
-            plan = exploratory_trials(*given, campaign.limits)
-            return "" if plan is None else informative_text(plan)
-        named, rival = look.names[0], look.rival if look.rival in {e.effect for e in campaign.power.effects} else ""
-        plan = confirming_trials(*given, named, rival, campaign.limits)
-        return "" if plan is None else informative_text(plan, named, rival)
+        design, power = campaign.design, campaign.power
+        named = look.names[0] if look.names else ""
+        rival = look.rival if look.rival in {entry.effect for entry in power.effects} else ""
+        if named:
+            plan = confirming_trials(design, power, named, rival, campaign.limits)
+        else:
+            plan = exploratory_trials(design, power, campaign.limits)
+    return "" if plan is None else informative_text(plan, named, rival)
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:

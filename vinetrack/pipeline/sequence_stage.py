@@ -25,6 +25,9 @@ DEFAULT_RISK = 0.03
 """Default risk of stopping with a wrong effect. Chosen: three campaigns in a hundred; at half or twice, a campaign
 takes about a tenth more or fewer trials, since the number depends on the logarithm of the risk."""
 
+VARY_MORE = "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
+"""What to do next where no particular trials can be recommended."""
+
 
 @dataclass(frozen=True)
 class Ledger:
@@ -140,10 +143,6 @@ def _next_step(diagnosis: Diagnosis, look: CampaignLook, target: Path, experimen
     if further:
         return f"Run about {further} further trials like those so far, by the growth of the log-likelihood ratio."
     return text or VARY_MORE
-
-
-VARY_MORE = "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
-"""What to do next where no particular trials can be recommended."""
 
 
 def _recommendation(look: CampaignLook, target: Path, experiment: Path | None) -> str:

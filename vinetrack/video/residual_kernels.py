@@ -54,10 +54,7 @@ def distance_sums(
     for used in range(len(frames)):
         t = frames[used]
         y = fit[t, 0]
-        half = coverage_reach(lengths[t], blur) + margin
-        table = coverage_table(lengths[t], blur, half)
-        middle = math.ceil(half) + 1
-        first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
         # Indexed by k, the position in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
         column_sums = np.zeros((2, table.shape[2] + 1))
         for u in range(rows):
@@ -110,10 +107,7 @@ def place_sums(
     for used in range(len(frames)):
         t = frames[used]
         y = fit[t, 0]
-        half = coverage_reach(lengths[t], blur) + margin
-        table = coverage_table(lengths[t], blur, half)
-        middle = math.ceil(half) + 1
-        first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
         sums = by_place[used]
         for u in range(rows):
             _, k, m, fraction = _residuals_of_row(
@@ -130,6 +124,16 @@ def place_sums(
                 for i in range(m):
                     weights[i] += part * weight[i]
     return by_place
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _around_edge(
+    y: float, length: float, lag: np.ndarray, blur: float, margin: float, columns: int
+) -> tuple[float, np.ndarray, int, int, int]:
+    """Reach of an edge at `y`, its table of coverage and the middle of that, the first column, one behind the last."""
+    half = coverage_reach(length, blur) + margin
+    table = coverage_table(length, blur, half)
+    return half, table, math.ceil(half) + 1, max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
@@ -194,10 +198,7 @@ def row_sums(
     for used in range(len(frames)):
         t = frames[used]
         y = fit[t, 0]
-        half = coverage_reach(lengths[t], blur) + margin
-        table = coverage_table(lengths[t], blur, half)
-        middle = math.ceil(half) + 1
-        first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
         for u in range(rows):
             by_row[used, u] = _sums_of_row(
                 strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first,
@@ -270,10 +271,7 @@ def misfit_sums(
     for used in range(len(frames)):
         t = frames[used]
         y = fit[t, 0]
-        half = coverage_reach(lengths[t], blur) + margin
-        table = coverage_table(lengths[t], blur, half)
-        middle = math.ceil(half) + 1
-        first, last = max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
         for u in range(rows):
             logarithms, pixels = _logarithms_of_row(
                 strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first,

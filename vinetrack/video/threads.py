@@ -5,9 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import TypeVar
+
+from vinetrack.core.thread_pool import available_cores, thread_pool
 
 Part = TypeVar("Part")
 
@@ -33,7 +33,7 @@ def n_threads() -> int:
         return 1
     stated = os.environ.get("OMP_NUM_THREADS", "")
     limit = int(stated) if stated.isdigit() and int(stated) > 0 else MOST_THREADS
-    return min(_cores(), limit, MOST_THREADS)
+    return min(available_cores(), limit, MOST_THREADS)
 
 
 def in_parts(work: Callable[[int, int], Part], count: int, least: int) -> list[Part]:
@@ -53,20 +53,5 @@ def in_parts(work: Callable[[int, int], Part], count: int, least: int) -> list[P
     if threads == 1:
         return [work(0, count)]
     cuts = [count * k // threads for k in range(threads + 1)]
-    others = [_pool(os.getpid()).submit(work, cuts[k], cuts[k + 1]) for k in range(1, threads)]
+    others = [thread_pool(MOST_THREADS - 1).submit(work, cuts[k], cuts[k + 1]) for k in range(1, threads)]
     return [work(0, cuts[1]), *(other.result() for other in others)]
-
-
-@lru_cache
-def _cores() -> int:
-    """Cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # no affinity on macOS and Windows
-        return os.cpu_count() or 1
-
-
-@lru_cache
-def _pool(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Thread pool of a process; a forked process gets its own."""
-    return ThreadPoolExecutor(MOST_THREADS - 1)
