@@ -42,8 +42,8 @@ _HOMES = {
     "tracks_from_frame": "vinetrack.interface.data_frames",
 }
 
+# Names of version 0.1 that are still read, with a warning, until the next release
 _RENAMED = {"Said": "StatedValues", "believe": "predictive_inputs", "foresee": "predict_vine"}
-"""Names of version 0.1 that are still read, with a warning, until the next release."""
 
 __all__ = ["__version__", "effects", *_HOMES]
 

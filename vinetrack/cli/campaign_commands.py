@@ -12,13 +12,7 @@ from vinetrack.cli.output import MORE, JsonFile, print_result
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the command to the command line."""
     app.command("campaign", rich_help_panel=MORE)(_campaign)
 
 

@@ -22,38 +22,14 @@ LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages a
 
 
 def activity_sign(what: str, log: Path | None) -> AbstractContextManager[object]:
-    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log.
-
-    Parameters
-    ----------
-    what : what is being done, in a few words.
-    log : log of the stage; None where it is run by hand.
-
-    Returns
-    -------
-    context manager
-    """
+    """Show a spinner while a stage runs by hand; not in the workflow, where it has a log."""
     from vinetrack.core.terminal import waiting
 
     return waiting(what) if log is None else nullcontext()
 
 
 def settings_from_json(text: str) -> RunSettings:
-    """Settings of a run from the option `--settings`.
-
-    Parameters
-    ----------
-    text : a JSON object of the settings that differ from the defaults.
-
-    Returns
-    -------
-    RunSettings
-
-    Raises
-    ------
-    typer.BadParameter
-        If the text is no JSON object.
-    """
+    """Settings of a run from the option `--settings`."""
     import json
 
     from vinetrack.experiment.settings import run_settings

@@ -388,12 +388,6 @@ design_app.command("campaign", cls=RenamedOptions)(_campaign)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the commands to the command line."""
     app.command("predict", cls=RenamedOptions, rich_help_panel=MORE)(_predict)
     app.add_typer(design_app, rich_help_panel=MORE)

@@ -17,11 +17,12 @@ from vinetrack.experiment.schema import COLUMNS, option
 VINE, RIG, INPUTS, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
 
 
+# Columns about the vine itself; all others are about the rig
 _VINE_COLUMNS = frozenset(
     {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
 )
-"""Columns about the vine itself; all others are about the rig."""
 
+# Former names of options in version 0.1 and their current names
 RENAMED_OPTIONS = {
     "--fps": "--capture-fps",
     "--of-burst": "--burst-fraction",
@@ -30,28 +31,13 @@ RENAMED_OPTIONS = {
     "--B-within": "--B-se-percent",
     "--from": "--fit",
 }
-"""Former names of options in version 0.1 and their current names; the former are accepted with a warning until the next
-release."""
 
 
 class RenamedOptions(typer.core.TyperCommand):
     """A command that also accepts options by their former names."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Replace former names of options, with a warning for each, and parse the arguments.
-
-        Parameters
-        ----------
-        ctx
-            Context of the command.
-        args : list of str
-            Arguments on the command line.
-
-        Returns
-        -------
-        list of str
-            Arguments that are not options.
-        """
+        """Replace former names of options, with a warning for each, and parse the arguments."""
         current = []
         for argument in args:
             name, equals, value = argument.partition("=")
@@ -71,21 +57,9 @@ _Command = Callable[..., None]
 
 
 def column_options(*columns: str, meanings: Mapping[str, str] | None = None) -> Callable[[_Command], _Command]:
-    """Give a command an option for each of these columns of the trial sheet, in place of its argument `cells`.
-
-    The command is called with `cells`, the given texts by column, which are checked like cells of a sheet.
-
-    Parameters
-    ----------
-    columns : str
-        Names of columns, in the order of the help.
-    meanings : mapping, optional
-        Help texts by column, for those whose meaning differs from that in the sheet.
-
-    Returns
-    -------
-    callable
-        Decorator.
+    """Give a command an option for each of these columns of the trial sheet, in place of its argument `cells`. The
+    command is called with `cells`, the given texts by column, which are checked like cells of a sheet. Returns
+    decorator.
     """
     help_texts = meanings or {}
     options = [_column_option(COLUMNS[name], help_texts.get(name)) for name in columns]
@@ -181,11 +155,6 @@ LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages a
 
 
 def say(lines: Iterable[str]) -> None:
-    """Print lines.
-
-    Parameters
-    ----------
-    lines : iterable of str
-    """
+    """Print lines."""
     for line in lines:
         typer.echo(line)

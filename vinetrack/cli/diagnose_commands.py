@@ -30,13 +30,7 @@ Moved = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the commands to the command line."""
     app.command("diagnose", rich_help_panel=MORE)(_diagnose)
     app.command("add", rich_help_panel=MORE)(_add)
     app.command("propose", rich_help_panel=MORE)(_propose)

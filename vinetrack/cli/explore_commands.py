@@ -24,13 +24,7 @@ Exports = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the command to the command line."""
     app.command("explore", rich_help_panel=START)(_explore)
 
 

@@ -63,10 +63,9 @@ def main() -> None:
 
 
 def _exit_despite_threads(status: str | int | None) -> None:
-    """Exit immediately if a thread of a page is still fitting or tracking.
-
-    At a normal exit the interpreter may stop such a thread within compiled code, which sometimes aborts the process
-    (status -6). Files are written atomically, so nothing is lost by not waiting.
+    """Exit immediately if a thread of a page is still fitting or tracking. At a normal exit the interpreter may stop
+    such a thread within compiled code, which sometimes aborts the process (status -6). Files are written atomically, so
+    nothing is lost by not waiting.
     """
     if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
         return

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-START, MORE = "Start here", "More"
-"""Panels of the help; the first lists the commands that a new user needs."""
+START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
 
 JsonFile = Annotated[
     Path | None,
@@ -19,30 +18,14 @@ JsonFile = Annotated[
 
 
 def json_to_terminal(json_file: Path | None) -> bool:
-    """Whether JSON is printed to the terminal instead of lines.
-
-    Parameters
-    ----------
-    json_file : value of the option `--json`.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether JSON is printed to the terminal instead of lines."""
     from vinetrack.core.tables import STANDARD_OUTPUT
 
     return json_file == STANDARD_OUTPUT
 
 
 def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
-    """Print lines, and write `content` as JSON to a file; or print it instead of the lines.
-
-    Parameters
-    ----------
-    lines : lines for the user.
-    content : the same content for a program: mappings, lists, numbers, text and paths.
-    json_file : value of the option `--json`; None for lines only.
-    """
+    """Print lines, and write `content` as JSON to a file; or print it instead of the lines."""
     from vinetrack.core.tables import write_json
     from vinetrack.core.terminal import severity_first
 

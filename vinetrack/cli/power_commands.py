@@ -16,13 +16,7 @@ SIMULATION, FURTHER = "Simulation", "What to add"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the command to the command line."""
     app.command("power", rich_help_panel=MORE)(_power)
 
 

@@ -12,13 +12,7 @@ from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line.
-
-    Parameters
-    ----------
-    app : typer.Typer
-        The command line.
-    """
+    """Add the commands to the command line."""
     app.command("check", rich_help_panel=START)(_check)
     app.command("run", rich_help_panel=START)(_run)
 

@@ -12,12 +12,7 @@ from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line.
-
-    Parameters
-    ----------
-    app : the command line.
-    """
+    """Add the commands to the command line."""
     app.command(name="setup", rich_help_panel=START)(_setup)
     app.command(name="track", rich_help_panel=START)(_track)
 

@@ -15,16 +15,7 @@ R = TypeVar("R")
 
 
 def in_one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function so that linear algebra in it uses one thread; afterwards as many as before.
-
-    Parameters
-    ----------
-    function : any.
-
-    Returns
-    -------
-    callable
-    """
+    """Decorate a function so that linear algebra in it uses one thread; afterwards as many as before."""
 
     @functools.wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:

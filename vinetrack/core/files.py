@@ -11,24 +11,16 @@ import os
 import stat
 from pathlib import Path
 
-DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Error numbers of a full disk or an exhausted quota."""
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})  # Error numbers of a full disk or an exhausted quota
 
 
+# Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`
 NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
-"""Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`."""
 
 
 def missing_file_message(path: Path) -> tuple[str, str]:
     """Return message and remedy for a missing file; a broken link, as to a disk that is not mounted, is named as such.
-
-    Parameters
-    ----------
-    path : path of the file.
-
-    Returns
-    -------
-    message, remedy
+    Returns message, remedy.
     """
     if path.is_symlink():
         return (
@@ -39,16 +31,7 @@ def missing_file_message(path: Path) -> tuple[str, str]:
 
 
 def is_pipe_or_device(path: Path) -> bool:
-    """Whether a path leads to something other than a file or folder, reading which may block or never end.
-
-    Parameters
-    ----------
-    path : the path; links are followed.
-
-    Returns
-    -------
-    False for files, folders and missing paths.
-    """
+    """Whether a path leads to something other than a file or folder, reading which may block or never end."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -57,21 +40,7 @@ def is_pipe_or_device(path: Path) -> bool:
 
 
 def file_size(path: Path) -> int:
-    """Return the size of a readable regular file.
-
-    Parameters
-    ----------
-    path : the file, or a link to it.
-
-    Returns
-    -------
-    bytes.
-
-    Raises
-    ------
-    OSError
-        If it does not exist, is not readable, or is a folder, a pipe or a device; `strerror` says which, for the user.
-    """
+    """Return the size of a readable regular file."""
     status = path.stat()
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
@@ -83,16 +52,7 @@ def file_size(path: Path) -> int:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether a path leads to a readable regular file or folder.
-
-    Parameters
-    ----------
-    path : path named by a sheet.
-
-    Returns
-    -------
-    False if it does not exist.
-    """
+    """Whether a path leads to a readable regular file or folder."""
     try:
         return (path.is_dir() and os.access(path, os.R_OK | os.X_OK)) or file_size(path) >= 0
     except (OSError, ValueError):
@@ -100,14 +60,5 @@ def is_readable(path: Path) -> bool:
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error means that the disk is full.
-
-    Parameters
-    ----------
-    error : the error raised.
-
-    Returns
-    -------
-    True for a full disk or an exhausted quota.
-    """
+    """Whether an error means that the disk is full."""
     return isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS

@@ -11,14 +11,11 @@ from typing import Any, TypeVar
 from vinetrack.core.problems import UserError
 
 LOOPBACK = "127.0.0.1"
-FIRST_PORT, PORTS = 5070, 30
-"""Chosen: not used by well-known services; 30 pages on one machine, then any free port."""
+FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
-TOKEN_BYTES = 16
-"""Chosen: 128 bits, which cannot be guessed; half would suffice."""
+TOKEN_BYTES = 16  # Chosen: 128 bits, which cannot be guessed; half would suffice
 
-THREAD_PREFIX = "vinetrack-"
-"""Prefix of the names of a page's threads that need not finish before the process exits."""
+THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
 Server = TypeVar("Server")
 
@@ -28,46 +25,19 @@ class PageError(UserError, RuntimeError):
 
 
 def secret_path() -> str:
-    """Return a random first part of a page's path, so that only users who know the address have access.
-
-    Returns
-    -------
-    path with a leading slash and no trailing one.
-    """
+    """Return a random first part of a page's path, so that only users who know the address have access."""
     return f"/{secrets.token_urlsafe(TOKEN_BYTES)}"
 
 
 def allowed_hosts(port: int) -> frozenset[str]:
-    """Return the allowed values of a request's `Host` header; others indicate a page of another site (DNS rebinding).
-
-    Parameters
-    ----------
-    port : port of the server.
-
-    Returns
-    -------
-    allowed values, with port.
+    """Return the allowed values of a request's `Host` header; others indicate a page of another site (DNS
+    rebinding).
     """
     return frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
 
 
 def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
-    """Start a server on a port, or on the first free one.
-
-    Parameters
-    ----------
-    serve : starts a server on a port; raises OSError if the port is in use.
-    port : port to use, 0 for any free one; None for the first free one from `FIRST_PORT`.
-
-    Returns
-    -------
-    what `serve` returns.
-
-    Raises
-    ------
-    PageError
-        If the port is in use.
-    """
+    """Start a server on a port, or on the first free one."""
     ports = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
     for number in ports:
         with contextlib.suppress(OSError):
@@ -77,16 +47,7 @@ def serve_on_free_port(serve: Callable[[int], Server], port: int | None) -> Serv
 
 @contextlib.contextmanager
 def stop_on_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end a server between two iterations of its loop.
-
-    Parameters
-    ----------
-    end : requests the end of the loop; it is called in the serving thread and must not block.
-
-    Yields
-    ------
-    None : while the signals are handled.
-    """
+    """Let Ctrl-C and SIGTERM end a server between two iterations of its loop."""
 
     def handle(_number: int, _frame: Any) -> None:
         end()

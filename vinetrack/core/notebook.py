@@ -14,23 +14,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Module whose function `figure_of(object, name, **options)` draws objects of this package
 PLOTTING_BACKEND = "vinetrack.interface.plotting"
-"""Module whose function `figure_of(object, name, **options)` draws objects of this package."""
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:
-    """Return a table as HTML with all text escaped.
-
-    Parameters
-    ----------
-    head, rows : names of the columns, and cells of each row.
-    title : line above the table.
-    notes : lines below the table.
-
-    Returns
-    -------
-    str
-    """
+    """Return a table as HTML with all text escaped."""
     above = f"<p><b>{html.escape(title)}</b></p>" if title else ""
     names = "".join(f"<th>{html.escape(name)}</th>" for name in head)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
@@ -39,17 +28,6 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = 
 
 
 def plot(shown: Any, name: str = "", **options: Any) -> Figure:
-    """Draw an object as in the report.
-
-    Parameters
-    ----------
-    shown : a fit, a comparison, a diagnosis or loaded results.
-    name : name of the figure, see `vinetrack.figures.registry`; blank for the main figure of the object.
-    options : for figures of one trial, `trial`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Draw an object as in the report."""
     figure: Figure = import_module(PLOTTING_BACKEND).figure_of(shown, name, **options)
     return figure

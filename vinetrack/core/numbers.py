@@ -9,61 +9,27 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-_FIXED_EXPONENTS = (-4, 6)
-"""Decimal exponents written without "e". Convention: the range of Python's `g` format, 0.0001 to 999999."""
+_FIXED_EXPONENTS = (-4, 6)  # Decimal exponents written without "e" (convention)
 
-_MAX_FIXED_DECIMALS = 6
-"""Decimals beyond which value and error are written with a common power of ten. Chosen: six zeros can be counted."""
+_MAX_FIXED_DECIMALS = 6  # Decimals beyond which value and error are written with a common power of ten (chosen)
 
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-_MAX_DECIMALS = 12
-"""Derived: an error below 1e-11 is the rounding of a double of order 1e5."""
+_MAX_DECIMALS = 12  # Derived: an error below 1e-11 is the rounding of a double of order 1e5
 
 
 def decimals(sigma: float) -> int:
-    """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN.
-
-    Parameters
-    ----------
-    sigma : an error, in the unit in which it is shown.
-
-    Returns
-    -------
-    decimals : int, 0 to 12.
-    """
+    """Return the number of decimals that shows two digits of an error, at most 12; 0 for an error of 0 or NaN."""
     return min(max(1 - math.floor(math.log10(sigma)), 0), _MAX_DECIMALS) if 0 < sigma < math.inf else 0
 
 
 def or_nan(value: Any) -> float:
-    """Return a number of a JSON file as a float; NaN for None, which means unknown.
-
-    Parameters
-    ----------
-    value : a number, or None.
-
-    Returns
-    -------
-    float
-
-    >>> or_nan(None), or_nan(2)
-    (nan, 2.0)
-    """
+    """Return a number of a JSON file as a float; NaN for None, which means unknown."""
     return math.nan if value is None else float(value)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN.
-
-    Parameters
-    ----------
-    value : the number; None and NaN are unknown.
-    digits : significant digits.
-
-    Returns
-    -------
-    text
-    """
+    """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN."""
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -75,19 +41,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_error(value: float | None, sigma: float | None) -> str:
-    """Return `value ± sigma`, the error to two significant digits and the value to the same decimal.
-
-    Parameters
-    ----------
-    value, sigma : a number and its standard error, in the same unit; None and NaN are unknown.
-
-    Returns
-    -------
-    text : the value alone where the error is unknown or 0.
-
-    >>> with_error(0.36981, 0.0123)
-    '0.370 ± 0.012'
-    """
+    """Return `value ± sigma`, the error to two significant digits and the value to the same decimal."""
     if value is None or not math.isfinite(value):
         return "–"
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
@@ -103,16 +57,7 @@ def with_error(value: float | None, sigma: float | None) -> str:
 
 
 def interval(bounds: Sequence[float | None] | None) -> str:
-    """Return `(low, high)` as "low to high", with decimals that suit its width; "–" if unknown.
-
-    Parameters
-    ----------
-    bounds : low and high, in the same unit; None if unknown.
-
-    Returns
-    -------
-    text
-    """
+    """Return `(low, high)` as "low to high", with decimals that suit its width; "–" if unknown."""
     if bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return "–"
     low, high = (float(bound) for bound in bounds if bound is not None)
@@ -122,19 +67,8 @@ def interval(bounds: Sequence[float | None] | None) -> str:
 
 
 def with_interval(value: float | None, bounds: Sequence[float | None] | None) -> str:
-    """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds are unknown.
-
-    Parameters
-    ----------
-    value : the number, in the unit of the bounds; None if unknown.
-    bounds : bounds of the 95 % interval; None if unknown.
-
-    Returns
-    -------
-    text
-
-    >>> with_interval(0.4001, (0.359, 0.4412))
-    '0.400 (95 %: 0.359 to 0.441)'
+    """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds
+    are unknown.
     """
     if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return number(value)

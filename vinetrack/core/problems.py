@@ -10,23 +10,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-CLOSE_NAME_RATIO = 0.6
-"""Similarity ratio above which an unknown name may be a misspelling of a known one. Chosen: difflib's default."""
+CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
 
-MAX_QUOTED_LENGTH = 60
-"""Longest quotation of a value in a message. Chosen: half a line; a pasted paragraph would hide the message."""
+MAX_QUOTED_LENGTH = 60  # Longest quotation of a value in a message (chosen)
 
+# Reason given for a trial or stage that an unexpected exception stopped
 INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
-"""Reason given for a trial or stage that an unexpected exception stopped."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An error or a warning (`severity`): location, given value, allowed values, and remedy.
-
-    `file` is relative to the experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if
-    they do not apply. `value` is None if there is none, "" for a blank cell. `of_a_measurement` marks a message that
-    quotes a measured number: problems of several trials that differ only in that number are reported as one.
+    """An error or a warning (`severity`): location, given value, allowed values, and remedy. `file` is relative to the
+    experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if they do not apply. `value`
+    is None if there is none, "" for a blank cell.
     """
 
     message: str
@@ -42,18 +38,7 @@ class Problem:
 
     @classmethod
     def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
-        """Make a problem of an error whose text is `message: remedy`.
-
-        Parameters
-        ----------
-        error : the error.
-        file : file in which it occurred.
-        details : further fields.
-
-        Returns
-        -------
-        Problem
-        """
+        """Make a problem of an error whose text is `message: remedy`."""
         message, _, remedy = str(error).partition(": ")
         return cls(message=message, file=file, remedy=remedy, **details)
 
@@ -78,9 +63,8 @@ class Problem:
 
 
 class UserError(Exception):
-    """An error that the user can correct: the message says what is wrong and what to do.
-
-    The command line prints the message of these errors; any other exception is an error in the program.
+    """An error that the user can correct: the message says what is wrong and what to do. The command line prints the
+    message of these errors; any other exception is an error in the program.
     """
 
 
@@ -93,21 +77,8 @@ class ExperimentError(UserError):
 
 
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
-    """Format problems as at most `limit` lines, errors first; the last line counts those omitted.
-
-    A problem that several trials share is reported once.
-
-    Parameters
-    ----------
-    problems : the problems, in any order.
-    limit : largest number of lines.
-
-    Returns
-    -------
-    lines : errors first.
-
-    >>> format_problems([Problem(message="is blank", column=f"c{i}") for i in range(4)], limit=3)
-    ['error: c0 is blank', 'error: c1 is blank', '… and 2 more (2 errors, 0 warnings)']
+    """Format problems as at most `limit` lines, errors first; the last line counts those omitted. A problem that
+    several trials share is reported once.
     """
     ordered = sorted(_merged(problems), key=lambda problem: problem.severity != "error")
     if len(ordered) <= limit:
@@ -131,20 +102,7 @@ def _merged(problems: Iterable[Problem]) -> list[Problem]:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Suggest the three known names most similar to an unknown one.
-
-    Parameters
-    ----------
-    name : the unknown name.
-    known : known names.
-
-    Returns
-    -------
-    a question if one is similar enough, else a list; blank if there are no known names.
-
-    >>> did_you_mean("presure", ["pressure", "payload", "trial", "preview"])
-    'did you mean pressure? (or preview, trial)'
-    """
+    """Suggest the three known names most similar to an unknown one."""
     nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
     if not nearest:
         return ""

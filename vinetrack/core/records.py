@@ -20,26 +20,21 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
 Bools = NDArray[np.bool_]
 
+# Flags of a point of a track; several are joined by `;` in this order
 FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "corrected", "gap", "retimed", "after_end")
-"""Flags of a point of a track; several are joined by `;` in this order. `corrected`: moved, dropped or confirmed by
-hand. `gap`: frames are missing before it. `retimed`: the times from it on were corrected."""
 
-_FORMER_RETIMED_FLAGS = "gap;corrected"
-"""Former spelling of `gap;retimed`, read for one more release. In the current order `corrected` precedes `gap`, so that
-the two are distinguishable."""
+_FORMER_RETIMED_FLAGS = "gap;corrected"  # Former spelling of `gap;retimed`, read for one more release
 
+# Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
-"""Flags of points that are not measurements of the leading edge."""
 
 
-CORRECTION_ACTIONS = ("move", "drop", "confirm")
-"""Manual corrections of a point of a track."""
+CORRECTION_ACTIONS = ("move", "drop", "confirm")  # Manual corrections of a point of a track
 
 
 @dataclass(frozen=True)
 class Correction:
     """A manual correction of one frame of a recording: one of CORRECTION_ACTIONS, and for `move` the new position.
-
     `edge_px` is measured along the growth axis of the trial, as in the track; NaN if the point is not moved.
     """
 
@@ -48,17 +43,13 @@ class Correction:
     edge_px: float = math.nan
 
 
-POSITION_SYSTEMATIC_M = 1e-4
-"""Standard deviation of smooth position errors if lens distortion is unknown. Measured: with this allowance, a smooth
-error of 0.11 mm was identified as a physical effect in 0 of 5 campaigns (5 of 6 without it), and both depletion and
-tail friction were still detected. At half, such an error counts as 2 σ; at twice, the errors of small effects grow."""
+POSITION_SYSTEMATIC_M = 1e-4  # Standard deviation of smooth position errors if lens distortion is unknown
 
 
 @dataclass(frozen=True)
 class PictureAxis:
-    """The growth axis of a trial in the picture: (x, y) of its ends, px; `width_m` is NaN if not given.
-
-    `via_px` are intermediate points of a curved path, in order.
+    """The growth axis of a trial in the picture: (x, y) of its ends, px; `width_m` is NaN if not given. `via_px` are
+    intermediate points of a curved path, in order.
     """
 
     from_px: tuple[float, float]
@@ -78,11 +69,9 @@ class Bend:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One row of the trial sheet with shared settings filled in, in SI units; NaN for blank cells.
-
-    `vine` is common to trials with the same diameter, thickness and length; `condition` to replicates, trials with the
-    same nominal settings. `specimen` is the physical tube and `day` the day or batch, blank if unknown; `order` is the
-    position of the trial in the order in which trials were run, from 1, NaN if unknown.
+    """One row of the trial sheet with shared settings filled in, in SI units; NaN for blank cells. `vine` is common to
+    trials with the same diameter, thickness and length; `condition` to replicates, trials with the same nominal
+    settings.
     """
 
     name: str
@@ -126,18 +115,7 @@ class Trial:
     corrections: tuple[Correction, ...] = ()
 
     def group(self, shared: str) -> str:
-        """Return the group of this trial for a parameter that is shared within groups.
-
-        Parameters
-        ----------
-        shared : str
-            `all`, `vine` or `day`.
-
-        Returns
-        -------
-        str
-            Name of the group; blank for `all`, and if the day is unknown.
-        """
+        """Return the group of this trial for a parameter that is shared within groups."""
         if shared == "day":
             return f"day {self.day}" if self.day else ""
         return self.vine if shared == "vine" else ""
@@ -162,16 +140,7 @@ class Trial:
         return self.linear_density_kg_m * (self.travel_ratio - 1) / self.travel_ratio
 
     def moving_mass_kg(self, lead_travel_m: Floats | float) -> Floats:
-        """Return the mass of tail and payload, m = max(λL − c·x, 0) + m_pay, after growth y, with x = r·y.
-
-        Parameters
-        ----------
-        lead_travel_m : growth y since release, array of any shape, m.
-
-        Returns
-        -------
-        array of that shape, kg.
-        """
+        """Return the mass of tail and payload, m = max(λL − c·x, 0) + m_pay, after growth y, with x = r·y."""
         length_m = self.length_m if math.isfinite(self.length_m) else 0.0
         film_kg = self.linear_density_kg_m * length_m
         tail_travel_m = self.travel_ratio * np.asarray(lead_travel_m, dtype=float)
@@ -185,60 +154,24 @@ def join_flags(*flags: str) -> str:
 
 
 def split_flags(flag: str) -> list[str]:
-    """Split the flags of one point.
-
-    Parameters
-    ----------
-    flag : flags joined by `;`; `gap;corrected` of an earlier release is read as `gap;retimed`.
-
-    Returns
-    -------
-    list of str : without blanks.
-
-    >>> split_flags("doubtful;gap;corrected"), split_flags("corrected;gap")
-    (['doubtful', 'gap', 'retimed'], ['corrected', 'gap'])
-    """
+    """Split the flags of one point."""
     return [part for part in flag.replace(_FORMER_RETIMED_FLAGS, "gap;retimed").split(";") if part]
 
 
 def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
-    """Return the mask of points that carry a flag.
-
-    Parameters
-    ----------
-    flags : flags of every frame, joined by `;`.
-    name : one of FLAGS.
-
-    Returns
-    -------
-    array of bool, shape (n_frames,)
-    """
+    """Return the mask of points that carry a flag. Shape (n_frames,)."""
     return np.array([name in split_flags(str(flag)) for flag in flags], dtype=bool)
 
 
 def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
-    """Return the mask of points that were moved, dropped or confirmed by hand.
-
-    Parameters
-    ----------
-    flags : flags of every frame, joined by `;`.
-
-    Returns
-    -------
-    array of bool, shape (n_frames,)
-    """
+    """Return the mask of points that were moved, dropped or confirmed by hand. Shape (n_frames,)."""
     return with_flag(flags, "corrected")
 
 
 @dataclass(frozen=True)
 class Track:
-    """Position of the leading edge at each frame of one trial. All arrays have shape (n_frames,).
-
-    `lead_position_m` is NaN where the edge was not found. `lead_position_sigma_m` is the standard deviation of the
-    random error of each point (NaN if unknown), `lead_position_systematic_m` that of its slowly varying error, which
-    neighbouring frames share and averaging does not reduce (None or NaN if unknown). `flag` holds strings, see FLAGS;
-    `pressure_Pa` is the gauge pressure measured during the trial, if any; `notes` are sentences about the whole track
-    for the user. `tracked_px` is `edge_px` before manual corrections, None if there were none.
+    """Position of the leading edge at each frame of one trial. All arrays have shape (n_frames,). `lead_position_m` is
+    NaN where the edge was not found.
     """
 
     time_s: Floats
@@ -264,17 +197,8 @@ class Track:
 def plain_track(
     time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
 ) -> Track:
-    """Make a track of positions alone: without flags and pixels, and without errors unless given.
-
-    Parameters
-    ----------
-    time_s, lead_position_m : shape (n_frames,), s and m.
-    sigma_m : shape (n_frames,), standard deviation of the random error of each point, m.
-    pressure_Pa : shape (n_frames,), gauge pressure measured during the trial, Pa.
-
-    Returns
-    -------
-    Track
+    """Make a track of positions alone: without flags and pixels, and without errors unless given. Shapes: time_s,
+    lead_position_m, sigma_m, pressure_Pa (n_frames,).
     """
     unknown = np.full(len(time_s), np.nan)
     no_flag = np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}")
@@ -283,10 +207,9 @@ def plain_track(
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Motion of the leading edge at the usable points of a track. All arrays have shape (n,), SI units.
-
-    `window_points` is the width of the smoothing window chosen at each point; `noise_m` the standard deviation of a
-    single position and `noise_correlation` its lag-one autocorrelation.
+    """Motion of the leading edge at the usable points of a track. All arrays have shape (n,), SI units. `window_points`
+    is the width of the smoothing window chosen at each point; `noise_m` the standard deviation of a single position and
+    `noise_correlation` its lag-one autocorrelation.
     """
 
     time_s: Floats
@@ -307,12 +230,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason.
-
-    `rule` is `gated`, `paper` or `user`; `x_ss_m_s` the mean **tail** speed in the window and `x_ss_sigma_m_s` its
-    standard error; `drift` the relative change of speed across the window with its 95 % interval `drift_95`; `cv` the
-    coefficient of variation of the velocities in it. Numbers are NaN if there is no window.
-    """
+    """A window of a trial tested for steadiness by one rule: whether it was accepted, and the reason."""
 
     rule: str
     accepted: bool

@@ -29,15 +29,12 @@ from vinetrack.core.problems import UserError
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_TABLE_BYTES = 200_000_000
-"""Largest file read as a table; a larger one is probably a recording in the wrong column. Chosen: an hour of positions
-at 1000 frames per second takes 150 MB. At half such a file is refused; at twice a recording takes more memory first."""
+MAX_TABLE_BYTES = 200_000_000  # Largest file read as a table (chosen)
 
 STANDARD_OUTPUT = Path("-")  # convention of commands: this name means standard output
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
-"""Such as 1,069 or 1.069: the mark is a decimal mark or a thousands separator, depending on the locale."""
+_AMBIGUOUS_NUMBER = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)  # Such as 1,069 or 1.069
 _PLAIN_NUMBERS = re.compile(r"[0-9eE+.\n-]*")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
@@ -48,11 +45,9 @@ class TableError(UserError):
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of a CSV file as stripped text.
-
-    `rows[i]` maps each column to its cell ("" if blank or if the line is short); `lines[i]` is its line in the file,
-    from 1; `extra[i]` holds the cells beyond the last column; `nameless`: a column without a name has content.
-    `decimal` is the decimal mark of the file, "." or ",", or "" if it uses both.
+    """Cells of a CSV file as stripped text. `rows[i]` maps each column to its cell ("" if blank or if the line is
+    short); `lines[i]` is its line in the file, from 1; `extra[i]` holds the cells beyond the last column; `nameless`: a
+    column without a name has content.
     """
 
     columns: tuple[str, ...]
@@ -64,22 +59,7 @@ class Table:
     nameless: bool = False
 
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
-        """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error.
-
-        Parameters
-        ----------
-        column : its name in the header.
-        blank_is_nan : whether blank cells are NaN, not errors.
-
-        Returns
-        -------
-        array, shape (n_rows,), in the unit of the column.
-
-        Raises
-        ------
-        TableError
-            Naming line, column and cell of the first that is not a number.
-        """
+        """Return a column as numbers; blank cells are NaN if `blank_is_nan`, else an error. Shape (n_rows,)."""
         cells = [row[column] for row in self.rows]
         # Fast path, 10 times faster: a column of plain numbers needs no check of each cell.
         joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
@@ -101,28 +81,7 @@ class Table:
 
 
 def parse_number(text: str, decimal: str = ".") -> float:
-    """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else.
-
-    Parameters
-    ----------
-    text : one cell.
-    decimal : decimal mark of the file, blank if unknown; used only to interpret numbers such as 1,069 and 1.069.
-
-    Returns
-    -------
-    the number.
-
-    Raises
-    ------
-    TableError
-        If it is not a number; the message does not quote the text.
-
-    >>> parse_number("0,5"), parse_number(" 2.5e3 "), parse_number("1,069", decimal=",")
-    (0.5, 2500.0, 1.069)
-    >>> parse_number("12 kPa")
-    Traceback (most recent call last):
-    vinetrack.core.tables.TableError: is not a number: write digits only, without unit or separators
-    """
+    """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else."""
     text = text.strip()
     if text == "":
         raise TableError("is blank: write a number")
@@ -140,19 +99,7 @@ def parse_number(text: str, decimal: str = ".") -> float:
 
 
 def decode_text(data: bytes) -> str:
-    r"""Decode a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
-
-    Parameters
-    ----------
-    data : content of the file.
-
-    Returns
-    -------
-    its text.
-
-    >>> decode_text("µ\r\n".encode("cp1252")), decode_text("µ".encode("utf-16"))
-    ('µ\n', 'µ')
-    """
+    r"""Decode a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`."""
     if data.startswith((b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")):
         encodings = ["utf-32"]
     elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -168,21 +115,7 @@ def decode_text(data: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file of at most `MAX_TABLE_BYTES`.
-
-    Parameters
-    ----------
-    path : the file.
-
-    Returns
-    -------
-    its text, decoded; see `decode_text`.
-
-    Raises
-    ------
-    TableError
-        If the file does not exist, cannot be opened, is too large or is not text.
-    """
+    """Read a text file of at most `MAX_TABLE_BYTES`."""
     try:
         if file_size(path) > MAX_TABLE_BYTES:
             raise TableError("is too large to be a table: is it a recording?")
@@ -195,40 +128,12 @@ def read_text(path: Path) -> str:
 
 
 def read_table(path: Path) -> Table:
-    """Read a CSV file whose first line (after blank ones) is the header.
-
-    Parameters
-    ----------
-    path : the file.
-
-    Returns
-    -------
-    table : cells as text.
-
-    Raises
-    ------
-    TableError
-        If it is not a table; the message does not contain the name of the file.
-    """
+    """Read a CSV file whose first line (after blank ones) is the header."""
     return parse_table(read_text(path))
 
 
 def parse_table(text: str, skip_lines: int = 0) -> Table:
-    r"""Read the text of a CSV file.
-
-    Parameters
-    ----------
-    text : content of the file.
-    skip_lines : number of lines to skip before the header.
-
-    Returns
-    -------
-    table : cells as text.
-
-    >>> table = parse_table("trial; pressure_kPa\n a ;28,5\n;\n\n")
-    >>> table.rows, table.lines, table.decimal
-    (({'trial': 'a', 'pressure_kPa': '28,5'},), (2,), ',')
-    """
+    r"""Read the text of a CSV file."""
     lines = text.split("\n")[skip_lines:]
     if lines and (match := re.fullmatch(r'"?sep=(.)"?[;,\t]*', lines[0].strip("\ufeff "))):
         delimiter, lines, skip_lines = match[1], lines[1:], skip_lines + 1
@@ -301,28 +206,7 @@ def _find_decimal(cells: list[str], delimiter: str) -> str:
 
 def safe_join(folder: Path, relative: str) -> Path:
     r"""Return the path of a file inside `folder`; only its text is checked, so a link may still lead outside.
-
     Backslashes count as slashes.
-
-    Parameters
-    ----------
-    folder : folder that the path must not leave.
-    relative : path stated by the sheet or the settings.
-
-    Returns
-    -------
-    the path below `folder`.
-
-    Raises
-    ------
-    TableError
-        If `relative` is blank, absolute, starts with a drive letter or leaves the folder.
-
-    >>> safe_join(Path("exp"), r"videos\a.mp4").as_posix()
-    'exp/videos/a.mp4'
-    >>> safe_join(Path("exp"), "../a.mp4")
-    Traceback (most recent call last):
-    vinetrack.core.tables.TableError: leads out of the experiment folder: move the file into it, or put a link there
     """
     text = relative.strip().replace("\\", "/")
     # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
@@ -344,21 +228,7 @@ def safe_join(folder: Path, relative: str) -> Path:
 
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
-    """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`.
-
-    Parameters
-    ----------
-    folder : folder of the file.
-    name : name of a trial, vine or condition.
-    suffix : suffix of the file, with its dot.
-
-    Returns
-    -------
-    the path.
-
-    >>> result_file(Path("results/demo/tracks"), "v1-a", ".csv").as_posix()
-    'results/demo/tracks/v1-a.csv'
-    """
+    """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`."""
     if not _SAFE_NAME.fullmatch(name):
         raise TableError(f"{name[:40]!r} cannot name a file: use letters, digits, _ and -")
     return folder / f"{name}{suffix}"
@@ -366,16 +236,7 @@ def result_file(folder: Path, name: str, suffix: str) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it is renamed to `path`, otherwise deleted.
-
-    Parameters
-    ----------
-    path : the file to write; a missing folder is created.
-
-    Yields
-    ------
-    temporary : path in the same folder, with the suffix of `path`.
-    """
+    """Yield a temporary path beside `path`; on success it is renamed to `path`, otherwise deleted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex}{path.suffix}")
     try:
@@ -386,37 +247,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically.
-
-    Parameters
-    ----------
-    path : the file; a missing folder is created.
-    data : content of the file.
-    """
+    """Write a file atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically, in UTF-8, without changing line ends.
-
-    Parameters
-    ----------
-    path : the file.
-    text : content of the file.
-    """
+    """Write a text file atomically, in UTF-8, without changing line ends."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
-    """Write a table atomically as CSV; missing numbers are `NaN`, missing text is blank.
-
-    Floats are written with all digits needed to read back the same value.
-
-    Parameters
-    ----------
-    path : the file.
-    frame : the table, units in the names of its columns.
+    """Write a table atomically as CSV; missing numbers are `NaN`, missing text is blank. Floats are written with all
+    digits needed to read back the same value.
     """
     text_columns = frame.columns[[dtype.kind not in "fiub" for dtype in frame.dtypes]]
     filled = frame.astype(dict.fromkeys(text_columns, object))
@@ -425,13 +268,7 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text.
-
-    Parameters
-    ----------
-    path : the file; STANDARD_OUTPUT for the terminal.
-    content : mappings, lists, numbers, text, arrays and paths.
-    """
+    """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text."""
     text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
     print(text) if path == STANDARD_OUTPUT else write_text(path, text + "\n")
 

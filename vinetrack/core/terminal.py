@@ -17,9 +17,7 @@ from typing import Any, Generic, TextIO, TypeVar
 
 Item = TypeVar("Item")
 
-PROGRESS_DELAY_S = 0.5
-"""Delay before a progress bar appears. Chosen: half a second of work needs no bar; two seconds show one most of the
-time."""
+PROGRESS_DELAY_S = 0.5  # Delay before a progress bar appears (chosen)
 
 COLUMN_GAP = "  "
 STYLE_CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
@@ -33,16 +31,7 @@ _NO_VALUE = frozenset({"", "–", "-", "—", "nan", "open"})
 
 
 def colour_wanted(stream: TextIO | None = None) -> bool:
-    """Whether to use colour on a stream.
-
-    Parameters
-    ----------
-    stream : the stream; None for standard output.
-
-    Returns
-    -------
-    False if NO_COLOR is set, TERM is "dumb", or the stream is not a terminal.
-    """
+    """Whether to use colour on a stream."""
     stream = stream or sys.stdout
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return False
@@ -50,35 +39,14 @@ def colour_wanted(stream: TextIO | None = None) -> bool:
 
 
 def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
-    """Apply styles to a text, if the stream uses colour.
-
-    Parameters
-    ----------
-    text : the text.
-    *styles : keys of `STYLE_CODES`.
-    stream : stream to which the text is printed; None for standard output.
-
-    Returns
-    -------
-    the text between the escape codes of the styles, or unchanged.
-    """
+    """Apply styles to a text, if the stream uses colour."""
     if not styles or not text or not colour_wanted(stream):
         return text
     return f"\x1b[{';'.join(STYLE_CODES[style] for style in styles)}m{text}\x1b[0m"
 
 
 def severity_first(line: str, stream: TextIO | None = None) -> str:
-    """Return a line of `format_problems` with its first word in the colour of its severity.
-
-    Parameters
-    ----------
-    line : "error: …" or "warning: …"; any other line is returned unchanged.
-    stream : stream to which the line is printed; None for standard output.
-
-    Returns
-    -------
-    the line.
-    """
+    """Return a line of `format_problems` with its first word in the colour of its severity."""
     word, colon, message = line.partition(":")
     return (
         styled(word, SEVERITY_COLOURS[word], "bold", stream=stream) + colon + message
@@ -88,16 +56,7 @@ def severity_first(line: str, stream: TextIO | None = None) -> str:
 
 
 def width(text: str) -> int:
-    """Return the width of a text on a terminal: 0 for styles and combining marks, 2 for wide characters.
-
-    Parameters
-    ----------
-    text : one line, with or without styles.
-
-    Returns
-    -------
-    number of terminal columns.
-    """
+    """Return the width of a text on a terminal: 0 for styles and combining marks, 2 for wide characters."""
     plain = _ESCAPE_CODE.sub("", text)
     return sum(
         0 if unicodedata.combining(char) else 2 if unicodedata.east_asian_width(char) in "WF" else 1 for char in plain
@@ -112,22 +71,7 @@ def table(
     indent: str = "",
     align: str = "",
 ) -> list[str]:
-    """Format rows as lines of aligned columns: numbers right-aligned, words left-aligned.
-
-    Parameters
-    ----------
-    rows : cells of each row, converted by `str`.
-    header, units : names of the columns and their units, one line each; no line if empty.
-    indent : text before every line.
-    align : one character per column, `<` or `>`; by default numbers are right-aligned.
-
-    Returns
-    -------
-    lines, without line ends.
-
-    >>> table([("a", "1.5"), ("b", "12.0")], header=("trial", "rms"), units=("", "mm"))
-    ['trial   rms', '         mm', 'a       1.5', 'b      12.0']
-    """
+    """Format rows as lines of aligned columns: numbers right-aligned, words left-aligned."""
     body = [[str(cell) for cell in row] for row in rows]
     above = [list(line) for line in (header, units) if line]
     lines = [*above, *body]
@@ -173,30 +117,15 @@ class Progress(Generic[Item]):
         )
 
     def advance(self, count: int = 1) -> None:
-        """Advance by a number of steps.
-
-        Parameters
-        ----------
-        count : steps since the last call.
-        """
+        """Advance by a number of steps."""
         self._bar.update(count)
 
     def reach(self, done: int) -> None:
-        """Set the number of completed steps.
-
-        Parameters
-        ----------
-        done : completed steps since the start.
-        """
+        """Set the number of completed steps."""
         self._bar.update(done - self._bar.n)
 
     def say(self, words: str) -> None:
-        """Show the current activity after the bar.
-
-        Parameters
-        ----------
-        words : a few words, which replace those of the previous call.
-        """
+        """Show the current activity after the bar."""
         self._bar.set_postfix_str(words, refresh=False)
 
     def __iter__(self) -> Iterator[Item]:
@@ -217,24 +146,7 @@ class Progress(Generic[Item]):
 def progress(
     work: Iterable[Item] | int, description: str, *, total: int | None = None, unit: str = "trial"
 ) -> Progress[Item]:
-    """Return a progress bar, which appears on standard error after half a second if that is a terminal.
-
-    Parameters
-    ----------
-    work : an iterable, or the number of steps; for an unknown number see `waiting`.
-    description : one or two words.
-    total : number of elements of an iterable without a length.
-    unit : unit of the count, in the singular.
-
-    Returns
-    -------
-    a bar: iterate over it, or use it as a context manager and call `advance` or `reach`.
-
-    >>> [item for item in progress(["a", "b"], "trials")]
-    ['a', 'b']
-    >>> with progress(3, "effects", unit="effect") as bar:
-    ...     bar.advance()
-    """
+    """Return a progress bar, which appears on standard error after half a second if that is a terminal."""
     if isinstance(work, int):
         return Progress(None, work, description, unit)
     count = len(work) if total is None and isinstance(work, Sized) else total

@@ -9,12 +9,7 @@ from functools import lru_cache
 
 @lru_cache
 def available_cores() -> int:
-    """Number of cores that this process may use, determined once.
-
-    Returns
-    -------
-    int
-    """
+    """Number of cores that this process may use, determined once."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # no affinity on macOS and Windows
@@ -22,17 +17,7 @@ def available_cores() -> int:
 
 
 def thread_pool(threads: int) -> ThreadPoolExecutor:
-    """Thread pool of this process; a forked process gets its own.
-
-    Parameters
-    ----------
-    threads : number of its threads.
-
-    Returns
-    -------
-    ThreadPoolExecutor
-        The same for the same number.
-    """
+    """Thread pool of this process; a forked process gets its own."""
     return _pool(os.getpid(), threads)
 
 

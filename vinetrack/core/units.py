@@ -12,11 +12,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit and its conversion: value in SI = value · `multiply` / `divide`.
-
-    Factor and divisor are separate so that both are exact: 28.7 / 1000 is the double closest to 0.0287, whereas
-    28.7 · 0.001 may differ in the last place. `text` is the printed unit, `metavar` the placeholder of a value in the
-    help of a command.
+    """A unit and its conversion: value in SI = value · `multiply` / `divide`. Factor and divisor are separate so that
+    both are exact: 28.7 / 1000 is the double closest to 0.0287, whereas 28.7 · 0.001 may differ in the last place.
     """
 
     si: str
@@ -26,32 +23,15 @@ class Unit:
     metavar: str = "NUMBER"
 
     def to_si(self, value: float) -> float:
-        """Return a value in SI.
-
-        Parameters
-        ----------
-        value : in this unit.
-
-        Returns
-        -------
-        the value in the unit `si`.
-        """
+        """Return a value in SI."""
         return value * self.multiply / self.divide
 
     def from_si(self, value: float) -> float:
-        """Return a value in this unit.
-
-        Parameters
-        ----------
-        value : in SI.
-
-        Returns
-        -------
-        the value in this unit.
-        """
+        """Return a value in this unit."""
         return value * self.divide / self.multiply
 
 
+# Units by the suffix of a name
 UNITS: dict[str, Unit] = {
     "Pa": Unit("Pa", "Pa"),
     "mbar": Unit("Pa", "mbar", multiply=100.0),
@@ -85,58 +65,31 @@ UNITS: dict[str, Unit] = {
     "kg_m3": Unit("kg_m3", "kg/m³"),
     "fps": Unit("fps", "frames per second"),
 }
-"""Units by the suffix of a name. By definition (international yard and pound agreement, 1959) an inch is 25.4 mm, a
-foot 304.8 mm, a pound 453.59237 g and an ounce 1/16 pound; a psi is the weight of a pound (g = 9.80665 m/s²) on a
-square inch: 0.45359237 · 9.80665 / 0.0254² Pa."""
 
+# Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is dimensionless
 DISPLAY_UNITS: dict[str, tuple[str, float]] = {
     "Pa": ("kPa", 1e-3),
     "1/Pa": ("1/kPa", 1e3),
     "kg": ("g", 1e3),
     "1": ("", 1.0),
 }
-"""Display unit by SI unit, and the factor from SI: pressures are shown in kPa, masses in grams; "1" is
-dimensionless."""
 
-SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}
-"""Display units of sliders; lengths are shown in millimetres."""
+SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}  # Display units of sliders
 
-PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}
-"""Display units of predictions; times are shown in milliseconds, since a vine grows within a tenth of a second."""
+PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}  # Display units of predictions
 
 
 def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS) -> tuple[str, float]:
-    """Return the display unit of an SI unit, and the factor from SI.
-
-    Parameters
-    ----------
-    unit : SI unit as stated by parameters of effects, such as ``"1/Pa"``.
-    table : display units, such as `SLIDER_UNITS` or `PREDICTION_UNITS`.
-
-    Returns
-    -------
-    name, factor
-        The unit itself and 1.0 if it has no other display unit.
-
-    >>> display_unit("Pa"), display_unit("m")
-    (('kPa', 0.001), ('m', 1.0))
+    """Return the display unit of an SI unit, and the factor from SI. Returns name, factor (the unit itself and 1.0 if
+    it has no other display unit), >>> display_unit("Pa"), display_unit("m"), (('kPa', 0.001), ('m', 1.0)).
     """
     return table.get(unit, (unit, 1.0))
 
 
 def split_unit(name: str) -> tuple[str, str]:
     """Split a name into its quantity and the key of its unit, which is blank if the name does not end in a unit.
-
-    Parameters
-    ----------
-    name : name of a column, key or option.
-
-    Returns
-    -------
-    quantity, unit : the unit as a key of `UNITS`.
-
-    >>> split_unit("yield_pressure_kPa"), split_unit("film_density_kg_m3"), split_unit("bends")
-    (('yield_pressure', 'kPa'), ('film_density', 'kg_m3'), ('bends', ''))
+    Returns quantity, unit, >>> split_unit("yield_pressure_kPa"), split_unit("film_density_kg_m3"), split_unit("bends"),
+    (('yield_pressure', 'kPa'), ('film_density', 'kg_m3'), ('bends', '')).
     """
     parts = name.split("_")
     for start in range(1, len(parts)):
@@ -146,25 +99,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def convert(value: float, unit: str, to: str) -> float:
-    """Convert a value to another unit of the same quantity.
-
-    Parameters
-    ----------
-    value : a number in `unit`.
-    unit, to : keys of `UNITS`.
-
-    Returns
-    -------
-    the number in `to`.
-
-    Raises
-    ------
-    ValueError
-        If the units belong to different quantities.
-
-    >>> convert(4, "psi", "kPa"), convert(1, "in", "mm")
-    (27.579029172673444, 25.4)
-    """
+    """Convert a value to another unit of the same quantity."""
     given, wanted = UNITS[unit], UNITS[to]
     if given.si != wanted.si:
         raise ValueError(f"{given.text} cannot be turned into {wanted.text}")

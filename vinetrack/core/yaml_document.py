@@ -13,9 +13,7 @@ import yaml
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import TableError, read_text
 
-MAX_KEYS = 10_000
-"""Largest number of keys of a document. Chosen: fifty times what an experiment of 200 trials needs; half or twice only
-changes how soon a malicious file is refused."""
+MAX_KEYS = 10_000  # Largest number of keys of a document (chosen)
 
 
 @dataclass(frozen=True)
@@ -50,21 +48,7 @@ _Loader.add_constructor("tag:vinetrack,number", _construct_number)
 
 
 def read_yaml(path: Path) -> YamlDocument:
-    """Read a YAML file that holds one mapping; an empty file is an empty mapping.
-
-    Parameters
-    ----------
-    path : the file.
-
-    Returns
-    -------
-    document : its content, and the line of every key.
-
-    Raises
-    ------
-    ExperimentError
-        If it cannot be read, is not YAML, is not a mapping, or contains a key twice.
-    """
+    """Read a YAML file that holds one mapping; an empty file is an empty mapping."""
     try:
         text = read_text(path)
     except TableError as error:
@@ -73,20 +57,7 @@ def read_yaml(path: Path) -> YamlDocument:
 
 
 def parse_yaml(text: str, file: str) -> YamlDocument:
-    r"""Parse YAML text; see `read_yaml`.
-
-    Parameters
-    ----------
-    text : YAML.
-    file : its name, for messages.
-
-    Returns
-    -------
-    document : its content, and the line of every key.
-
-    >>> parse_yaml("steady: 10:20\ncapture_fps: 1e3", "experiment.yaml").content
-    {'steady': '10:20', 'capture_fps': 1000.0}
-    """
+    r"""Parse YAML text; see `read_yaml`."""
     loader = None
     try:
         loader = _Loader(text)
@@ -143,31 +114,9 @@ def _syntax_problem(error: Exception, file: str) -> Problem:
 
 
 def with_list(text: str, key: str, values: Sequence[str], file: str = "experiment.yaml") -> str:
-    r"""Return the text with a top-level key set to a list of words; everything else, comments included, is unchanged.
-
-    A list in brackets stays in brackets, and a list with one line per value stays so; comments after the value and
+    r"""Return the text with a top-level key set to a list of words; everything else, comments included, is unchanged. A
+    list in brackets stays in brackets, and a list with one line per value stays so; comments after the value and
     between its lines are kept. A missing key is added at the end.
-
-    Parameters
-    ----------
-    text : YAML.
-    key : a top-level key.
-    values : words of letters, digits and underscores.
-    file : its name, for messages.
-
-    Returns
-    -------
-    the changed text.
-
-    Raises
-    ------
-    ExperimentError
-        If the text is not YAML, or the change would alter other keys (for example if the value is an alias).
-
-    Examples
-    --------
-    >>> with_list("a: 1  # one\nmodel: [x]  # now\n", "model", ["x", "y"])
-    'a: 1  # one\nmodel: [x, y]  # now\n'
     """
     before = parse_yaml(text, file).content
     flow = f"[{', '.join(values)}]"
@@ -185,21 +134,7 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
 
 
 def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, file: str) -> None:
-    """Check that an edited text has exactly the expected content.
-
-    Parameters
-    ----------
-    changed : the edited YAML.
-    expected : expected content.
-    key : key that was set.
-    shown : its value as YAML, for the message.
-    file : name of the file, for messages.
-
-    Raises
-    ------
-    ExperimentError
-        If the content differs.
-    """
+    """Check that an edited text has exactly the expected content."""
     try:
         correct = parse_yaml(changed, file).content == expected
     except ExperimentError:
@@ -212,17 +147,7 @@ def verify_edit(changed: str, expected: dict[Any, Any], key: str, shown: str, fi
 
 
 def top_level_value(text: str, key: str) -> Any:
-    """Return the node of a top-level key's value, with its position in the text.
-
-    Parameters
-    ----------
-    text : YAML.
-    key : a top-level key.
-
-    Returns
-    -------
-    yaml.Node; None if there is no such key, or the text is not a mapping.
-    """
+    """Return the node of a top-level key's value, with its position in the text."""
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
@@ -234,7 +159,6 @@ def top_level_value(text: str, key: str) -> Any:
 
 def _with_block_items(text: str, node: Any, values: Sequence[str]) -> str:
     """Set a list with one line per value: drop the lines of removed values, add new ones after the last that is kept.
-
     If the order of the kept values changes, all lines are replaced.
     """
     lines = text.splitlines(keepends=True)

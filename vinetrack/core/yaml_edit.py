@@ -14,37 +14,11 @@ from vinetrack.core.yaml_document import parse_yaml, top_level_value, verify_edi
 
 _PLAIN_TEXT = re.compile(r"[A-Za-z_./][\w./ -]*")
 _YAML_WORDS = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
-_Edit = tuple[int, int, str]
-"""Start index, end index, and the text that replaces what lies between."""
+_Edit = tuple[int, int, str]  # Start index, end index, and the text that replaces what lies between
 
 
 def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -> str:
-    r"""Return the text with a top-level key set to a value; everything else is unchanged.
-
-    Parameters
-    ----------
-    text : YAML.
-    key : a top-level key.
-    value : a number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. In a
-        mapping with one line per key, only lines whose value differs are changed.
-    file : its name, for messages.
-
-    Returns
-    -------
-    the changed text.
-
-    Raises
-    ------
-    ExperimentError
-        If the text is not YAML, or the change would alter other keys (for example if the value is an alias).
-
-    Examples
-    --------
-    >>> with_value("capture_fps:  # of the camera\n", "capture_fps", 1069)
-    'capture_fps: 1069  # of the camera\n'
-    >>> with_value("axis:\n  from_px: [1, 2]  # left\n  to_px: [9, 2]\n", "axis", {"from_px": [1, 2], "to_px": [8, 2]})
-    'axis:\n  from_px: [1, 2]  # left\n  to_px: [8, 2]\n'
-    """
+    r"""Return the text with a top-level key set to a value; everything else is unchanged."""
     before = parse_yaml(text, file).content
     if before.get(key) == _plain(value):
         return text

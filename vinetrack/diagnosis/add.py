@@ -35,31 +35,8 @@ if TYPE_CHECKING:
 def add(
     experiment: Experiment, tracks: Mapping[str, Track], name: str, report: Callable[[str], None]
 ) -> tuple[Fit, Fit, pd.DataFrame]:
-    """Fit the model in use without and with an effect, and work out the ladder of both.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings; the user's effects are read from its folder.
-    tracks : mapping
-        Tracks by name of trial.
-    name : str
-        Name of the effect, or path of its file.
-    report : callable
-        Called with a sentence at each step.
-
-    Returns
-    -------
-    before, after : Fit
-    table : DataFrame
-        The ladder of errors, one row for each model.
-
-    Raises
-    ------
-    EffectError
-        If there is no such effect, it is in the model already, or a trial lacks what it needs.
-    FitError
-        If the simulation of a model fails.
+    """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
+    (the ladder of errors, one row for each model).
     """
     from vinetrack.diagnosis.ladder import ladder
     from vinetrack.effects import own_effects
@@ -83,22 +60,8 @@ def add(
 
 
 def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
-    """Fit a model without and with an effect, each from its best minimum, as the diagnosis does.
-
-    Parameters
-    ----------
-    before : the fit without it.
-    effect : to be added.
-    report : called with a sentence at each step.
-
-    Returns
-    -------
-    before, after : Fit
-
-    Raises
-    ------
-    FitError
-        If the simulation of the model with the effect fails from every start.
+    """Fit a model without and with an effect, each from its best minimum, as the diagnosis does. Returns before, after
+    : Fit.
     """
     if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
         before = restart_exponents(before)

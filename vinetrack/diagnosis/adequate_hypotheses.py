@@ -21,29 +21,10 @@ MISFIT_REMAINS = "a significant misfit remains once it is added"
 def adequate_hypotheses(
     hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
 ) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
-    """Test the model with each hypothesis of the answer set added, and keep those that no test rejects.
-
-    A hypothesis that leaves a significant misfit is rejected, and no longer sets the likelihood that others are
-    compared with. If the whole answer set is rejected, the next hypotheses are tested, as far behind the best as
-    misjudged noise could have put them. Each is tested twice: with the film mass as stated, and free within its error.
-
-    Parameters
-    ----------
-    hypotheses : sequence of LikelihoodRatio
-        At least one.
-    search : CandidateFits
-        Runs the misfit tests of each fit, once.
-    sets : EffectSets, optional
-        Where the hypotheses are sets of effects.
-
-    Returns
-    -------
-    adequate : list of LikelihoodRatio
-        The likeliest first; empty where every hypothesis is rejected.
-    rejected : dict
-        Reason by label.
-    after : MisfitTests or None
-        Tests of the model with the first adequate hypothesis added.
+    """Test the model with each hypothesis of the answer set added, and keep those that no test rejects. A hypothesis
+    that leaves a significant misfit is rejected, and no longer sets the likelihood that others are compared with.
+    Returns adequate (the likeliest first; empty where every hypothesis is rejected), rejected (reason by label), after
+    (tests of the model with the first adequate hypothesis added).
     """
     in_answer_set, rejected = answer_set(hypotheses)
     best = best_of(hypotheses)
@@ -94,14 +75,5 @@ def _candidate_or_probe_rejects(tests: MisfitTests) -> bool:
 
 
 def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
-    """Whether the fitted sizes can be an explanation; with three effects or more all must be plausible.
-
-    Parameters
-    ----------
-    hypothesis : LikelihoodRatio
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the fitted sizes can be an explanation; with three effects or more all must be plausible."""
     return hypothesis.plausible and hypothesis.credible if len(hypothesis.effects) > 2 else hypothesis.credible

@@ -1,4 +1,5 @@
-"""Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.
+"""Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is
+confounded.
 
 Each hypothesis has several forms, of which the best counts: a drift of B, a drift of the pressure, or a step of the
 pressure from some trial on; specimens and days differ in B, in pressure, or in both. `between_trials` states the model
@@ -22,44 +23,21 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import EXPONENT, BetweenTerm, groups_of
 
-SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
-"""Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
-few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2 for each coefficient of a group."""
+SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0  # Standard deviation of ln B and of P_y among tubes of one kind
 
-DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03
-"""The same between days, and of ln P: film in air of another humidity, a gauge zeroed again, a regulator set again.
-Chosen: a gauge holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent; at half and twice as for
-specimens."""
+DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03  # The same between days, and of ln P (chosen)
 
-MIN_TRIALS_EACH_SIDE = 2
-"""Minimum number of trials before and after a change. Derived: a change of a single trial is its random deviation."""
+MIN_TRIALS_EACH_SIDE = 2  # Minimum number of trials before and after a change (derived)
 
-FEWEST_TRIALS = 6
-"""Number of trials from which drifts and changes are tested: with fewer, any order of a few pressures resembles any
-other. Chosen: with six, one order in 360 is strictly increasing or decreasing. At half chance orders pass for drifts,
-at twice small campaigns are never tested."""
+FEWEST_TRIALS = 6  # Number of trials from which drifts and changes are tested (chosen)
 
+# A difference is confounded with the conditions if its variance within conditions is below this fraction of that in
+# random order (1 on average) (chosen)
 CONFOUNDED_VARIANCE_SHARE = 0.5
-"""A difference is confounded with the conditions if its variance within conditions is below this fraction of that in
-random order (1 on average). Chosen: adjacent replicates give under 0.1, random order 0.6 to 1.3; at half both are still
-separated, at twice half of all random orders count as confounded."""
 
 
 def forms_of(fit: Fit, base: Solution) -> list[Difference]:
-    """List every form of every hypothesis that these trials can test.
-
-    Parameters
-    ----------
-    fit
-        The fit of the model.
-    base
-        Its solution, with smooth errors of position and of recorded pressures among its parameters.
-
-    Returns
-    -------
-    list of Difference
-        Without their gains; `n_forms` counts the forms of each hypothesis.
-    """
+    """List every form of every hypothesis that these trials can test."""
     trials = [trial.trial for trial in fit.trials]
     forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
     forms += _changes(fit, base, trials)
@@ -173,9 +151,8 @@ def _forms(
 
 
 def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Changes of tube where specimens are not stated: from some trial of each vine on, or with each condition.
-
-    A tube for each condition is possible only where replicates were made consecutively.
+    """Changes of tube where specimens are not stated: from some trial of each vine on, or with each condition. A tube
+    for each condition is possible only where replicates were made consecutively.
     """
     if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
         return []
@@ -207,19 +184,9 @@ def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> boo
 
 
 def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
-    """Whether regressors are confounded with the conditions: they hardly vary among replicates.
-
-    The criterion is the mean square within conditions over that within vines, 1 on average for trials in random order.
-    Without replicates they are always confounded.
-
-    Parameters
-    ----------
-    regressors : array, shape (n_trials, k)
-    trials : sequence of Trial
-
-    Returns
-    -------
-    bool
+    """Whether regressors are confounded with the conditions: they hardly vary among replicates. The criterion is the
+    mean square within conditions over that within vines, 1 on average for trials in random order. Without replicates
+    they are always confounded. Shapes: regressors (n_trials, k).
     """
     in_conditions, inner_degrees = _square_within(regressors, [trial.condition for trial in trials])
     in_vines, outer_degrees = _square_within(regressors, [trial.vine for trial in trials])

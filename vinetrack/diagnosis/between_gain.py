@@ -30,23 +30,7 @@ from vinetrack.inference.systematics import Systematics, recorded_pressures, sys
 
 @dataclass(frozen=True)
 class Difference:
-    """One hypothesis that trials differ.
-
-    Parameters
-    ----------
-    name
-        Of `result.BETWEEN_SUMMARIES`.
-    terms, shared
-        Coefficients that are added to the fit, and parameters that are shared differently.
-    stated
-        Whether the sheet states the columns that define it.
-    confounded
-        Whether it is confounded with the conditions, so that replicates cannot distinguish it from an effect of them.
-    ways
-        Number of forms of which it is the best, with the possible onsets counted.
-    gain, p
-        Predicted fall of −2 ln L (linear), and its p-value as the best of its forms.
-    """
+    """One hypothesis that trials differ."""
 
     name: str
     terms: tuple[BetweenTerm, ...] = ()
@@ -64,21 +48,9 @@ class Difference:
 
 
 def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
-    """p-value of a gain where trials do not differ.
-
-    For fixed coefficients by the F test, LR = N ln(1 + q F / dof), because χ² would be anticonservative for few trials.
-    For random effects exp(gain / 2) is a Bayes factor K, and P(K > 1/α) ≤ α by Markov's inequality.
-
-    Parameters
-    ----------
-    fit : the fit without the difference.
-    difference : the difference.
-    gain : fall of −2 ln L.
-
-    Returns
-    -------
-    float
-        0 to 1.
+    """p-value of a gain where trials do not differ. For fixed coefficients by the F test, LR = N ln(1 + q F / dof),
+    because χ² would be anticonservative for few trials. For random effects exp(gain / 2) is a Bayes factor K, and P(K >
+    1/α) ≤ α by Markov's inequality. Returns 0 to 1.
     """
     from scipy.stats import f as fisher
 
@@ -94,22 +66,9 @@ def gain_p_value(fit: Fit, difference: Difference, gain: float) -> float:
 
 
 def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[float, float] | None = None) -> float:
-    """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit.
-
-    The deviation of each trial is a column of the linear mixed model already, and the columns of the coefficients are
-    multiples of it.
-
-    Parameters
-    ----------
-    fit : the fit without the difference.
-    base : its solution, with smooth errors of position among its parameters where there are any.
-    difference : the difference.
-    spread : between-trial standard deviations of pressure and ln B; None to estimate them again.
-
-    Returns
-    -------
-    float
-        Fall of −2 ln L.
+    """Predicted fall of −2 ln L with a difference, from the sensitivities of the fit. The deviation of each trial is a
+    column of the linear mixed model already, and the columns of the coefficients are multiples of it. Returns fall of
+    −2 ln L.
     """
     cross_products, problem, state = _widened(fit, base, difference)
     before = marginal(base.cross_products, base.problem, base.state)
@@ -125,52 +84,19 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
 
 def with_shared_errors(fit: Fit, base: Solution) -> Solution:
     """Add the shared systematic errors of payloads, set pressures and trackers to a solution as nuisance parameters.
-
     They are common to all replicates of a condition. With enough replicates they exceed the scatter of trials, and
     would pass for a difference between groups of conditions.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    base : its solution, with smooth errors of position among its parameters where there are any.
-
-    Returns
-    -------
-    Solution
-        Each error has a prior of mean 0 and standard deviation 1; sensitivities stay those of the solution.
     """
     return with_errors(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
 
 
 def with_trace_errors(fit: Fit, base: Solution) -> Solution:
-    """Add the errors of recorded pressures to a solution as parameters, with the corrections of its fit undone.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    base : its solution, with smooth errors of position among its parameters where there are any.
-
-    Returns
-    -------
-    Solution
-        As from `with_shared_errors`.
-    """
+    """Add the errors of recorded pressures to a solution as parameters, with the corrections of its fit undone."""
     return with_errors(fit, base, recorded_pressures(fit.predictor, fit.solution))
 
 
 def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
-    """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    base : its solution, with smooth errors of position among its parameters where there are any.
-    errors : change of the positions by one standard deviation of each.
-
-    Returns
-    -------
-    Solution
-    """
+    """Add errors to a solution as parameters, each with a prior of mean 0 and standard deviation 1."""
     if not errors.n_columns:
         return base
     columns = [
@@ -191,25 +117,9 @@ def with_errors(fit: Fit, base: Solution, errors: Systematics) -> Solution:
 def gains_by_onset(
     fit: Fit, base: Solution, difference: Difference, members: Sequence[int], onsets: Iterable[int]
 ) -> list[float]:
-    """`linear_gain` of a difference for each of several onsets of its group.
-
-    Between-trial standard deviations stay those of the solution. The contribution of each trial to the sums over trials
-    is removed in turn, so that all onsets take little longer than one.
-
-    Parameters
-    ----------
-    fit : the fit without the difference.
-    base : its solution, with smooth errors of position among its parameters where there are any.
-    difference : the difference, with all members in the group.
-    members : sequence of int
-        Indices of the trials of the group, in the order in which they were made.
-    onsets : iterable of int
-        Positions among the members from which on a trial belongs to the group, increasing.
-
-    Returns
-    -------
-    list of float
-        Falls of −2 ln L.
+    """`linear_gain` of a difference for each of several onsets of its group. Between-trial standard deviations stay
+    those of the solution. The contribution of each trial to the sums over trials is removed in turn, so that all onsets
+    take little longer than one.
     """
     cross_products, problem, state = _widened(fit, base, difference)
     spread = base.state.spread
@@ -269,7 +179,6 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
 
 def _column_map(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
     """Matrices that map the columns of one layout to those of another, shape (n_trials, n_columns before, after).
-
     Columns are those of the trial effects, the keys, the shapes of smooth errors, and the residual.
     """
     count, size = len(old.keys), N_TRIAL_EFFECTS + len(layout.keys) + shapes + 1

@@ -6,13 +6,6 @@ physics that depends on the condition. Such differences are therefore hypotheses
 
     ln B_j          = ln B_vine + Σ_g a_g z_gj + u_j
     P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random effects of trials
-
-For a drift, z_gj is the number of earlier trials of the vine or specimen of trial j; for the pressure that of all
-earlier trials, as a supply empties or a regulator creeps, or 1 from some trial on, as a regulator is set again. For
-groups it is 1 in group g and 0 elsewhere; for the pressure 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y,
-which have the same effect on a force (P − P_y) A. Coefficients of groups are random effects with a prior and are
-integrated out of the likelihood, so that a hypothesis is penalised for each of its groups; a drift has one fixed
-coefficient. All are compared by Δχ², as effects are.
 """
 
 from __future__ import annotations
@@ -49,26 +42,18 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.position_errors import with_smooth_errors
 
+# Largest plausible drift of ln B and of ln P per trial, and step of ln P (chosen)
 PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
-"""Largest plausible drift of ln B and of ln P per trial, and step of ln P. Chosen: a tube whose B rises by 5 % a trial
-is worn out after ten; a supply that loses 1 % a trial has lost a fifth after twenty, which somebody would have seen on
-the gauge; a regulator is set to 5 %, as in `pressure_gain`."""
 
+# Predicted −2 ln L by which a difference may be behind the best hypothesis and still be fitted (chosen)
 MAX_GAIN_SHORTFALL = 40.0
-"""Predicted −2 ln L by which a difference may be behind the best hypothesis and still be fitted. Chosen: well above the
-answer set's 9 times the usual inflation of 1 to 3; twice as much only costs time."""
 
-MIN_LINEAR_GAIN = 2.0
-"""Predicted fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of the threshold."""
+MIN_LINEAR_GAIN = 2.0  # Predicted fall of −2 ln L below which a difference is not fitted (chosen)
 
+# p-value below which a difference is also tested with shared systematic errors in the model (chosen)
 SYSTEMATICS_CHECK_P_VALUE = 0.01
-"""p-value below which a difference is also tested with shared systematic errors in the model. Chosen for time: three
-times the level of the first round, so that at half and at twice every difference that could be significant is tested;
-with more nuisance parameters no difference becomes more significant."""
 
-FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30
-"""Iterations of the fit of a difference, at first and in all. Chosen for time; a fit that has not converged by then
-states so."""
+FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30  # Iterations of the fit of a difference, at first and in all (chosen)
 
 
 @dataclass(frozen=True)
@@ -91,18 +76,7 @@ class BetweenRatio(LikelihoodRatio):
 
 
 def differences(fit: Fit) -> list[Difference]:
-    """Hypotheses that trials differ, with their predicted gains and p-values.
-
-    Parameters
-    ----------
-    fit
-        The fit of the model.
-
-    Returns
-    -------
-    list
-        Of each hypothesis the form (B, pressure, both) with the largest gain.
-    """
+    """Hypotheses that trials differ, with their predicted gains and p-values."""
     if DAMPING not in fit.predictor.layout.keys:
         return []
     plain = with_smooth_errors(fit)
@@ -118,22 +92,9 @@ def differences(fit: Fit) -> list[Difference]:
 
 
 def significant(estimated: Sequence[Difference], level: float) -> list[Difference]:
-    """Significant differences that are confounded with the conditions, so that they could pass for physics.
-
-    Random order and replicates separate a difference from the conditions; it is then a random deviation of the trials,
-    which the fit includes. Differences by a column of the sheet make a model inadequate. Others follow the order of the
-    rows, which need not be that of the trials: they affect no verdict and are reported beside an adequate model.
-
-    Parameters
-    ----------
-    estimated : sequence of Difference
-        From `differences`.
-    level : float
-        Family-wise false-alarm probability (Bonferroni).
-
-    Returns
-    -------
-    list of Difference
+    """Significant differences that are confounded with the conditions, so that they could pass for physics. Random
+    order and replicates separate a difference from the conditions; it is then a random deviation of the trials, which
+    the fit includes. Differences by a column of the sheet make a model inadequate.
     """
     return [difference for difference in estimated if difference.confounded and difference.p < level / len(estimated)]
 
@@ -141,23 +102,7 @@ def significant(estimated: Sequence[Difference], level: float) -> list[Differenc
 def between_fits(
     before: Fit, estimated: Sequence[Difference], best: float, report: Callable[[str], None]
 ) -> list[LikelihoodRatio]:
-    """Fit the differences whose predicted gain is near the best Δχ² of the effects.
-
-    Parameters
-    ----------
-    before
-        The fit of the model.
-    estimated : sequence of Difference
-        From `differences`.
-    best : float
-        Largest Δχ² of the effects.
-    report : callable
-        Called with a sentence at each fit.
-
-    Returns
-    -------
-    list of LikelihoodRatio
-    """
+    """Fit the differences whose predicted gain is near the best Δχ² of the effects."""
     fitted: list[LikelihoodRatio] = []
     for difference in estimated:
         if difference.gain < MIN_LINEAR_GAIN or difference.gain < best - max(MAX_GAIN_SHORTFALL, 0.3 * best):
@@ -176,10 +121,9 @@ def between_fits(
 
 
 def _widened_by(difference: Difference) -> tuple[str, ...]:
-    """Names of the sizes whose scatter between trials reduces the significance of a difference.
-
-    Those of its parameters; but the coefficient of a random effect depends on the few trials of its group only, and its
-    robust standard error is meaningless.
+    """Names of the sizes whose scatter between trials reduces the significance of a difference. Those of its
+    parameters; but the coefficient of a random effect depends on the few trials of its group only, and its robust
+    standard error is meaningless.
     """
     random = any(math.isfinite(term.prior_sd) for term in difference.terms)
     return () if random else (difference.name, *difference.shared)
@@ -234,21 +178,7 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
 def between_candidates(
     fitted: Sequence[LikelihoodRatio], answer: Sequence[str], rejected: Mapping[str, str]
 ) -> list[Candidate]:
-    """Rows of the ranking of candidates for the differences that were fitted.
-
-    Parameters
-    ----------
-    fitted : sequence of LikelihoodRatio
-        Hypotheses that were fitted.
-    answer : sequence of str
-        Names in the answer set.
-    rejected : mapping
-        Reasons of rejection, by name.
-
-    Returns
-    -------
-    list of Candidate
-    """
+    """Rows of the ranking of candidates for the differences that were fitted."""
     return [
         Candidate(
             hypothesis.names[0],

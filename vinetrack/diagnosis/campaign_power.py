@@ -24,26 +24,11 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.planning.campaign_information import FilmingPlan
 from vinetrack.planning.simulated_campaigns import make
 
-NOISELESS = 1e-3
-"""Part of the stated noise that the noise-free campaign has. Chosen: the noise of a track is estimated and must not be
-0; a thousandth moves no parameter by more than a thousandth of its error."""
+NOISELESS = 1e-3  # Part of the stated noise that the noise-free campaign has (chosen)
 
 
 def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequence[PowerInput] = ()) -> Power:
-    """Compute which effects outside its model the trials of a fit can detect.
-
-    Parameters
-    ----------
-    fitted : of the trials; from a host of the candidates, so that no kernel is compiled anew.
-    candidates : sequence of str, optional
-        Names of effects; the catalogue where None.
-    inputs : sequence of PowerInput
-        What the power is based on, with its origin; noise and between-trial scatter of the fit where empty.
-
-    Returns
-    -------
-    Power
-    """
+    """Compute which effects outside its model the trials of a fit can detect."""
     candidates_to_test = candidates_of(fitted.model, candidates, fitted.model.user_effects)
     effects, not_testable = testable(candidates_to_test, fitted.predictor.data)
     tests = misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND)
@@ -51,23 +36,7 @@ def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequ
 
 
 def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> Power:
-    """Compute which effects a planned campaign could detect.
-
-    Parameters
-    ----------
-    design : of the campaign.
-    inputs : sequence of PowerInput
-        Its noise and scatter, and where they come from.
-
-    Returns
-    -------
-    Power
-
-    Raises
-    ------
-    FitError
-        If no trial of the design can be fitted.
-    """
+    """Compute which effects a planned campaign could detect."""
     tests, not_testable = planned_tests(design)
     return power_of(tests, not_testable, inputs, nonlinear=True)
 
@@ -75,11 +44,8 @@ def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> P
 @dataclass(frozen=True)
 class CampaignDesign:
     """What a campaign is simulated from: the true model with its values, trials, cameras, between-trial scatter.
-
     `cameras`, `slow_error_m` and `has_trace` are given for each trial: how it is filmed, the slow error that its
-    tracker states (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names
-    of effects, the catalogue where None. `other_values` are the values, SI, of the parameters of an effect after its
-    first, by its name, as in `EffectPower`.
+    tracker states (NaN for positions measured elsewhere), and whether its pressure is measured.
     """
 
     model: Model
@@ -99,18 +65,7 @@ class CampaignDesign:
         return replace(self.model, values={key: self.model.values[key] for key in held if key in self.model.values})
 
     def with_effect(self, name: str, value: float) -> CampaignDesign:
-        """The same design with an effect in the true model that the fitted one lacks.
-
-        Parameters
-        ----------
-        name : of the effect.
-        value : of its first parameter, SI.
-
-        Returns
-        -------
-        CampaignDesign
-            Its further parameters are those of `other_values`, else in the middle of the plausible range.
-        """
+        """The same design with an effect in the true model that the fitted one lacks."""
         model = self.model + name
         effect = next(effect for effect in model if effect.name == name)
         if not effect.parameters:
@@ -122,18 +77,7 @@ class CampaignDesign:
 
 
 def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> CampaignDesign:
-    """The design of a fitted campaign, with its model as the truth and its noise and scatter as estimated.
-
-    Parameters
-    ----------
-    fitted : of a campaign.
-    candidates : sequence of str, optional
-        Names of the effects that a diagnosis would test.
-
-    Returns
-    -------
-    CampaignDesign
-    """
+    """The design of a fitted campaign, with its model as the truth and its noise and scatter as estimated."""
     data = fitted.predictor.data
     variance = fitted.state.variance / (1 - fitted.state.rho**2)
     cameras = [
@@ -160,23 +104,9 @@ def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> Campa
 
 
 def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
-    """Misfit tests of a noise-free campaign with all candidates, under the noise and scatter of its design.
-
-    Parameters
-    ----------
-    design : of a planned campaign.
-
-    Returns
-    -------
-    tests : MisfitTests
-        Its scores are zero but for rounding; its information is what the campaign would have.
-    not_testable : dict
-        Reasons by name of the candidates that cannot act with this sheet.
-
-    Raises
-    ------
-    FitError
-        If no trial of the design can be fitted.
+    """Misfit tests of a noise-free campaign with all candidates, under the noise and scatter of its design. Returns
+    tests (its scores are zero but for rounding; its information is what the campaign would have), not_testable (reasons
+    by name of the candidates that cannot act with this sheet).
     """
     candidates_to_test = candidates_of(design.model, design.candidates, design.model.user_effects)
     host = host_for(design.model, candidates_to_test)
@@ -214,18 +144,7 @@ def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
 
 
 def with_measurement_errors(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
-    """Give tracks the slow error that a tracker states, and the pressure trace where the campaign measures it.
-
-    Parameters
-    ----------
-    design : of the campaign.
-    pairs : sequence of (Trial, Track)
-        Of its trials, in order.
-
-    Returns
-    -------
-    list of (Trial, Track)
-    """
+    """Give tracks the slow error that a tracker states, and the pressure trace where the campaign measures it."""
     measured = []
     for (trial, track), slow_m, has_trace in zip(pairs, design.slow_error_m, design.has_trace, strict=True):
         stated = np.full(track.time_s.size, slow_m)

@@ -45,81 +45,46 @@ from vinetrack.inference.fit import FitError, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.goodness_of_fit import POOR_FIT, is_poor_fit
 
-Report = Callable[[str], None]
-"""Called with a few words on what is being done."""
+Report = Callable[[str], None]  # Called with a few words on what is being done
 
+# Largest predicted Δχ² at which linear predictions are still good to a per cent (measured)
 LINEAR_PREDICTION_LIMIT = 100.0
-"""Largest predicted Δχ² at which linear predictions are still good to a per cent, so that no subset fits are needed.
-Measured in trials of the method: for weak effects the linear Δχ² predicts the refitted one to 0.1 %, for strong ones
-√LR 22 against 25, 65 against 17."""
 
-MIN_SHARE_OF_SUBSET_GAIN = 0.1
-"""Share of the subset fit's gain that the fit to all trials must reach; otherwise it is repeated from other starts.
-Chosen: a fit to all trials gains a multiple of what a subset gains; at half fewer, at twice more fits are repeated
-(time)."""
+MIN_SHARE_OF_SUBSET_GAIN = 0.1  # Share of the subset fit's gain that the fit to all trials must reach (chosen)
 
-FAILED_FIT_DELTA_CHI2 = -1.0
-"""Δχ² of an added effect below which its fit has failed. Derived: the maximum likelihood of a model is at least that of
-a model nested in it. 1 allows for rounding, for unsettled iterations and for the noise, which is estimated by the
-restricted likelihood and so does not maximise the one compared here."""
+FAILED_FIT_DELTA_CHI2 = -1.0  # Δχ² of an added effect below which its fit has failed (derived)
 
-SAME_MINIMUM_PER_POINT = 0.01
-"""Δχ² per point below which two fits that are far off count as the same minimum. Derived: −2 ln L of n points with
-noise s is n ln s², so their misfits agree to half a per cent; such fits end before they have settled. At half more
-starts are tried (time), at twice fewer."""
+SAME_MINIMUM_PER_POINT = 0.01  # Δχ² per point below which two fits that are far off count as the same minimum (derived)
 
+# Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted (chosen)
 LINEAR_REACH, LINEAR_REACH_SHARE, MAX_LINEAR_REACH_SHARE = 16.0, 0.4, 0.75
-"""Δχ² by which an effect's predicted gain may fall short of the best one's for it still to be fitted: the first number,
-or the second's share of the best gain where that is more, but never more than the third's share of it. Chosen: 16 is
-nearly twice the difference within which a hypothesis belongs to the answer set, for linear predictions err; the shares
-are for time, so that strong effects are compared with all that gain more than 60 % of what they do, and weak ones with
-none that gains less than a quarter. At half fewer, at twice more are fitted."""
 
+# Share of its predicted gain that a fit to all trials must reach for no other shape of the effect to be tried (chosen)
 PREDICTED_GAIN_SHARE = 0.7
-"""Share of its predicted gain that a fit to all trials must reach for no other shape of the effect to be tried. Chosen:
-the linear prediction of a strong effect errs by a quarter of Δχ² (√LR 22 against 25, see LINEAR_PREDICTION_LIMIT). At
-half a fit that ended in a local minimum stands, at twice every effect is fitted from all of its starts (time)."""
 
-ALIKE_COSINE = 0.95
-"""Cosine from which two effects count as alike. Chosen: with one of them in the model, a tenth of the information on
-the other is left (1 − 0.95²)."""
+ALIKE_COSINE = 0.95  # Cosine from which two effects count as alike (chosen)
 
-MIN_SHARE_OF_BEST_PREDICTION = 0.2
-"""Share of the best predicted gain from which an effect is fitted. Chosen: at half more subset fits cost time, at twice
-an effect whose linear prediction errs is missed."""
+MIN_SHARE_OF_BEST_PREDICTION = 0.2  # Share of the best predicted gain from which an effect is fitted (chosen)
 
-MIN_SUBSET_FITS, HIGHEST_SCORES = 5, 4
-"""Number of effects fitted to the subset in any case: those of the largest predicted gain and those of the highest
-score, for the misfit of a model that is far off may show in only one of them. Chosen for time: 5 and 4 of about 20
-candidates."""
+MIN_SUBSET_FITS, HIGHEST_SCORES = 5, 4  # Number of effects fitted to the subset in any case (chosen)
 
+# −2 ln L by which a subset fit may end behind the best and still be fitted to all trials (chosen)
 SUBSET_REACH, SUBSET_REACH_SHARE, ALIKE_REACH_FACTOR = 40.0, 0.1, 5.0
-"""−2 ln L by which a subset fit may end behind the best and still be fitted to all trials: this value or this share of
-the best one's gain, times the third number if the two effects are alike. Chosen: far more than chance explains (40 on
-a third of the trials is about 120 on all), because subset fits are short, with noise correlation and between-trial
-standard deviations fixed, and may end in a local minimum. At half a right answer may be dropped, at twice time
-grows."""
 
-MAX_FULL_FITS = 7
-"""Candidates fitted to all trials after their subset fits, at most. Chosen for time."""
+MAX_FULL_FITS = 7  # Candidates fitted to all trials after their subset fits, at most (chosen)
 
-STARTS_PER_EFFECT = 3
-"""Shapes of an effect from which it is fitted. Chosen for time."""
+STARTS_PER_EFFECT = 3  # Shapes of an effect from which it is fitted (chosen)
 
+# Share of the best gain below which a hypothesis that still misses a visible part of the growth is not fitted from its
+# other shapes, if subset fits tried them (chosen)
 HOPELESS_GAIN_SHARE = 0.5
-"""Share of the best gain below which a hypothesis that still misses a visible part of the growth is not fitted from its
-other shapes, if subset fits tried them. Chosen for time: most fits of a model that is far off are such; at half fewer
-are spared, at twice every poor one is."""
 
 
 @dataclass
 class CandidateFits:
-    """Fits of single effects added to one model. Subset fits and full fits are made once each.
-
-    `subset_fits` and `fitted` (full fits) are by name; `failed` are effects whose fits failed, `same_minimum` those
-    whose other starts ended in the same minimum. `started` holds the starts of full fits (effects, values, whether the
-    state was reset) and whether a poor fit was rescued. `nested_checked`, `nested_labels` and `nested_tried` keep track
-    of simpler forms: fits whose simpler forms were fitted, hypotheses that resulted, and forms tried.
+    """Fits of single effects added to one model. Subset fits and full fits are made once each. `subset_fits` and
+    `fitted` (full fits) are by name; `failed` are effects whose fits failed, `same_minimum` those whose other starts
+    ended in the same minimum.
     """
 
     tests: MisfitTests
@@ -163,18 +128,7 @@ class CandidateFits:
         return any(hypothesis.fit.chi2_per_dof < SEARCH_CHI2_PER_DOF for hypothesis in self.fitted.values())
 
     def tests_after(self, fit: Fit, *, film: bool = False) -> MisfitTests:
-        """Run the misfit tests of one of the fits, at the level of later rounds.
-
-        Parameters
-        ----------
-        fit : the fit of a hypothesis.
-        film : whether the film mass of each vine is a nuisance parameter.
-
-        Returns
-        -------
-        MisfitTests
-            Kept and returned again for the same fit; of many trials only the last ones are kept.
-        """
+        """Run the misfit tests of one of the fits, at the level of later rounds."""
         for tested_fit, with_film, tests in self.tests_by_fit:
             if tested_fit is fit and with_film == film:
                 return tests
@@ -185,17 +139,7 @@ class CandidateFits:
         return tests
 
     def fit_singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
-        """Fit each effect alone that may be the best or near it.
-
-        Parameters
-        ----------
-        all_of_them : bool
-            Make a subset fit of every candidate, and a full fit of each that ends within reach of the best.
-
-        Returns
-        -------
-        list of LikelihoodRatio
-        """
+        """Fit each effect alone that may be the best or near it."""
         if self.linear_prediction_holds:
             return self._fit_predicted(all_of_them=all_of_them)
         self._fit_subsets(self.names if all_of_them else self._worth_a_subset_fit())
@@ -221,19 +165,9 @@ class CandidateFits:
         return list(self.fitted.values())
 
     def fit_to_all_trials(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
-        """Fit candidates of large predicted gain, or all, to all trials whatever their subset fits gave.
-
-        A subset fit may end in a local minimum. And a model whose parameters have adapted to the lack of an effect may
-        predict no gain for it, not even the right sign.
-
-        Parameters
-        ----------
-        all_of_them : also those whose predicted gain is a small part of the best one's.
-
-        Returns
-        -------
-        list of LikelihoodRatio
-            All hypotheses fitted so far.
+        """Fit candidates of large predicted gain, or all, to all trials whatever their subset fits gave. A subset fit
+        may end in a local minimum. And a model whose parameters have adapted to the lack of an effect may predict no
+        gain for it, not even the right sign.
         """
         top = self.tests.predicted_gain(self.names[0]) if self.names else 0.0
         for name in self.names:
@@ -244,9 +178,8 @@ class CandidateFits:
         return list(self.fitted.values())
 
     def _refit_rivals_from_best(self) -> None:
-        """Refit hypotheses just outside the answer set from where the best ended: its releases may suit them too.
-
-        Where trials begin slowly, a minute difference between starts may decide which minimum a fit settles in.
+        """Refit hypotheses just outside the answer set from where the best ended: its releases may suit them too. Where
+        trials begin slowly, a minute difference between starts may decide which minimum a fit settles in.
         """
         credible = self.credible_fits
         if not credible or is_poor_fit((best := best_of(credible)).fit.predictor, best.fit.solution):
@@ -267,9 +200,8 @@ class CandidateFits:
                     self.fitted[rival.label] = likelihood_ratio(self.tests.fit, rival.effects, fit)
 
     def _fit_simpler_forms(self) -> None:
-        """Fit the simpler forms of effects that contain one, from where the larger form ended.
-
-        A larger form that is out of the running is skipped: the simpler form is nested in it and fits no better.
+        """Fit the simpler forms of effects that contain one, from where the larger form ended. A larger form that is
+        out of the running is skipped: the simpler form is nested in it and fits no better.
         """
         before = self.tests.fit
         best = max((hypothesis.fit.log_likelihood for hypothesis in self.fitted.values()), default=0.0)
@@ -394,10 +326,9 @@ class CandidateFits:
     def _restarted(
         self, start: SubsetFit, hypothesis: LikelihoodRatio, best: float, *, rescue: bool
     ) -> LikelihoodRatio:
-        """Return the best fit of a hypothesis over this and other starts, in case the first start misled it.
-
-        The first restart is from sizes at which it hardly acts, or from the same values with the state reset where it
-        began there. If that ends in the same minimum, the start is not to blame, and no other start is tried.
+        """Return the best fit of a hypothesis over this and other starts, in case the first start misled it. The first
+        restart is from sizes at which it hardly acts, or from the same values with the state reset where it began
+        there. If that ends in the same minimum, the start is not to blame, and no other start is tried.
         """
         name = "+".join(start.names)
         if name in self.same_minimum:

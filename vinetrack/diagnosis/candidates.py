@@ -16,27 +16,22 @@ from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import group_names
 
-WIDE_RANGE = 10.0
-"""Ratio of the ends of a plausible range from which values are tried in geometric steps. Chosen: within a factor of ten
-a linear scale meets every size within a factor of two."""
+WIDE_RANGE = 10.0  # Ratio of the ends of a plausible range from which values are tried in geometric steps (chosen)
 
+# Where the ends of a plausible range differ by more than the first factor, a size may lie below it by the second
+# (chosen)
 NARROW_RANGE, BELOW_RANGE_FACTOR = 2.0, 3.0
-"""Where the ends of a plausible range differ by more than the first factor, a size may lie below it by the second.
-Chosen: such a range is no reason to exclude small sizes."""
 
+# Fractions of the plausible range at which an effect is tried that has no response to an infinitesimal size (chosen)
 AMPLITUDES = (0.03, 0.2, 0.7)
-"""Fractions of the plausible range at which an effect is tried that has no response to an infinitesimal size. Chosen:
-near zero, small, large."""
 
+# The same for an effect with a threshold (chosen)
 THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
-"""The same for an effect with a threshold: its response jumps, and a fit started too far below or above does not
-converge. Chosen: steps of about 1.3, less than the width of the jump."""
 
+# Fraction of the plausible range within which a size may differ from that of a slip in the sheet (chosen)
 RANGE_SHARE_BESIDE_SLIP = 0.5
-"""Fraction of the plausible range within which a size may differ from that of a slip in the sheet. Chosen: a slip and a
-large error together are rare; at twice film that is 60 % too heavy would pass for half of its thickness, at half a tube
-measured flat that is 2 % off would be missed."""
 
+# Columns that only a tube has, and what an effect that needs them acts on
 TUBE_ONLY_COLUMNS = {
     "length_mm": "a tube",
     "thickness_um": "film",
@@ -44,16 +39,13 @@ TUBE_ONLY_COLUMNS = {
     "inlet_mm": "the gas of a chamber",
     "yield_pressure_kPa": "a tube under pressure",
 }
-"""Columns that only a tube has, and what an effect that needs them acts on."""
 
 
 @dataclass(frozen=True)
 class CandidateShape:
-    """An effect in the form in which its size is tested: the first parameter is the size, the others are fixed.
-
-    The others are fixed at `other_values`. `step` is the step of the size in the finite difference. Where `whole`, the
-    step is a finite size, because the effect has no or another response to small sizes. With `group`, the effect acts
-    on the trials of that vine or day only; `other_groups` are those without it.
+    """An effect in the form in which its size is tested: the first parameter is the size, the others are fixed. The
+    others are fixed at `other_values`. `step` is the step of the size in the finite difference. Where `whole`, the step
+    is a finite size, because the effect has no or another response to small sizes.
     """
 
     effect: Effect
@@ -75,18 +67,8 @@ class CandidateShape:
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
-    """Candidates that these trials can test, and for the others the reason why not.
-
-    Parameters
-    ----------
-    candidates : sequence of Effect
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    testable : tuple of Effect
-    reasons : dict
-        Why each of the others cannot be tested, by name.
+    """Candidates that these trials can test, and for the others the reason why not. Returns testable, reasons (why each
+    of the others cannot be tested, by name).
     """
     can_act, reasons = [], {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
@@ -118,20 +100,8 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
 
 
 def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
-    """Shapes in which an effect is tried: every combination of typical values of its shape parameters.
-
-    An effect whose size may differ between vines or days is tried with one size for all, and in each group alone.
-
-    Parameters
-    ----------
-    effect
-        An effect of the catalogue or of the user.
-    trials : sequence of Trial
-        The trials of the fit.
-
-    Returns
-    -------
-    list of CandidateShape
+    """Shapes in which an effect is tried: every combination of typical values of its shape parameters. An effect whose
+    size may differ between vines or days is tried with one size for all, and in each group alone.
     """
     if not effect.parameters:
         return [CandidateShape(effect, (), 1.0, whole=True)]
@@ -151,19 +121,7 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
 
 
 def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
-    """Shapes of an effect at finite sizes within its plausible range.
-
-    Parameters
-    ----------
-    effect
-        An effect of the catalogue or of the user.
-    other_values : sequence of tuple of float
-        Values of the parameters after the first, SI, one tuple for each combination.
-
-    Returns
-    -------
-    list of CandidateShape
-    """
+    """Shapes of an effect at finite sizes within its plausible range."""
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
@@ -183,15 +141,7 @@ def _first_step(size: Parameter) -> float:
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
     """Plausible range of a parameter; where the effect states none, three times its default on either side of zero.
-
-    Parameters
-    ----------
-    parameter
-        Of an effect.
-
-    Returns
-    -------
-    low, high : float, SI
+    Returns low, high : float, SI.
     """
     if parameter.plausible is not None:
         return parameter.plausible
@@ -213,21 +163,8 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
 
 
 def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0) -> tuple[float, str] | None:
-    """Find the common slip in the sheet that would produce a fitted size, up to an ordinary error.
-
-    Parameters
-    ----------
-    parameter
-        Of an effect.
-    value, sigma : float
-        Size, a relative error, and its standard error.
-    reach : float
-        Standard errors by which the remaining error may lie outside its range.
-
-    Returns
-    -------
-    (float, str) or None
-        Size that the slip produces, and what was done; None where no slip fits.
+    """Find the common slip in the sheet that would produce a fitted size, up to an ordinary error. Returns (float, str)
+    or None: Size that the slip produces, and what was done; None where no slip fits.
     """
     if parameter.plausible is None:
         return None
@@ -240,23 +177,7 @@ def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 
 
 
 def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, within `reach` standard errors of it, or is that of a slip.
-
-    Parameters
-    ----------
-    parameter
-        Of an effect.
-    value, sigma : float, SI
-        Size and its standard error.
-    reach : float
-        Standard errors by which a value may lie outside the range.
-    widened : float
-        Factor by which the range is widened.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a value lies in the plausible range, within `reach` standard errors of it, or is that of a slip."""
     if (
         parameter.plausible is None
         or value == parameter.zero

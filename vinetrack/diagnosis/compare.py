@@ -6,9 +6,7 @@ filmed, minimise the root mean square error. Replicates are aligned with their m
 so that a model which lacks nothing has an error equal to the replicate floor, a ratio of 1.
 
 The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of the
-final speed of the leading edge. A vine that stops and starts again is simulated through every stop, but the corners of
-such a motion may differ by a frame between model and measurement, and its replicates are then not merely shifted
-against each other: the floor counts this as scatter.
+final speed of the leading edge.
 """
 
 from __future__ import annotations
@@ -58,25 +56,20 @@ TRAJECTORY_COLUMNS = (
     "replicates_sigma_m",
 )
 
-FINAL_AT_FRACTION = 0.95
-"""Fraction of the length, or of the part seen, at which the final speed is taken: the speed of a vine without payload
-changes along the growth. Chosen as END_FRACTION of the fit."""
+FINAL_AT_FRACTION = 0.95  # Fraction of the length, or of the part seen, at which the final speed is taken (chosen)
 
+# Duration of the simulation, in durations of the recording, so that a slow model reaches the same position (chosen)
 MAX_DURATION_FACTOR = 3.0
-"""Duration of the simulation, in durations of the recording, so that a slow model reaches the same position. Chosen as
-a safeguard: a model three times slower has failed in any case."""
 
+# Fraction of the growth's duration over which the residual is averaged before its maximum is found (chosen)
 SMOOTHED_SHARE = 0.05
-"""Fraction of the growth's duration over which the residual is averaged before its maximum is found, so that the noise
-of one frame is not. Chosen: a twentieth averages 5 to 50 frames."""
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`.
-
-    `trajectories` holds the trials of each condition with the model's prediction, columns `TRAJECTORY_COLUMNS`, with
-    time since release and position from the origin. `trials` are the predictions.
+    """Result of `compare`: `table` has one row for each condition, columns `COMPARISON_COLUMNS`. `trajectories` holds
+    the trials of each condition with the model's prediction, columns `TRAJECTORY_COLUMNS`, with time since release and
+    position from the origin. `trials` are the predictions.
     """
 
     table: pd.DataFrame
@@ -84,17 +77,7 @@ class Comparison:
     trials: tuple[TrialFit, ...]
 
     def plot(self, name: str = "model_comparison") -> Figure:
-        """Return a figure of the report: `model_comparison` or `model_residuals`.
-
-        Parameters
-        ----------
-        name : str
-            Name of the figure.
-
-        Returns
-        -------
-        Figure
-        """
+        """Return a figure of the report: `model_comparison` or `model_residuals`."""
         return plot(self, name)
 
     def __repr__(self) -> str:
@@ -113,30 +96,7 @@ def compare(
     kinematics: Mapping[str, Kinematics] | None = None,
     final_at_fraction: float = FINAL_AT_FRACTION,
 ) -> Comparison:
-    """Compare a fitted model with the trials of an experiment.
-
-    Parameters
-    ----------
-    fit : the fitted model.
-    experiment : an experiment or its folder, or pairs of trial and track; trials that the fit did not use are skipped.
-    tracks : mapping, optional
-        Tracks by name of trial, where the experiment brings recordings.
-    kinematics : mapping, optional
-        By name of trial, where known already; otherwise estimated from the tracks.
-    final_at_fraction : float
-        Fraction of the length, or of the part seen, at which the final speed is taken.
-
-    Returns
-    -------
-    Comparison
-
-    Raises
-    ------
-    FitError
-        If the simulation of the model fails.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Compare a fitted model with the trials of an experiment."""
     import pandas as pd
 
     fitted = {trial.name for trial in fit.trials}
@@ -161,18 +121,8 @@ def compare(
 
 
 def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[str, float]:
-    """Position errors of one condition in motion, with equal weight for every trial, however many its frames.
-
-    Parameters
-    ----------
-    trials : sequence of TrialFit
-        Of one condition, as predicted.
-    together : the same trials on one clock.
-
-    Returns
-    -------
-    dict of float
-        Columns of `comparison.csv`: m, s and ratios.
+    """Position errors of one condition in motion, with equal weight for every trial, however many its frames. Returns
+    columns of `comparison.csv`: m, s and ratios.
     """
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
     rms_m = math.sqrt(float(np.mean(squares)))
@@ -209,9 +159,8 @@ def _final_speed_errors(
     kinematics: Mapping[str, Kinematics],
     at_fraction: float = FINAL_AT_FRACTION,
 ) -> dict[str, float]:
-    """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position.
-
-    A model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.
+    """Model minus measurement of the leading edge's final speed, m/s, by name of trial, both at the same position. A
+    model that does not reach the position has stopped, and its speed there is 0. NaN where none was measured.
     """
     times = [MAX_DURATION_FACTOR * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
@@ -240,18 +189,7 @@ def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats
 
 def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.DataFrame:
     """Trials of one condition with the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
-
     `replicates_mean_m` is the mean of the replicates at that time, `replicates_sigma_m` their standard deviation.
-
-    Parameters
-    ----------
-    trials : sequence of TrialFit
-        Of one condition, as predicted.
-    together : the same trials on one clock.
-
-    Returns
-    -------
-    DataFrame
     """
     import pandas as pd
 

@@ -22,30 +22,16 @@ from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Number
 
-MIN_SHIFT_SIGMAS = 1.0
-"""Shift, in standard errors of the size, from which a confounder is reported. Chosen: a shift of one standard error
-leaves a 95 % interval a coverage of 83 %; at half (92 %) every correlated pair is listed, at twice (48 %) an interval
-misses the truth without warning."""
+MIN_SHIFT_SIGMAS = 1.0  # Shift, in standard errors of the size, from which a confounder is reported (chosen)
 
-MAX_LISTED = 3
-"""Confounders listed for each size. Chosen: more make a sentence unreadable; further ones are weaker."""
+MAX_LISTED = 3  # Confounders listed for each size (chosen)
 
-TWO_SIDED_95 = 1.959964
-"""Derived: quantile of the normal distribution."""
+TWO_SIDED_95 = 1.959964  # Derived: quantile of the normal distribution
 
 
 def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
-    """Find, for each size of the added effects, the physical effects that it may include.
-
-    Parameters
-    ----------
-    after : tests of the fit with the effects added, for all other candidates.
-    added : names of the effects whose sizes are examined.
-
-    Returns
-    -------
-    tuple of Confounder
-        For each size, those that could shift it by more than its standard error, the largest first.
+    """Find, for each size of the added effects, the physical effects that it may include. Returns for each size, those
+    that could shift it by more than its standard error, the largest first.
     """
     if after.poorly_fitted or not after.sensitivities.shapes:
         return ()
@@ -115,18 +101,8 @@ def _quantile(number: Number) -> float:
 
 
 def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
-    """Combine the estimate of a size with its plausible range (truncated normal posterior).
-
-    Parameters
-    ----------
-    estimate, sigma : one-step estimate of the size, from its value without effect, and its standard error, SI.
-    parameter : the size, with its plausible range and sign.
-
-    Returns
-    -------
-    mean, sd, limit : float
-        Of the posterior, from the value without effect; the limit is its 5 % or 95 % quantile, whichever is farther
-        from zero.
+    """Combine the estimate of a size with its plausible range (truncated normal posterior). Returns mean, sd, limit :
+    float.
     """
     from scipy.stats import truncnorm
 

@@ -12,21 +12,7 @@ from vinetrack.inference.fit_result import Number
 
 @dataclass(frozen=True)
 class Confounder:
-    """Another effect that a fitted size may include.
-
-    Parameters
-    ----------
-    number
-        The fitted size, as the model without the other effect gives it, SI.
-    effect, symbol, unit
-        The other effect and its size.
-    limit
-        Upper limit of its size from data and plausible range, one-sided 95 %, SI.
-    value
-        The fitted size if the other effect were at its limit, SI.
-    low_95, high_95
-        Interval of the fitted size with the other effect's size left free, SI; never narrower than that of `number`.
-    """
+    """Another effect that a fitted size may include."""
 
     number: Number
     effect: str
@@ -53,31 +39,13 @@ class Confounder:
 
 
 def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
-    """The 95 % interval of a size with each of these effects left free (hull).
-
-    Parameters
-    ----------
-    alike : all of the same size, at least one.
-
-    Returns
-    -------
-    low, high : SI.
-    """
+    """The 95 % interval of a size with each of these effects left free (hull). Returns low, high : SI."""
     return min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
 
 
 def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
-    """Read confounders from a file, each with the size that it concerns.
-
-    Parameters
-    ----------
-    entries : of `confounded_by`.
-    numbers : sizes of the candidate that the entries belong to.
-
-    Returns
-    -------
-    tuple of Confounder
-        Without those whose size is missing from `numbers`.
+    """Read confounders from a file, each with the size that it concerns. Returns without those whose size is missing
+    from `numbers`.
     """
     of = {(number.key, number.vine): number for number in numbers}
     return tuple(

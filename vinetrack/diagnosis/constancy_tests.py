@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates
 
-FEWEST_DEGREES = 2
-"""Degrees of freedom of replicates from which they determine the scatter of estimates; with fewer, the residuals of the
-trend do. Chosen: two degrees of freedom determine a scatter to a factor of two, which Student's t allows for."""
+FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)
 
 
-LEAST_SCATTER = 0.1
-"""Least scatter of replicates, as part of the expected scatter of pressure and B; closer agreement counts as chance.
-Chosen: a tenth of a usual scatter; with few replicates chance agreement would make any trend significant."""
+LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
 
 
 @dataclass(frozen=True)
@@ -32,43 +28,15 @@ class Covariate:
     logarithmic: bool
 
     def level(self, trial: Trial) -> float:
-        """The nominal value for a trial, SI.
-
-        Parameters
-        ----------
-        trial
-            Row of the sheet.
-
-        Returns
-        -------
-        float, SI
-        """
+        """The nominal value for a trial, SI."""
         return float(getattr(trial, self.column))
 
     def coordinate(self, levels: Floats) -> Floats:
-        """The coordinate in which a trend is linear.
-
-        Parameters
-        ----------
-        levels : array, shape (n_trials,), SI
-
-        Returns
-        -------
-        array, shape (n_trials,)
-        """
+        """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
         return np.log(levels) if self.logarithmic and np.all(levels > 0) else levels
 
     def formatted(self, level: float) -> str:
-        """A level with its unit.
-
-        Parameters
-        ----------
-        level : float, SI
-
-        Returns
-        -------
-        str
-        """
+        """A level with its unit."""
         return f"{level * self.factor:.3g} {self.unit}"
 
 
@@ -84,7 +52,6 @@ COVARIATES = (
 @dataclass(frozen=True)
 class BlockedDeviations:
     """Deviations of coordinate x and estimate d from the weighted means of their block, and the scatter of replicates.
-
     `variance` is that scatter relative to the estimates' own variances, with `dof` degrees of freedom; `chi2` is the
     sum of squares between groups, with `groups` degrees of freedom.
     """
@@ -102,20 +69,7 @@ def blocked_deviations(
     estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]
 ) -> BlockedDeviations | None:
     """Deviations from the mean of each vine (or of all), and the scatter of replicates; None without enough trials.
-
-    Parameters
-    ----------
-    estimates : values of one parameter by trial.
-    x : array, shape (n_trials,)
-        Coordinate of a trend.
-    levels : array, shape (n_trials,)
-        Values that define the groups.
-    chosen : array of bool, shape (n_trials,)
-        Trials that are tested.
-
-    Returns
-    -------
-    BlockedDeviations or None
+    Shapes: x, levels, chosen (n_trials,).
     """
     conditions = np.array([trial.condition for trial in estimates.trials])
     blocks = (
@@ -155,15 +109,8 @@ def blocked_deviations(
 
 
 def constancy_p_value(deviations: BlockedDeviations) -> tuple[float, float]:
-    """F test of whether the groups have the same mean: its p-value, and that as a normal deviate.
-
-    Parameters
-    ----------
-    deviations : from `blocked_deviations`.
-
-    Returns
-    -------
-    p, z : float
+    """F test of whether the groups have the same mean: its p-value, and that as a normal deviate. Returns
+    p, z : float.
     """
     from scipy.stats import f as fisher
 
@@ -174,17 +121,7 @@ def constancy_p_value(deviations: BlockedDeviations) -> tuple[float, float]:
 
 
 def normal_deviate(p: float) -> float:
-    """The normal deviate with this two-sided p-value.
-
-    Parameters
-    ----------
-    p : float
-        Two-sided p-value.
-
-    Returns
-    -------
-    float
-    """
+    """The normal deviate with this two-sided p-value."""
     from scipy.stats import norm
 
     return float(norm.isf(max(p, 1e-300) / 2))

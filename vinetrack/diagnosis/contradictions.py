@@ -22,24 +22,12 @@ from vinetrack.inference.fit_result import Fit
 if TYPE_CHECKING:
     import pandas as pd
 
-CONTRADICTING_DRIFT_SIGMAS = 4.0
-"""Significance of a drift from which it contradicts an adequate model. Chosen: `drift` has a false-alarm probability of
-1 % a campaign, which is too high for a sentence that contradicts the verdict; 4 σ is 0.006 % a test, a quarter of a per
-cent for 40 tests. At half one campaign in two would carry such a sentence, at twice n that differs by 7 σ between vines
-would not be mentioned."""
+CONTRADICTING_DRIFT_SIGMAS = 4.0  # Significance of a drift from which it contradicts an adequate model (chosen)
 
 
 def displacement_m(before: Fit, after: Fit) -> float:
-    """Root mean square displacement of the predicted positions by an added effect.
-
-    Parameters
-    ----------
-    before, after : fits to the same trials without and with the effect.
-
-    Returns
-    -------
-    float
-        Over trials, of the largest difference of predicted positions, each fit with its own release and origin, m.
+    """Root mean square displacement of the predicted positions by an added effect. Returns over trials, of the largest
+    difference of predicted positions, each fit with its own release and origin, m.
     """
     moved = [
         float(np.max(np.abs(trial.predicted_position_m - later.predicted_position_m)))
@@ -50,16 +38,7 @@ def displacement_m(before: Fit, after: Fit) -> float:
 
 def is_within_position_errors(before: Fit, after: Fit) -> bool:
     """Whether an effect moves positions by less than their systematic error and does not improve left-out predictions.
-
     Such a gain in likelihood may be lens distortion. The left-out error is computed only for so small a displacement.
-
-    Parameters
-    ----------
-    before, after : fits to the same trials without and with the effect.
-
-    Returns
-    -------
-    bool
     """
     systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in before.predictor.data]))
     if not displacement_m(before, after) < systematic_m:
@@ -72,18 +51,8 @@ def is_within_position_errors(before: Fit, after: Fit) -> bool:
 
 
 def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[str, ...]:
-    """List the results that contradict the final model of a diagnosis where the verdict calls it adequate.
-
-    Parameters
-    ----------
-    fits : the first model and every one after it.
-    added : the effects added, in order.
-    ladder : table of errors, one row a model, see `vinetrack.diagnosis.ladder`; None where it was not computed.
-
-    Returns
-    -------
-    tuple of str
-        Sentences; empty where nothing contradicts the verdict.
+    """List the results that contradict the final model of a diagnosis where the verdict calls it adequate. Returns
+    sentences; empty where nothing contradicts the verdict.
     """
     return (*_not_better(added, ladder), *_still_drifts(fits[-1]))
 

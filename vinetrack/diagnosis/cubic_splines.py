@@ -8,8 +8,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 
-N_NONZERO = 4
-"""Cubic splines that are nonzero between two knots. Derived: order + 1."""
+N_NONZERO = 4  # Cubic splines that are nonzero between two knots (derived)
 
 
 @lru_cache(maxsize=64)
@@ -24,21 +23,9 @@ def _pieces(knots: tuple[float, ...]) -> tuple[Floats, Floats]:
 
 
 def nonzero_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, Floats]:
-    """Indices and values of the splines that are nonzero at each position; constant beyond the end knots.
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-        Positions.
-    knots : tuple of float
-        Increasing.
-
-    Returns
-    -------
-    first : array of int, shape (n,)
-        The first of the four nonzero splines, of n_knots + 2.
-    values : array, shape (n, 4)
-        Of these four; they sum to 1.
+    """Indices and values of the splines that are nonzero at each position; constant beyond the end knots. Returns first
+    (the first of the four nonzero splines, of n_knots + 2), values (of these four; they sum to 1). Shapes: at (n,) →
+    (n,).
     """
     breaks, pieces = _pieces(knots)
     inside = np.clip(at, breaks[0], breaks[-1])
@@ -52,17 +39,8 @@ def nonzero_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, F
 
 
 def splines(at: Floats, knots: Floats) -> Floats:
-    """Design matrix of cubic B-splines on these knots; constant beyond the end knots.
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-    knots : array, shape (n_knots,)
-        Increasing.
-
-    Returns
-    -------
-    array, shape (n, n_knots + 2)
+    """Design matrix of cubic B-splines on these knots; constant beyond the end knots. Shapes: at (n,); knots (n_knots,)
+    → (n, n_knots + 2).
     """
     first, values = nonzero_splines(at, tuple(np.asarray(knots).tolist()))
     design = np.zeros((len(first), len(knots) + 2))
@@ -71,33 +49,11 @@ def splines(at: Floats, knots: Floats) -> Floats:
 
 
 def uniform_splines(at: Floats, count: int) -> Floats:
-    """Cubic B-splines on 0 to 1 with evenly spaced knots.
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-        Positions from 0 to 1.
-    count : int
-        Number of splines.
-
-    Returns
-    -------
-    array, shape (n, count)
-    """
+    """Cubic B-splines on 0 to 1 with evenly spaced knots. Shapes: at (n,) → (n, count)."""
     return splines(at, np.array(uniform_knots(count)))
 
 
 @lru_cache
 def uniform_knots(count: int) -> tuple[float, ...]:
-    """Knots of `uniform_splines`.
-
-    Parameters
-    ----------
-    count : int
-        Number of splines.
-
-    Returns
-    -------
-    tuple of float
-    """
+    """Knots of `uniform_splines`."""
     return tuple(np.linspace(0.0, 1.0, count - 2).tolist())

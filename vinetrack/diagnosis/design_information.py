@@ -5,9 +5,9 @@ effects add up over trials. Of a design with n_c trials of condition c, and the 
 
     M = M_prior + M_so_far + Σ_c n_c M_c,   I = M_aa − M_aν M_νν⁻¹ M_νa
 
-is the information about the sizes a with all other unknowns ν free: its diagonal is about each effect alone, and
-I_ee − I_ef² / I_ff about effect e with effect f free as well. One trial of every condition is therefore simulated once,
-and designs are evaluated by linear algebra.
+is the information about the sizes a with all other unknowns ν free: its diagonal is about each effect alone, and I_ee −
+I_ef² / I_ff about effect e with effect f free as well. One trial of every condition is therefore simulated once, and
+designs are evaluated by linear algebra.
 """
 
 from __future__ import annotations
@@ -32,32 +32,23 @@ from vinetrack.planning.campaign_information import FEWEST_GROWTH_FRAMES
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.scaling_priors import damping_prior
 
-REPLICATES = 2
-"""Trials of a condition that are added at a time. Chosen: a single trial has no replicate to confirm it; with three a
-plan is up to two trials longer than needed, with two up to one."""
+REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
-UNLIMITED_TRIALS = 1000
-"""Trials of each condition that stand for unlimited replicates. Chosen: what scatters from trial to trial is then
-thirty times smaller; at half or twice what is left is the shared error all the same."""
+UNLIMITED_TRIALS = 1000  # Trials of each condition that stand for unlimited replicates (chosen)
 
+# Prior precision of parameters that no trial determines yet, such as B of a vine that has not been made (chosen)
 NOMINAL_PRECISION = 1e-6
-"""Prior precision of parameters that no trial determines yet, such as B of a vine that has not been made. Chosen: a
-standard deviation of a thousand, in ln B, is uninformative."""
 
+# Most passes of the exchange, and the ratio of worth from which a trial is exchanged (chosen)
 MAX_EXCHANGE_PASSES, LEAST_GAIN = 3, 1.002
-"""Most passes of the exchange, and the ratio of worth from which a trial is exchanged. Chosen: the exchange usually
-ends after two passes; a gain of 0.2 % in information is 0.1 % of a detectable size."""
 
-Worth = Callable[[Floats], Floats]
-"""Worth of designs, shape (n_designs,), from their cross products, shape (n_designs, n, n)."""
+Worth = Callable[[Floats], Floats]  # Worth of designs, shape (n_designs,), from their cross products, shape
 
 
 class DesignInformation:
-    """Information of designs about the sizes of some effects with everything else free.
-
-    `conditions` are those that can be filmed; `efforts` and `vines`, shape (n_conditions,), are theirs; `each`, shape
-    (n_conditions, n, n), is what a group of `REPLICATES` trials of each adds, the effects last. A design is a sequence
-    of indices of conditions, one a group.
+    """Information of designs about the sizes of some effects with everything else free. `conditions` are those that can
+    be filmed; `efforts` and `vines`, shape (n_conditions,), are theirs; `each`, shape (n_conditions, n, n), is what a
+    group of `REPLICATES` trials of each adds, the effects last.
     """
 
     def __init__(self, design: CampaignDesign, every: Sequence[Condition], effects: Sequence[str]) -> None:
@@ -78,29 +69,12 @@ class DesignInformation:
         self.vines = np.array([condition.trial.vine for condition in self.conditions])
 
     def total(self, chosen: Sequence[int]) -> Floats:
-        """Cross products of the trials so far and of a design.
-
-        Parameters
-        ----------
-        chosen : the design.
-
-        Returns
-        -------
-        array, shape (n, n)
-        """
+        """Cross products of the trials so far and of a design. Shape (n, n)."""
         return np.asarray(self.so_far + self.each[list(chosen)].sum(axis=0))
 
     def information_of(self, totals: Floats) -> Floats:
-        """Information about the sizes of the effects with all other unknowns free.
-
-        Parameters
-        ----------
-        totals : array, shape (n_designs, n, n)
-            As from `total`.
-
-        Returns
-        -------
-        array, shape (n_designs, n_effects, n_effects)
+        """Information about the sizes of the effects with all other unknowns free. Shapes: totals (n_designs, n, n) →
+        (n_designs, n_effects, n_effects).
         """
         count = len(self.effects)
         cross = totals[:, :-count, -count:]
@@ -108,18 +82,7 @@ class DesignInformation:
         return np.asarray(totals[:, -count:, -count:] - np.swapaxes(cross, 1, 2) @ solved)
 
     def exchanged(self, chosen: Sequence[int], allowed: NDArray[np.intp], worth: Worth) -> list[int]:
-        """The same number of groups, each exchanged for a better one until none gains.
-
-        Parameters
-        ----------
-        chosen : the design to begin with.
-        allowed : indices of the conditions to choose from.
-        worth : what is to be large.
-
-        Returns
-        -------
-        list of int
-        """
+        """The same number of groups, each exchanged for a better one until none gains."""
         chosen = list(chosen)
         now = float(worth(self.total(chosen)[None])[0])
         for _ in range(MAX_EXCHANGE_PASSES):
@@ -133,34 +96,14 @@ class DesignInformation:
         return chosen
 
     def first_information(self, totals: Floats) -> Floats:
-        """Information about the first effect alone, shape (n_designs,).
-
-        Parameters
-        ----------
-        totals : as for `information_of`.
-
-        Returns
-        -------
-        array
-        """
+        """Information about the first effect alone, shape (n_designs,)."""
         return np.asarray(np.maximum(self.information_of(totals)[:, 0, 0], 0.0))
 
 
 def tests_with_conditions(
     design: CampaignDesign, added: Sequence[Condition], candidates: tuple[str, ...] | None
 ) -> MisfitTests:
-    """Misfit tests of a noise-free design with one trial of each condition added.
-
-    Parameters
-    ----------
-    design : of the trials so far, or of a sheet.
-    added : conditions.
-    candidates : names of effects; the catalogue where None.
-
-    Returns
-    -------
-    MisfitTests
-    """
+    """Misfit tests of a noise-free design with one trial of each condition added."""
     longest_s = max(camera.longest_s for camera in design.cameras)
     values: dict[str, Value] = {}
     stated_B = design.model.values.get(DAMPING)
@@ -218,17 +161,7 @@ def _prior_precision(tests: MisfitTests, n_effects: int) -> Floats:
 
 
 def with_trials(tests: MisfitTests, indices: Sequence[int]) -> MisfitTests:
-    """The same tests for some of the trials, which may be repeated.
-
-    Parameters
-    ----------
-    tests : from `tests_with_conditions`.
-    indices : of trials.
-
-    Returns
-    -------
-    MisfitTests
-    """
+    """The same tests for some of the trials, which may be repeated."""
     where = list(indices)
     fit, problem, state = tests.fit, tests.fit.solution.problem, tests.fit.state
     layout = tests.fit.predictor.layout

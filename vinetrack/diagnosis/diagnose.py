@@ -1,7 +1,6 @@
 """Diagnose an experiment: what its model lacks, how certain that is, how far the error falls, and what to do next.
 
-diagnosis = vinetrack.diagnose("my_experiment")
-print(diagnosis)
+diagnosis = vinetrack.diagnose("my_experiment") print(diagnosis)
 """
 
 from __future__ import annotations
@@ -81,41 +80,7 @@ def diagnose(
     advice: bool = True,
     report: Report = _quiet,
 ) -> Diagnosis:
-    """Find what is missing from a model.
-
-    Parameters
-    ----------
-    source
-        A fit of the model; or an experiment, its folder, or pairs of trial and track, to which the model is fitted
-        first.
-    model : Model, optional
-        The model to diagnose, by default the one that the experiment names, else the base model.
-    tracks : mapping, optional
-        Tracks by name of trial, where the experiment brings recordings.
-    candidates : iterable of str, optional
-        Names of candidate effects, by default those that the experiment names, else the whole catalogue.
-    user_effects : mapping, optional
-        Effects of the user by name.
-    limits : Limits, optional
-        Limits within which further trials can be made.
-    ladder, advice : bool
-        Whether to compute the ladder of errors, and what to do next.
-    report : callable
-        Called with a few words at each step.
-
-    Returns
-    -------
-    Diagnosis
-
-    Raises
-    ------
-    FitError
-        If there is nothing to fit.
-    EffectError
-        If an effect is unknown or a trial lacks what the model needs.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Find what is missing from a model."""
     outliers_note = ""
     if isinstance(source, Fit):
         effects = candidates_of(source.model, candidates, user_effects)
@@ -365,17 +330,7 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Di
 
 
 def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report: Report = _quiet) -> Diagnosis:
-    """Add the trials that would discriminate between the hypotheses that remain.
-
-    Parameters
-    ----------
-    result : returned unchanged where fewer than two hypotheses remain.
-    limits, report : limits of further trials; called with a few words at each step.
-
-    Returns
-    -------
-    Diagnosis
-    """
+    """Add the trials that would discriminate between the hypotheses that remain."""
     last = result.rounds[-1]
     tied = list(last.fits.values())
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:

@@ -6,9 +6,7 @@ free. Values that follow the pressure point to what is missing. Their scatter by
 from the between-trial standard deviations and noise of the fit, which a model that fails inflates.
 
 The common parameters were fitted to the same trials and have absorbed part of the drift (n most of it, where B follows
-the pressure): what is found is the remainder, and its z is too small rather than too large. A change of B along the
-growth cannot be absorbed, and a yield pressure that is pulled away from the sheet's is a sign of it
-(`vinetrack.diagnosis.drift_along`).
+the pressure): what is found is the remainder, and its z is too small rather than too large.
 """
 
 from __future__ import annotations
@@ -81,25 +79,16 @@ GROUP_COLUMNS = (
     "n_trials",
 )
 
-MOST_ITERATIONS = 15
-"""Maximum number of iterations of a refit. Chosen: it starts near its minimum."""
+MOST_ITERATIONS = 15  # Maximum number of iterations of a refit (chosen)
 
 
-FALSE_ALARM_LEVEL = 0.01
-"""Family-wise probability that any drift is called significant where nothing drifts. Chosen: the usual 1 %, shared
-among all parameters and conditions (Šidák)."""
+FALSE_ALARM_LEVEL = 0.01  # Family-wise probability that any drift is called significant where nothing drifts (chosen)
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Drifts, most significant first, and the values of the groups; SI.
-
-    `table`, columns `DRIFT_COLUMNS`, has one row for each parameter, vine (blank: all) and condition. From `from_level`
-    to `to_level` of the nominal condition (`growth`: fractions of it; `sheet`: the stated value) the parameter rises by
-    `change` ± `change_sigma` (`relative`: as a fraction). `z` is its significance by Student's t with `dof` degrees of
-    freedom, `z_constancy` that of the differences between groups.
-    `groups`, columns `GROUP_COLUMNS`, has the mean value of every group: `level` is the nominal condition, NaN where
-    the groups are vines; `ratio` the value divided by the common value.
+    """Drifts, most significant first, and the values of the groups; SI. `table`, columns `DRIFT_COLUMNS`, has one row
+    for each parameter, vine (blank: all) and condition.
     """
 
     table: pd.DataFrame
@@ -114,23 +103,7 @@ class Drift:
 
 
 def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
-    """Test every parameter for drift with pressure, payload, angle, chamber, inlet, vine or along the growth.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    scatter : Scatter, optional
-        Between-trial scatter, where known already.
-
-    Returns
-    -------
-    Drift
-
-    Raises
-    ------
-    FitError
-        If the simulation of the model fails.
-    """
+    """Test every parameter for drift with pressure, payload, angle, chamber, inlet, vine or along the growth."""
     import pandas as pd
 
     notes: list[str] = []
@@ -148,19 +121,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
 
 
 def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
-    """Return the best values of each group of trials under the first model and, where something was added, the last.
-
-    Parameters
-    ----------
-    before : of the first model.
-    after : the last fit; None where nothing was added.
-
-    Returns
-    -------
-    DataFrame
-        Columns `GROUP_COLUMNS` and `model` (`before` or `after`); without the last model where its drift cannot be
-        computed.
-    """
+    """Return the best values of each group of trials under the first model and, where something was added, the last."""
     import pandas as pd
 
     parts = [before.groups.assign(model="before")]

@@ -24,20 +24,13 @@ from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
-STEP = 1e-3
-"""Relative step of a finite difference. Derived: 1000 times the integrator's error."""
+STEP = 1e-3  # Relative step of a finite difference (derived)
 
-LEAST_SCATTER = 2e-3
-"""Lower limit of the standard deviation of the rise of ln B in single trials: better agreement of replicates counts as
-chance. Chosen: a tenth of the usual scatter of B within a batch."""
+LEAST_SCATTER = 2e-3  # Lower limit of the standard deviation of the rise of ln B in single trials (chosen)
 
-LARGEST_STEP = 3.0
-"""Deviation of ln B of a half (a factor of 20) beyond which the linear step is meaningless and the trial is skipped.
-Chosen: effects that build up along the growth are some per cent to a factor of two; a tip that stands still in one half
-would need e^1000. At half (4.5) and twice (400) the tests of sound trials are the same."""
+LARGEST_STEP = 3.0  # Deviation of ln B of a half (chosen)
 
-HALVES = (0.25, 0.75)
-"""Midpoints of the halves, as fractions of the growth. Defined by the halves."""
+HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
 
 
 @dataclass(frozen=True)
@@ -49,23 +42,7 @@ class _Halves:
 
 
 def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
-    """Test B for a change along the growth, for every vine and for all.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    aligned : the model aligned with its trials.
-    estimates : best-fit values of B by trial.
-
-    Yields
-    ------
-    ConstancyTest
-
-    Raises
-    ------
-    SimulationError
-        If the simulation of a trajectory fails.
-    """
+    """Test B for a change along the growth, for every vine and for all."""
     if aligned.predictor.damping_column < 0:
         return
     halves = _halves(fit, aligned, estimates.trial_effects)
@@ -80,9 +57,8 @@ def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates)
 
 
 def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
-    """Deviations of ln B in both halves, linearised about each trial's own B.
-
-    About the common B, the between-trial scatter would enter in second order.
+    """Deviations of ln B in both halves, linearised about each trial's own B. About the common B, the between-trial
+    scatter would enter in second order.
     """
     motions = motions_of(fit, trial_effects)
     data = aligned.predictor.data
@@ -195,16 +171,7 @@ def _groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[di
 
 
 def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
-    """Compare fitted yield pressures with the sheet, in units of the standard error stated there.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-
-    Yields
-    ------
-    ConstancyTest
-    """
+    """Compare fitted yield pressures with the sheet, in units of the standard error stated there."""
     for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
         if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
             continue

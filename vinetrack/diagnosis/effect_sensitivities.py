@@ -19,25 +19,20 @@ from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.position_change import position_change
 
+# A finite-difference step should move a trajectory by the first of these parts of its travel (derived)
 TARGET_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
-"""A finite-difference step should move a trajectory by the first of these parts of its travel; it is rescaled where it
-moves it by more than the second or less than the third: above, the curvature matters, below, the integrator's error.
-Derived as in vinetrack.inference.sensitivity; ten times to both sides."""
 
-LEAST_REMAINING_TRAVEL = 0.1
-"""Part of its travel that a vine must still make with a finite effect added. Chosen: a vine that hardly moves has no
-useful derivative."""
+LEAST_REMAINING_TRAVEL = 0.1  # Part of its travel that a vine must still make with a finite effect added (chosen)
 
+# Part of its travel by which a trajectory must change to count as responding, four times the integrator's error
+# (measured)
 LEAST_DETECTABLE_RESPONSE = 3e-6
-"""Part of its travel by which a trajectory must change to count as responding, four times the integrator's error.
-Measured: the integrator errs by at most 7e-7 (benchmarks/integrator.py)."""
 
 
 @dataclass(frozen=True)
 class EffectSensitivities:
-    """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size.
-
-    `silent` names the effects to which no trajectory responds at any plausible size.
+    """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size. `silent`
+    names the effects to which no trajectory responds at any plausible size.
     """
 
     shapes: tuple[CandidateShape, ...]
@@ -51,18 +46,8 @@ class EffectSensitivities:
 
 
 def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
-    """Compute the sensitivities to all shapes of all candidate effects.
-
-    An effect to which no trajectory responds for a small step is tried at finite sizes before it counts as silent.
-
-    Parameters
-    ----------
-    fit : the fit under test.
-    shapes : sequence of CandidateShape
-
-    Returns
-    -------
-    EffectSensitivities
+    """Compute the sensitivities to all shapes of all candidate effects. An effect to which no trajectory responds for a
+    small step is tried at finite sizes before it counts as silent.
     """
     baseline = fit.predictor.trajectories_at(fit.solution.state.theta, fit.solution.state.trial_effects)
     responses: list[tuple[CandidateShape, list[Floats]]] = []

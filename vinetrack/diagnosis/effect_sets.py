@@ -26,19 +26,16 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
-MAX_EFFECTS = 5
-"""Largest number of effects in a set. Chosen: with six and more there are more sets than 48 trials can tell apart."""
+MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
+# Number of best single effects from which pairs are built, and of partners tried with each (chosen)
 PAIR_BASES, PAIR_PARTNERS = 3, 4
-"""Number of best single effects from which pairs are built, and of partners tried with each. A single effect needs
-MIN_SHARE_OF_BEST_GAIN of the best one's gain. Chosen for time."""
 
+# The same for larger sets, built on the best sets of one effect fewer and, besides them, on the best whose sizes are
+# credible (chosen)
 LARGER_SET_BASES, LARGER_SET_PARTNERS = 2, 3
-"""The same for larger sets, built on the best sets of one effect fewer and, besides them, on the best whose sizes are
-credible. Chosen for time."""
 
-MIN_LOG_LIKELIHOOD_GAIN = 1.0
-"""Difference in ln L from which a fit counts as better. Chosen: iterations that have not settled differ by 0.1."""
+MIN_LOG_LIKELIHOOD_GAIN = 1.0  # Difference in ln L from which a fit counts as better (chosen)
 
 Names = frozenset[str]
 
@@ -58,31 +55,12 @@ class EffectSets:
         self.nested_tried: set[NestedForm] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
-        """Fitted sets of this many effects, the highest likelihood first.
-
-        Parameters
-        ----------
-        size : number of effects.
-
-        Returns
-        -------
-        list of LikelihoodRatio
-        """
+        """Fitted sets of this many effects, the highest likelihood first."""
         of_size = [hypothesis for names, hypothesis in self.fitted.items() if len(names) == size]
         return sorted(of_size, key=lambda hypothesis: -hypothesis.fit.log_likelihood)
 
     def grow(self, size: int) -> list[LikelihoodRatio]:
-        """Forward step: fit sets of this many effects, built on the best sets of one fewer.
-
-        Parameters
-        ----------
-        size : number of effects.
-
-        Returns
-        -------
-        list of LikelihoodRatio
-            All fitted sets of that size, the highest likelihood first.
-        """
+        """Forward step: fit sets of this many effects, built on the best sets of one fewer."""
         n_partners = PAIR_PARTNERS if size == 2 else LARGER_SET_PARTNERS
         for base in self._bases(size - 1):
             names = frozenset(base.names)
@@ -116,17 +94,7 @@ class EffectSets:
         return [*bases, *(best for best in credible[:1] if best not in bases)]
 
     def prune(self, hypothesis: LikelihoodRatio) -> bool:
-        """Backward step: remove each member from a set in turn.
-
-        Parameters
-        ----------
-        hypothesis : a set of at least two effects.
-
-        Returns
-        -------
-        bool
-            Whether one of the smaller sets is better than all that were fitted of its size before.
-        """
+        """Backward step: remove each member from a set in turn."""
         size = len(hypothesis.effects) - 1
         best = max((known.fit.log_likelihood for known in self.of_size(size)), default=-math.inf)
         for effect in hypothesis.effects:
@@ -134,19 +102,9 @@ class EffectSets:
         return self.of_size(size)[0].fit.log_likelihood > best + MIN_LOG_LIKELIHOOD_GAIN
 
     def leave_out(self, hypothesis: LikelihoodRatio, effect: Effect) -> LikelihoodRatio | None:
-        """Fit a set without one of its members, from where the set ended; None where no fit succeeds.
-
-        A fit of the smaller set that is known already may have ended in a local minimum, which would make the member
-        look needed: the better of the two counts.
-
-        Parameters
-        ----------
-        hypothesis : a set of at least two effects.
-        effect : one of them.
-
-        Returns
-        -------
-        LikelihoodRatio or None
+        """Fit a set without one of its members, from where the set ended; None where no fit succeeds. A fit of the
+        smaller set that is known already may have ended in a local minimum, which would make the member look needed:
+        the better of the two counts.
         """
         others = tuple(other for other in hypothesis.effects if other is not effect)
         if (hypothesis.label, effect.name) not in self.left_out:
@@ -158,17 +116,7 @@ class EffectSets:
         return self.fitted.get(frozenset(other.name for other in others))
 
     def subset(self, hypothesis: LikelihoodRatio, effects: Sequence[Effect]) -> LikelihoodRatio | None:
-        """Some members of a set alone, refitted from the set unless known already; None where the fit fails.
-
-        Parameters
-        ----------
-        hypothesis : a set.
-        effects : some of its effects.
-
-        Returns
-        -------
-        LikelihoodRatio or None
-        """
+        """Some members of a set alone, refitted from the set unless known already; None where the fit fails."""
         names = frozenset(effect.name for effect in effects)
         if names not in self.fitted:
             fit = self._refitted(hypothesis.fit, effects)
@@ -184,18 +132,8 @@ class EffectSets:
             return None
 
     def member_sigmas(self, hypothesis: LikelihoodRatio, effect: Effect) -> float:
-        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known.
-
-        Δχ² is divided by the inflation and has a degree of freedom for each size of the member (`sizes_of`).
-
-        Parameters
-        ----------
-        hypothesis : a set.
-        effect : one of its members.
-
-        Returns
-        -------
-        float
+        """Significance of a member of a set given the others, in standard deviations; 0 where it is not known. Δχ² is
+        divided by the inflation and has a degree of freedom for each size of the member (`sizes_of`).
         """
         others = self.leave_out(hypothesis, effect)
         if others is None:
@@ -204,17 +142,7 @@ class EffectSets:
         return in_sigmas(max(delta_chi2, 0.0) / hypothesis.inflation, sizes_of((effect,), hypothesis.fit))
 
     def superfluous(self, hypothesis: LikelihoodRatio) -> str:
-        """Find the first member of a set whose significance given the others is too low.
-
-        Parameters
-        ----------
-        hypothesis : a set of at least three effects.
-
-        Returns
-        -------
-        str
-            The reason, in words; blank where every member is significant.
-        """
+        """Find the first member of a set whose significance given the others is too low."""
         for effect in hypothesis.effects:
             others = frozenset(other.name for other in hypothesis.effects if other is not effect)
             sigmas = self.member_sigmas(hypothesis, effect)
@@ -227,22 +155,11 @@ class EffectSets:
         return ""
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
-        """Whether a set is better than a smaller one by at least the threshold of its additional effect.
-
-        The smaller set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any
-        nested one that was fitted, so the criterion is then the stricter. The difference of −2 ln L is divided by the
-        inflation of the sizes added: where they scatter between trials more widely than the noise model predicts,
-        chance makes it larger by as much (Kent, Biometrika 69, 19, 1982). The scatter of a size that both sets have
-        does not count.
-
-        Parameters
-        ----------
-        hypothesis : a set of at least two effects.
-        smaller : a smaller set; by default that of highest likelihood with one effect fewer.
-
-        Returns
-        -------
-        bool
+        """Whether a set is better than a smaller one by at least the threshold of its additional effect. The smaller
+        set need not be nested in it. If it is the best of one effect fewer, it fits at least as well as any nested one
+        that was fitted, so the criterion is then the stricter. The difference of −2 ln L is divided by the inflation of
+        the sizes added: where they scatter between trials more widely than the noise model predicts, chance makes it
+        larger by as much (Kent, Biometrika 69, 19, 1982).
         """
         smaller = smaller or self.of_size(len(hypothesis.effects) - 1)[0]
         family = self.search.tests_after(smaller.fit).family
@@ -254,11 +171,7 @@ class EffectSets:
 
     def plausible_steps(self) -> tuple[LikelihoodRatio, ...]:
         """Steps, one effect each, to the largest set of plausible sizes in which each additional effect is significant.
-
-        Returns
-        -------
-        tuple of LikelihoodRatio
-            Empty where no single effect is plausible.
+        Returns empty where no single effect is plausible.
         """
         best: LikelihoodRatio | None = None
         for size in range(1, MAX_EFFECTS + 1):

@@ -33,37 +33,23 @@ from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.trajectory_jobs import Jobs
 from vinetrack.inference.whitening import at_correlation
 
+# Most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
 MAX_ITERATIONS, CONVERGENCE_DECREASE = 20, 0.2
-"""Most Gauss–Newton steps of the fit without the effect, beyond which it is not used; and the predicted decrease of −2
-ln L below which it has converged. Chosen as a safeguard: of 62 fits of 24 trials of one vine 55 converge within four
-steps and all within fourteen (a pressure gauge 1.5 kPa off was the last); at half of it that one is not used. Derived:
-0.2 of the 49 of seven standard errors moves a score by 0.2 %; at half or twice by 0.1 and 0.4 %."""
 
 
-LINEARITY_TOLERANCE = 0.02
-"""Relative deviation of an expected score from linear theory that is neglected. Chosen: 2 % of a size, where the draws
-leave 0.5 %; at half more effects are computed at two sizes, and at twice sizes err by as much as noise and scatter are
-known from 24 trials."""
+LINEARITY_TOLERANCE = 0.02  # Relative deviation of an expected score from linear theory that is neglected (chosen)
 
+# Ratio of an expected score to that of linear theory from which neither is used, as below 0 (chosen)
 MAX_SCORE_RATIO = 2.0
-"""Ratio of an expected score to that of linear theory from which neither is used, as below 0. Chosen: a fit without the
-effect that ends in another minimum leaves too much; at half every convex effect is excluded, at twice some of those
-fits count. A small ratio is used: the independent simulator confirmed 0.11 and 0.20 of rolling shutter (tuning seed
-21100) and 0.43 of a slow valve (21110)."""
 
-LARGEST_SCORE = 7.0
-"""Expected score from which no larger size is tried. Chosen: thresholds are 3.6 to 4.6, and a power of 90 % lies 1.3
-above; at half sizes are extrapolated from below a threshold, at twice time is spent beyond all of them."""
+LARGEST_SCORE = 7.0  # Expected score from which no larger size is tried (chosen)
 
-LARGEST_MULTIPLE = 56.0
-"""Multiple of the size of one standard error beyond which no size is tried. Chosen: three doublings of 7; an effect
-that is not detected there is absorbed by other parameters, and larger sizes only take time."""
+LARGEST_MULTIPLE = 56.0  # Multiple of the size of one standard error beyond which no size is tried (chosen)
 
 
 @dataclass(frozen=True)
 class NoiselessStart:
     """Trajectories of a fit with the deviations of its trials set to zero, where every fit without an effect starts.
-
     `predictor` has finite-difference steps that suit them; `columns` are their sensitivities at the fit's points, the
     residual last.
     """
@@ -75,21 +61,7 @@ class NoiselessStart:
 
 
 def noiseless_start(fit: Fit) -> NoiselessStart:
-    """Set the trial deviations of a fit to zero and linearise there: the same start for every effect and size.
-
-    Parameters
-    ----------
-    fit : of the model without the effects.
-
-    Returns
-    -------
-    NoiselessStart
-
-    Raises
-    ------
-    SimulationError
-        If the trajectories cannot be simulated.
-    """
+    """Set the trial deviations of a fit to zero and linearise there: the same start for every effect and size."""
     trial_effects = fit.state.trial_effects.copy()
     trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
     state = replace(fit.state, trial_effects=trial_effects)
@@ -106,26 +78,9 @@ def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
 
 
 def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
-    """Sizes of an effect, and the ratios of its expected scores there to those of linear theory.
-
-    Where the score at seven units, above any threshold, agrees with linear theory, no other size is computed.
-    Otherwise, and where the effect cannot be simulated there (a ratio of exactly 1), one near a threshold is computed
-    as well, and ever larger ones while their scores stay below the thresholds: an effect that the release times of
-    trials absorb, such as a slow valve, is detected only where it is large. Where a ratio is implausible, linear theory
-    is used.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-    shape_index : of the shape in which the effect is added.
-    unit : size whose score is one standard error, SI.
-    start : NoiselessStart
-        Of the fit.
-
-    Returns
-    -------
-    sizes : array, shape (n_sizes,), SI
-    ratios : array, shape (n_sizes,)
+    """Sizes of an effect, and the ratios of its expected scores there to those of linear theory. Where the score at
+    seven units, above any threshold, agrees with linear theory, no other size is computed. Returns sizes, ratios. Shape
+    (n_sizes,).
     """
     large = score_ratio(tests, shape_index, 7 * unit, start)
     if 0 < abs(large - 1) < LINEARITY_TOLERANCE:
@@ -143,20 +98,8 @@ def score_ratios(tests: MisfitTests, shape_index: int, unit: float, start: Noise
 
 
 def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: NoiselessStart) -> float:
-    """Expected score of an effect at a size, divided by that of linear theory.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-    shape_index : of the shape in which the effect is added.
-    size : deviation from absence, SI.
-    start : NoiselessStart
-        Of the fit.
-
-    Returns
-    -------
-    float
-        1 where the trajectories with the effect cannot be simulated, or the fit without it does not converge.
+    """Expected score of an effect at a size, divided by that of linear theory. Returns 1 where the trajectories with
+    the effect cannot be simulated, or the fit without it does not converge.
     """
     fit, shape = tests.fit, tests.sensitivities.shapes[shape_index]
     sigma = float(tests.scores.plain_sigma[shape_index])
@@ -180,16 +123,8 @@ def score_ratio(tests: MisfitTests, shape_index: int, size: float, start: Noisel
 
 
 def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
-    """Sizes at which an effect moves positions by as much as their systematic errors.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-
-    Returns
-    -------
-    array, shape (n_shapes,)
-        Deviations from absence, SI, positive; 0 where positions have no such errors.
+    """Sizes at which an effect moves positions by as much as their systematic errors. Returns deviations from absence,
+    SI, positive; 0 where positions have no such errors. Shape (n_shapes,).
     """
     fit = tests.fit
     systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
@@ -200,17 +135,8 @@ def sizes_at_systematic_error(tests: MisfitTests) -> Floats:
 
 
 def residual_displacements(fit: Fit, products: Products) -> Floats:
-    """Distance of a fit without an effect from trajectories with a unit of its size, to first order.
-
-    Parameters
-    ----------
-    fit : the fit under test.
-    products : its columns and those of the candidates.
-
-    Returns
-    -------
-    array, shape (n_shapes,), m per unit of each size
-        Root mean square over trials of the largest distance, all parameters and trial effects re-estimated.
+    """Distance of a fit without an effect from trajectories with a unit of its size, to first order. Returns root mean
+    square over trials of the largest distance, all parameters and trial effects re-estimated. Shape (n_shapes,).
     """
     problem, state, n_shapes = fit.solution.problem, fit.state, products.n_shapes
     response = projected(fit, products, state).lever[:, :n_shapes]
@@ -234,47 +160,14 @@ def residual_displacements(fit: Fit, products: Products) -> Floats:
 
 
 def half_power_below(least: float, sizes: Floats) -> Floats:
-    """Detectable sizes where a detection below the least size counts with probability one half.
-
-    Parameters
-    ----------
-    least : float
-        Deviation from absence, SI, positive.
-    sizes : array
-        Deviations at `PROBABILITIES`.
-
-    Returns
-    -------
-    array
-        Of the same shape.
-    """
+    """Detectable sizes where a detection below the least size counts with probability one half."""
     deviation = np.abs(sizes)
     at_half_power = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, deviation, right=math.inf)
     return np.asarray(np.sign(sizes) * np.where(deviation >= least, deviation, np.minimum(at_half_power, least)))
 
 
 def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: NoiselessStart) -> Fit:
-    """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held.
-
-    Parameters
-    ----------
-    fit : of the model without the effect.
-    shape : in which the effect is added.
-    size : float
-        Deviation from absence, SI.
-    start : NoiselessStart
-        Of the fit.
-
-    Returns
-    -------
-    Fit
-        The residual column of its solution is what the model cannot reproduce.
-
-    Raises
-    ------
-    SimulationError
-        If a trial does not move with the effect.
-    """
+    """Fit the model of a fit to noise-free trajectories with an effect; noise and between-trial scatter are held."""
     state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
     moved = start.predictor.run_as(fit.model + shape.effect, jobs)
     used = [

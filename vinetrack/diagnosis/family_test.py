@@ -8,12 +8,7 @@ probability q, and q is such that any candidate exceeds its own with probability
 
 The probability that any of many correlated normal scores exceeds its threshold is found by importance sampling (Adler,
 Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail probability
-and drawn beyond its threshold, and the others are drawn conditionally on it. With N the number of scores that exceed
-their thresholds,
-
-    P(any) = Σ_j P(j) · E[1 / N],
-
-with the same relative accuracy at a probability of one in a million as at one in ten.
+and drawn beyond its threshold, and the others are drawn conditionally on it.
 """
 
 from __future__ import annotations
@@ -28,24 +23,17 @@ from scipy.special import ndtr, ndtri
 
 from vinetrack.core.records import Floats
 
-DRAWS, SEED = 2000, 20
-"""Draws of the scores, and the seed. Measured: with 2000 the thresholds of 13 to 134 shapes differ by 0.01 standard
-deviations from seed to seed (tests/diagnosis/test_family_test.py)."""
+DRAWS, SEED = 2000, 20  # Draws of the scores, and the seed (measured)
 
-NODES = 6
-"""Thresholds at which a candidate's exceedance probability p is computed; ln p is interpolated linearly in z². Chosen:
-steps of a quarter of a standard deviation, where the remaining curvature is a thousandth of ln p."""
+NODES = 6  # Thresholds at which a candidate's exceedance probability p is computed (chosen)
 
-HALVINGS = 30
-"""Bisection steps for ln q. Derived: its range spans less than 10 and is reduced to 1e-8."""
+HALVINGS = 30  # Bisection steps for ln q (derived)
 
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """Thresholds of all candidates, in standard deviations of a score.
-
-    `candidate_level` is the probability with which each candidate alone exceeds its threshold; `thresholds` are by name
-    of effect.
+    """Thresholds of all candidates, in standard deviations of a score. `candidate_level` is the probability with which
+    each candidate alone exceeds its threshold; `thresholds` are by name of effect.
     """
 
     level: float
@@ -53,16 +41,7 @@ class FamilyTest:
     thresholds: Mapping[str, float]
 
     def threshold(self, name: str) -> float:
-        """Threshold of a candidate; of one without shapes, that of a single two-sided score.
-
-        Parameters
-        ----------
-        name : of an effect or another hypothesis.
-
-        Returns
-        -------
-        float
-        """
+        """Threshold of a candidate; of one without shapes, that of a single two-sided score."""
         return self.thresholds.get(name, self.single_shape_threshold)
 
     @property
@@ -104,23 +83,7 @@ class _Scores:
 
 
 def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
-    """Compute the threshold of every candidate.
-
-    Parameters
-    ----------
-    cosines : array, shape (n_shapes, n_shapes)
-        Correlations of the scores.
-    signs : sequence of int
-        Sign of each size, 0 where it may have either (two-sided).
-    effects : sequence of str
-        Name of the effect of each shape.
-    level : float
-        Probability that any candidate exceeds its threshold where nothing is missing.
-
-    Returns
-    -------
-    FamilyTest
-    """
+    """Compute the threshold of every candidate. Shapes: cosines (n_shapes, n_shapes)."""
     if not effects:
         return FamilyTest(level, level, {})
     scores = _Scores(cosines, signs)
@@ -146,19 +109,8 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
 
 
 def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
-    """Family-wise p-value of the most significant candidate.
-
-    Parameters
-    ----------
-    cosines, signs, effects
-        As in `family_test`.
-    observed : array, shape (n_shapes,)
-        Scores in the direction that their sign allows, 0 in the other.
-
-    Returns
-    -------
-    float
-        1 where there is no candidate. Below 1e-12 it is no more than an order of magnitude.
+    """Family-wise p-value of the most significant candidate. Returns 1 where there is no candidate. Shapes: observed
+    (n_shapes,).
     """
     scores = _Scores(cosines, signs) if effects else None
     if scores is None or not scores.informative.any():

@@ -19,18 +19,9 @@ from vinetrack.inference.systematics import film_errors
 
 
 def film_gain(fit: Fit) -> float:
-    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`²) of each vine's film mass, by linear algebra.
-
-    ε takes its best value, with its prior as a penalty; it is not integrated out.
-
-    Parameters
-    ----------
-    fit : of a hypothesis.
-
-    Returns
-    -------
-    float
-        At least 0; 0 for a fit that is far off, has a free film mass already, or does not depend on it.
+    """Fall of −2 ln L with a relative error ε ~ N(0, `FILM_ERROR`²) of each vine's film mass, by linear algebra. ε
+    takes its best value, with its prior as a penalty; it is not integrated out. Returns at least 0; 0 for a fit that is
+    far off, has a free film mass already, or does not depend on it.
     """
     if FILM in fit.model or is_poor_fit(fit.predictor, fit.solution):
         return 0.0

@@ -16,41 +16,21 @@ from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import Predictor
 
-MANY_POINTS = 150_000
-"""Points of all trials from which curves are dropped. Chosen for memory: 300 trials of 500 frames, of which a fit takes
-16 MB; at half smaller campaigns spend time on computing curves again, at twice a search over them takes 2 GB. It
-affects no number or likelihood of a fit; derivatives computed again use other steps, within the error of the first."""
+MANY_POINTS = 150_000  # Points of all trials from which curves are dropped (chosen)
 
+# Fits, the likeliest of a search, and misfit tests, the last made, that are kept whole (chosen)
 MAX_WHOLE_FITS, MAX_WHOLE_TESTS = 8, 1
-"""Fits, the likeliest of a search, and misfit tests, the last made, that are kept whole. Chosen for memory: later steps
-go on from the best three; with half the fits, curves are computed again now and then; each further set of misfit tests
-takes as much as ten fits."""
 
 Key = TypeVar("Key")
 
 
 def is_large(fit: Fit) -> bool:
-    """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole.
-
-    Parameters
-    ----------
-    fit : of the trials in question.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a fit has so many points that the fits of other hypotheses cannot all be kept whole."""
     return sum(trial_data.time_s.size for trial_data in fit.predictor.data) > MANY_POINTS
 
 
 def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
-    """Drop the curves of hypotheses that can no longer enter an answer set.
-
-    Parameters
-    ----------
-    fitted : mapping
-        Hypotheses that compete, changed in place.
-    """
+    """Drop the curves of hypotheses that can no longer enter an answer set."""
     ranked = sorted(fitted.items(), key=lambda entry: -entry[1].fit.log_likelihood)
     for key, hypothesis in ranked[MAX_WHOLE_FITS:]:
         fit = hypothesis.fit
@@ -60,37 +40,13 @@ def drop_curves(fitted: MutableMapping[Key, LikelihoodRatio]) -> None:
 
 
 def without_curves(fit: Fit) -> Fit:
-    """Return a fit without its curves: its numbers, its state and the residuals of each trial.
-
-    Parameters
-    ----------
-    fit : a fit.
-
-    Returns
-    -------
-    Fit
-        `trials` is empty; the columns of its solution are the residuals alone.
-    """
+    """Return a fit without its curves: its numbers, its state and the residuals of each trial."""
     residuals = tuple(columns[:, -1:].copy() for columns in fit.solution.columns)
     return replace(fit, trials=(), solution=replace(fit.solution, columns=residuals))
 
 
 def with_curves(fit: Fit) -> Fit:
-    """Return a fit with its curves, computed again where they were dropped.
-
-    Parameters
-    ----------
-    fit : a fit, whole or from `without_curves`.
-
-    Returns
-    -------
-    Fit
-
-    Raises
-    ------
-    SimulationError
-        If the simulation of the model fails.
-    """
+    """Return a fit with its curves, computed again where they were dropped."""
     if fit.trials:
         return fit
     former, state = fit.predictor, fit.solution.state

@@ -26,25 +26,21 @@ from vinetrack.diagnosis.force_surface import (
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
 
+# Information, where each unknown alone has 1, below which a combination of unknowns is not estimable (derived)
 LEAST_INFORMATION = 1e-8
-"""Information, where each unknown alone has 1, below which a combination of unknowns is not estimable. Derived: sums of
-squares are rounded at 1e-14 of the largest, and the score in such a direction at the root of that."""
 
+# Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band
+# (chosen)
 NEGLIGIBLE_LOG_RATIO = 5.0
-"""Log-likelihood below that of the best hyperparameters at which a set of them is left out of the mean and the band.
-Chosen: a weight of 0.7 % of the best; at twice of it the band is the same within a hundredth and takes four times as
-long."""
 
-GRID_POINTS = 30
-"""Points over a variable at which the standard error of a force is evaluated. Chosen: more than it has splines."""
+GRID_POINTS = 30  # Points over a variable at which the standard error of a force is evaluated (chosen)
 
 
 @dataclass(frozen=True)
 class CoefficientLikelihood:
-    """Quadratic log-likelihood of the spline coefficients, all other unknowns integrated out.
-
-    `information` and `score` are about coefficients of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to
-    the best coefficients. `log_determinant` is that of the information on all other unknowns.
+    """Quadratic log-likelihood of the spline coefficients, all other unknowns integrated out. `information` and `score`
+    are about coefficients of zero, where χ² is `chi2_at_zero`; `delta_chi2` is its fall to the best coefficients.
+    `log_determinant` is that of the information on all other unknowns.
     """
 
     information: Floats
@@ -67,10 +63,9 @@ class CoefficientLikelihood:
 
 @dataclass(frozen=True)
 class ForcePosterior:
-    """Posterior of a force under one condition at the start of growth.
-
-    `log_evidence` is the log marginal likelihood, averaged over amplitude and length scales; `surface` has the most
-    likely ones. `mean`, N, and `covariance`, N², are those of the spline coefficients; `chi2` is that of the mean.
+    """Posterior of a force under one condition at the start of growth. `log_evidence` is the log marginal likelihood,
+    averaged over amplitude and length scales; `surface` has the most likely ones. `mean`, N, and `covariance`, N², are
+    those of the spline coefficients; `chi2` is that of the mean.
     """
 
     at_start: str
@@ -87,16 +82,8 @@ class ForcePosterior:
         return self.surface.domain
 
     def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Posterior mean of the force at values of the variables, and its standard error.
-
-        Parameters
-        ----------
-        values : sequence of arrays, shape (n,), SI
-            One a variable.
-
-        Returns
-        -------
-        force, sigma : arrays, shape (n,), N
+        """Posterior mean of the force at values of the variables, and its standard error. Returns force, sigma :
+        arrays, shape (n,), N. Shapes: values (n,).
         """
         basis = self.domain.basis(values)
         return basis @ self.mean, standard_error(basis, self.covariance)
@@ -104,9 +91,8 @@ class ForcePosterior:
 
 @dataclass(frozen=True)
 class VariableChoice:
-    """A choice of variables with its log marginal likelihood, and the posterior under each start condition.
-
-    The marginal likelihood is averaged over the start conditions.
+    """A choice of variables with its log marginal likelihood, and the posterior under each start condition. The
+    marginal likelihood is averaged over the start conditions.
     """
 
     domain: Domain
@@ -114,20 +100,9 @@ class VariableChoice:
     posteriors: tuple[ForcePosterior, ...]
 
     def best(self, error: float = 1.0) -> ForcePosterior:
-        """The posterior that is drawn; differences of ln Z count in units of `error`.
-
-        The force is zero where growth begins, or a constant where that is more likely. It is free there only if that is
-        worth Δχ² of 9, because B, n and P_y could take over such a force. The covariance is that of the mixture of zero
-        and constant, weighted by their marginal likelihoods.
-
-        Parameters
-        ----------
-        error : float
-            Standard error of ln Z.
-
-        Returns
-        -------
-        ForcePosterior
+        """The posterior that is drawn; differences of ln Z count in units of `error`. The force is zero where growth
+        begins, or a constant where that is more likely. It is free there only if that is worth Δχ² of 9, because B, n
+        and P_y could take over such a force.
         """
         restricted = [each for each in self.posteriors if each.at_start != FREE_AT_START]
         free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
@@ -145,9 +120,8 @@ class VariableChoice:
 
     @property
     def undecided_N(self) -> float:
-        """Standard error of a force that is free where growth begins, N: its median over the other variable.
-
-        B, n and P_y compete with such a force.
+        """Standard error of a force that is free where growth begins, N: its median over the other variable. B, n and
+        P_y compete with such a force.
         """
         free = [each for each in self.posteriors if each.at_start == FREE_AT_START]
         if not free or self.domain.start_axis < 0:
@@ -159,17 +133,8 @@ class VariableChoice:
         return float(np.median(free[0].force(grid)[1]))
 
     def with_start(self, at_start: str) -> SmoothForce:
-        """A force with the most likely hyperparameters, but with this condition at the start of growth.
-
-        While motions do not yet include the force, their defect at the start would be fitted as a force there.
-
-        Parameters
-        ----------
-        at_start : str
-
-        Returns
-        -------
-        SmoothForce
+        """A force with the most likely hyperparameters, but with this condition at the start of growth. While motions
+        do not yet include the force, their defect at the start would be fitted as a force there.
         """
         likely = max(self.posteriors, key=lambda each: each.log_evidence)
         modes = self.domain.prior_modes(likely.length_scales, at_start, SEARCHED_VARIANCE)
@@ -177,17 +142,7 @@ class VariableChoice:
 
 
 def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> CoefficientLikelihood:
-    """Integrate out all unknowns but the force coefficients, after scaling each unknown to unit information.
-
-    Parameters
-    ----------
-    point : where the search stands.
-    normal : its normal equations.
-
-    Returns
-    -------
-    CoefficientLikelihood
-    """
+    """Integrate out all unknowns but the force coefficients, after scaling each unknown to unit information."""
     p, q = point.theta.size, point.amplitude.size
     size = np.diag(normal.matrix)
     unit = np.where(size > 0, 1 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
@@ -219,21 +174,7 @@ def coefficient_likelihood(point: SearchPoint, normal: NormalEquations) -> Coeff
 def marginal_likelihood(
     domain: Domain, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
 ) -> VariableChoice:
-    """Average the marginal likelihood of a domain over start conditions, length scales and amplitudes.
-
-    Parameters
-    ----------
-    domain : the variables.
-    likelihood : that of the spline coefficients.
-    inflation : float
-        Factor by which the residual variance exceeds that of the noise.
-    largest_N : float
-        The largest drive of any trial.
-
-    Returns
-    -------
-    VariableChoice
-    """
+    """Average the marginal likelihood of a domain over start conditions, length scales and amplitudes."""
     posteriors = tuple(
         _force_posterior(domain, at_start, likelihood, inflation, largest_N) for at_start in domain.start_conditions
     )
@@ -244,9 +185,8 @@ def marginal_likelihood(
 def _force_posterior(
     domain: Domain, at_start: str, likelihood: CoefficientLikelihood, inflation: float, largest_N: float
 ) -> ForcePosterior:
-    """The posterior under one start condition, averaged over length scales and amplitudes by their likelihoods.
-
-    For given length scales the information in the prior's modes is diagonalised, so that the amplitude only changes how
+    """The posterior under one start condition, averaged over length scales and amplitudes by their likelihoods. For
+    given length scales the information in the prior's modes is diagonalised, so that the amplitude only changes how
     much each component is shrunk.
     """
     sizes_N = largest_N * RELATIVE_AMPLITUDES[:, None]
@@ -284,18 +224,8 @@ def _force_posterior(
 
 
 def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:
-    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two.
-
-    Parameters
-    ----------
-    choices : sequence of VariableChoice
-    error : float
-        Standard error of ln Z, in units of which its differences count.
-
-    Returns
-    -------
-    dict of float
-        By name of the choice, highest first.
+    """Posterior probabilities of choices of variables, with equal prior odds for one variable and for two. Returns by
+    name of the choice, highest first.
     """
     counts = {size: sum(len(choice.domain.variables) == size for choice in choices) for size in (1, 2)}
     highest = max(choice.log_evidence for choice in choices)

@@ -30,33 +30,25 @@ from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import whiten
 
-INDEPENDENT_POINTS_PER_TRIAL = 10.0
-"""Effective number of independent residuals in one trial: residuals of neighbouring frames are correlated. Chosen:
-residual correlation times of a tenth of a recording; half or twice moves the error of a force by 1.4."""
+INDEPENDENT_POINTS_PER_TRIAL = 10.0  # Effective number of independent residuals in one trial (chosen)
 
-MAX_TRIAL_EFFECT_ITERATIONS = 8
-"""Most iterations of the trial effects. Chosen."""
+MAX_TRIAL_EFFECT_ITERATIONS = 8  # Most iterations of the trial effects (chosen)
 
+# Part of the largest information below which a force amplitude is not estimable (chosen)
 LEAST_RELATIVE_INFORMATION = 1e-9
-"""Part of the largest information below which a force amplitude is not estimable: the force moves nothing, or only what
-the parameters move too. Chosen far below anything of weight."""
 
-PARAMETER_CUTOFF = 1e-11
-"""Relative eigenvalue below which a combination of model parameters is not estimable. Derived: sums of squares are
-rounded at 1e-14 of the largest, a thousandth of this."""
+PARAMETER_CUTOFF = 1e-11  # Relative eigenvalue below which a combination of model parameters is not estimable (derived)
 
+# Penalties on second differences among which generalised cross-validation chooses, relative to the mean information
+# about a coefficient (chosen)
 SMOOTHING_PENALTIES = np.geomspace(1e-6, 1e2, 17)
-"""Penalties on second differences among which generalised cross-validation chooses, relative to the mean information
-about a coefficient. Chosen: from no visible smoothing to a straight line, in steps of a factor of three."""
 
 
 @dataclass(frozen=True)
 class ForceEstimate:
-    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring.
-
-    `sigma` is the root mean square standard error of an amplitude. `parameter_shift` is how far the model parameters
-    move along, in the fit's own scaling. `degrees_of_freedom` counts the estimable amplitudes: by chance alone χ² falls
-    by as much.
+    """Least-squares estimate of force amplitudes, N, and the fall of χ² that they bring. `sigma` is the root mean
+    square standard error of an amplitude. `parameter_shift` is how far the model parameters move along, in the fit's
+    own scaling.
     """
 
     delta_chi2: float
@@ -72,19 +64,9 @@ class ForceEstimate:
 
 
 class LinearInversion:
-    """A fit linearised about its parameters and given trial effects, ready to estimate any number of forces.
-
-    The noise variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a
-    trial have the standard deviations estimated from replicates.
-
-    Parameters
-    ----------
-    fit : the fit that lacks a force.
-    trial_effects : array, shape (n_trials, 4)
-        Where the trial effects start. Each trial's effects are then optimised with the model parameters held, so that
-        the trajectories come as near to the tracks as their priors allow and little is left to a force.
-    scatter : Scatter
-        Between-trial standard deviations.
+    """A fit linearised about its parameters and given trial effects, ready to estimate any number of forces. The noise
+    variance is that of the tracks, so that misfit of the model does not count as noise. Pressure and B of a trial have
+    the standard deviations estimated from replicates.
     """
 
     def __init__(self, fit: Fit, trial_effects: Floats, scatter: Scatter) -> None:
@@ -113,18 +95,8 @@ class LinearInversion:
         return self.state.trial_effects
 
     def estimate_each(self, sensitivities: Sequence[Floats], columns: Sequence[int]) -> list[ForceEstimate]:
-        """Estimate each of several forces with none of the others present.
-
-        Parameters
-        ----------
-        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
-            Of the positions of each trial to the amplitudes of all forces, side by side.
-        columns : sequence of int
-            Number of amplitudes of each force.
-
-        Returns
-        -------
-        list of ForceEstimate
+        """Estimate each of several forces with none of the others present. Shapes: sensitivities (n_points,
+        n_columns).
         """
         products = self._products_without_trial_effects(sensitivities)
         matrix, cross, total = self._sums_over_trials(products)
@@ -137,28 +109,14 @@ class LinearInversion:
         ]
 
     def estimate_jointly(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
-        """Estimate all force amplitudes together, the same in every trial.
-
-        Parameters
-        ----------
-        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
-
-        Returns
-        -------
-        ForceEstimate
+        """Estimate all force amplitudes together, the same in every trial. Shapes: sensitivities (n_points,
+        n_columns).
         """
         return self.estimate_each(sensitivities, [sensitivities[0].shape[1]])[0]
 
     def estimate_by_condition(self, sensitivities: Sequence[Floats]) -> ForceEstimate:
-        """Estimate all force amplitudes together, with separate amplitudes for each condition.
-
-        Parameters
-        ----------
-        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
-
-        Returns
-        -------
-        ForceEstimate
+        """Estimate all force amplitudes together, with separate amplitudes for each condition. Shapes: sensitivities
+        (n_points, n_columns).
         """
         names = list(dict.fromkeys(self.conditions))
         count = sensitivities[0].shape[1]
@@ -179,25 +137,9 @@ class LinearInversion:
         return float(total[-1, -1] - cross[:, -1] @ covariance @ cross[:, -1])
 
     def bic(self, delta_chi2: float, n_parameters: int, largest_delta_chi2: float) -> float:
-        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better.
-
-        The misfit that not even the best force explains is counted as further noise: it inflates the variance of every
-        independent residual.
-
-        Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
-
-        Parameters
-        ----------
-        delta_chi2 : float
-            The fall of χ² with this force.
-        n_parameters : int
-            Parameters of the force.
-        largest_delta_chi2 : float
-            The largest fall of χ² with any force.
-
-        Returns
-        -------
-        float
+        """Bayesian information criterion of a force, relative to the force that explains most: smaller is better. The
+        misfit that not even the best force explains is counted as further noise: it inflates the variance of every
+        independent residual. Source: Schwarz, Annals of Statistics 6, 461 (1978), with χ² divided by that inflation.
         """
         independent_points = INDEPENDENT_POINTS_PER_TRIAL * len(self.data)
         unexplained = max(self.chi2_without_force - largest_delta_chi2 - self.n_points, 0.0)
@@ -207,22 +149,11 @@ class LinearInversion:
     def smooth_force_by_condition(
         self, sensitivities: Sequence[Floats], parameter_shift: Floats
     ) -> dict[str, tuple[Floats, Floats]]:
-        """Estimate a smooth force in every condition: spline coefficients and their covariance.
-
-        The coefficients minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx 1996). One
-        penalty for all conditions is chosen by generalised cross-validation.
-
-        Parameters
-        ----------
-        sensitivities : sequence of arrays, shape (n_points, n_columns), m/N
-            To the coefficients of the splines.
-        parameter_shift : array, shape (n_free,)
-            How far the model parameters are moved beforehand, scaled.
-
-        Returns
-        -------
-        dict of (coefficients, covariance)
-            By condition; shapes (n_columns,) in N and (n_columns, n_columns) in N².
+        """Estimate a smooth force in every condition: spline coefficients and their covariance. The coefficients
+        minimise χ² plus a penalty on their second differences (a P-spline, Eilers & Marx 1996). One penalty for all
+        conditions is chosen by generalised cross-validation. Returns dict of (coefficients, covariance): By condition;
+        shapes (n_columns,) in N and (n_columns, n_columns) in N². Shapes: sensitivities (n_points, n_columns);
+        parameter_shift (n_free,).
         """
         products = self._products_without_trial_effects(sensitivities)
         k = self.problem.index.shape[1]
@@ -258,9 +189,8 @@ class LinearInversion:
         return {name: (best[1][i], inflation * best[2][i]) for i, name in enumerate(names)}
 
     def _products_without_trial_effects(self, sensitivities: Sequence[Floats]) -> Floats:
-        """Cross products of [parameters, forces, residual] of each trial, its trial effects eliminated.
-
-        Shape (n_trials, n_keys + n_forces + 1, the same again).
+        """Cross products of [parameters, forces, residual] of each trial, its trial effects eliminated. Shape
+        (n_trials, n_keys + n_forces + 1, the same again).
         """
         products = []
         for i, (columns, of_force) in enumerate(zip(self.columns, sensitivities, strict=True)):
@@ -276,9 +206,8 @@ class LinearInversion:
         return np.array(products)
 
     def _sums_over_trials(self, products: Floats) -> tuple[Floats, Floats, Floats]:
-        """Normal equations over all trials, with the priors of the p model parameters.
-
-        Blocks: parameters by parameters (p, p); parameters by [forces, residual] (p, L + 1); the latter by themselves.
+        """Normal equations over all trials, with the priors of the p model parameters. Blocks: parameters by parameters
+        (p, p); parameters by [forces, residual] (p, L + 1); the latter by themselves.
         """
         k, p = self.problem.index.shape[1], self.prior_score.size
         index = self.problem.index
@@ -292,9 +221,8 @@ class LinearInversion:
         return matrix, cross, products[:, k:, k:].sum(axis=0)
 
     def _estimate(self, products: Floats, parameter_response: Floats, reduced: Floats, columns: slice) -> ForceEstimate:
-        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated.
-
-        Its standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
+        """The force whose amplitudes are in `columns`, from the equations with all other unknowns eliminated. Its
+        standard error is the larger of the model-based one and the cluster-robust one with trials as clusters.
         """
         information, score = reduced[columns, columns], reduced[columns, -1]
         size = np.diag(information)
@@ -331,20 +259,8 @@ class LinearInversion:
 
 
 def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.bool_] | None = None) -> Floats:
-    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1.
-
-    Parameters
-    ----------
-    matrix : array, shape (n, n)
-    cutoff : float
-        Eigenvalues of the scaled matrix below this part of the largest count as zero.
-    estimable : array of bool, shape (n,), optional
-        Rows that take part; those with a positive diagonal where None.
-
-    Returns
-    -------
-    array, shape (n, n)
-        Zero in the rows and columns that do not take part.
+    """Pseudo-inverse of a symmetric matrix after scaling its diagonal to 1. Returns zero in the rows and columns that
+    do not take part. Shapes: matrix (n, n); estimable (n,) → (n, n).
     """
     diagonal = np.diag(matrix)
     scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)

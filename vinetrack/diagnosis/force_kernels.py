@@ -12,24 +12,10 @@ from vinetrack.core.records import Floats
 def integrate_responses(
     time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
 ) -> tuple[Floats, Floats]:
-    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion.
-
-    The method is the L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by
-    Alexander, SIAM J. Numer. Anal. 14, 1006 (1977).
-
-    Parameters
-    ----------
-    time_s : array, shape (n_trials, n_steps + 1), s
-    stiffness, friction : arrays, shape (n_trials, n_steps + 1), 1/s² and 1/s
-        k = ∂a/∂x and c = ∂a/∂ẋ along the motions.
-    acceleration : array, shape (n_trials, n_steps + 1, n), m/s²
-        Added accelerations.
-    gamma : float
-        Diagonal coefficient of the scheme: the first stage lies at this part of a step.
-
-    Returns
-    -------
-    position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and m/s
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
+    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
+    Anal. 14, 1006 (1977). Returns position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and
+    m/s. Shapes: time_s, stiffness, friction (n_trials, n_steps + 1); acceleration (n_trials, n_steps + 1, n).
     """
     trials, points, count = acceleration.shape
     position_change, velocity_change = np.zeros_like(acceleration), np.zeros_like(acceleration)

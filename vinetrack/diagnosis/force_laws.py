@@ -17,53 +17,36 @@ from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
+# Number of positions of a local force, and its widths as parts of the growth (chosen)
 PATCH_CENTRES, PATCH_WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
-"""Number of positions of a local force, and its widths as parts of the growth. Chosen: neighbours overlap by half."""
 
-N_PERIODS = 24
-"""Periods in the grid. Chosen: each a tenth shorter than the one before."""
+N_PERIODS = 24  # Periods in the grid (chosen)
 
-LONGEST_PERIOD, SHORTEST_PERIOD = 0.6, 0.04
-"""As parts of the growth. Longer periods look like straight lines; shorter ones leave no trace in positions. Derived:
-two inertial lengths of the fastest vine, and 1.5 periods in the growth."""
+LONGEST_PERIOD, SHORTEST_PERIOD = 0.6, 0.04  # As parts of the growth (derived)
 
+# Decay scales in the grid, as parts of the largest growth, speed or time (chosen)
 RELATIVE_SCALES = (0.04, 0.1, 0.2, 0.4)
-"""Decay scales in the grid, as parts of the largest growth, speed or time. Chosen in factors of two."""
 
+# Part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest (chosen)
 LEAST_RELATIVE_SPEED = 0.05
-"""Part of the highest speed below which 1/ẋ is held constant, because a vine starts from rest. Chosen: below it,
-positions hardly determine the speed."""
 
-EDGE_FRACTION = 0.1
-"""Part of a patch's width over which the force rises at each end. Chosen: sharp compared with the patch, smooth
-compared with a frame."""
+EDGE_FRACTION = 0.1  # Part of a patch's width over which the force rises at each end (chosen)
 
-START_FRACTION = 0.05
-"""Part of the growth over which a vine accelerates: a force there does not count as the largest. Chosen; only the
-wording depends on it."""
+START_FRACTION = 0.05  # Part of the growth over which a vine accelerates (chosen)
 
-LEAST_PATCH_M = 1e-3
-"""Least width of a local force that is reported. Chosen: its ends are printed in millimetres; at half of it both ends
-could be the same number, at twice a narrow obstacle goes unreported."""
+LEAST_PATCH_M = 1e-3  # Least width of a local force that is reported (chosen)
 
+# Positions and speeds in the grid above which a force may set in (chosen)
 N_THRESHOLD_POSITIONS, N_THRESHOLD_SPEEDS = 8, 8
-"""Positions and speeds in the grid above which a force may set in. Chosen: the nonlinear fit finds values between them.
-Powers of the speed are 1, 2 and 3 only: a power near n is the damping itself, and trades off against B without
-limit."""
 
-SAME_AREA_RATIO = 1.02
-"""Ratio of cross-sections up to which two vines count as equally wide. Chosen: twice the error of a diameter of 0.5
-%."""
+SAME_AREA_RATIO = 1.02  # Ratio of cross-sections up to which two vines count as equally wide (chosen)
 
 
 @dataclass(frozen=True)
 class Law:
-    """One form of force along a motion.
-
-    `kind` names it; `low` and `high` are the ends of a patch (m of growth), `scale` its period, decay scale or
-    threshold. `factor` is the variable that it is multiplied by: "position", "speed", "pressure" or nothing. `n_shapes`
-    counts shape parameters, `n_amplitudes` amplitudes. With a `reference_area_m2` the force is proportional to the
-    cross-section over that area. `peak` is the largest value of the bare expression along the fitted motions.
+    """One form of force along a motion. `kind` names it; `low` and `high` are the ends of a patch (m of growth),
+    `scale` its period, decay scale or threshold. `factor` is the variable that it is multiplied by: "position",
+    "speed", "pressure" or nothing.
     """
 
     kind: str
@@ -108,81 +91,28 @@ class Law:
         return ("low", "high") if self.kind == "patch" else ("scale",) * self.n_shapes
 
     def size_of(self, name: str) -> float:
-        """Scale on which a shape parameter changes the law.
-
-        Parameters
-        ----------
-        name : str
-            One of `shape_names`.
-
-        Returns
-        -------
-        float
-        """
+        """Scale on which a shape parameter changes the law."""
         return self.high - self.low if self.kind == "patch" else float(getattr(self, name))
 
     def shifted(self, name: str, by: float) -> Law:
-        """The law with one shape parameter changed.
-
-        Parameters
-        ----------
-        name : str
-            One of `shape_names`.
-        by : float
-            Added to it.
-
-        Returns
-        -------
-        Law
-        """
+        """The law with one shape parameter changed."""
         return replace(self, **{name: getattr(self, name) + by})
 
     def within_growth(self, growth_m: float) -> Law:
-        """The law with the ends of a patch kept inside the growth, apart from its rounded edges.
-
-        Parameters
-        ----------
-        growth_m : float
-            Growth of the longest trial, m.
-
-        Returns
-        -------
-        Law
-        """
+        """The law with the ends of a patch kept inside the growth, apart from its rounded edges."""
         if self.kind != "patch":
             return self
         edge = EDGE_FRACTION * (self.high - self.low)
         return replace(self, low=max(self.low, -edge), high=min(self.high, growth_m + edge))
 
     def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion.
-
-        Parameters
-        ----------
-        motion
-            A fitted motion.
-
-        Returns
-        -------
-        array, shape (n_times, n_amplitudes), N
-        """
+        """The force of each unit amplitude along a motion. Shape (n_times, n_amplitudes)."""
         size = (motion.trial.area_m2 / self.reference_area_m2 if self.reference_area_m2 else 1.0) / self.peak
         force = size * _EXPRESSIONS[self.kind](self, motion)
         return force * _EXPRESSIONS[self.factor](self, motion) if self.factor else force
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
-        """Describe the law with its size.
-
-        Parameters
-        ----------
-        amplitude_N : sequence of float, N
-        sigma_N : float, N
-            Standard error of the amplitude.
-
-        Returns
-        -------
-        str
-        """
+        """Describe the law with its size."""
         if self.kind == "periodic":
             size = f"with an amplitude of {_with_error(math.hypot(*amplitude_N), sigma_N)}"
         else:
@@ -245,6 +175,7 @@ _EXPRESSIONS = {
     "patch": _patch,
     "periodic": _periodic,
 }
+# The variable that each kind but the constant depends on
 VARIABLE_OF_KIND = {
     **dict.fromkeys(("position", "position_squared", "beyond_a_place", "fading_along", "patch", "periodic"), "growth"),
     **dict.fromkeys(("speed", "speed_squared", "speed_cubed", "beyond_a_speed", "squared_beyond_a_speed"), "speed"),
@@ -252,11 +183,9 @@ VARIABLE_OF_KIND = {
     **dict.fromkeys(("time", "fading_in_time"), "time"),
     "pressure": "pressure",
 }
-"""The variable that each kind but the constant depends on."""
 
+# Kinds that peak at rest, where positions do not determine the speed: their size is stated at the lowest speed observed
 _LARGEST_AT_REST = ("inverse_speed", "falling_with_speed")
-"""Kinds that peak at rest, where positions do not determine the speed: their size is stated at the lowest speed
-observed."""
 
 _WORDS = {
     "constant": "a constant force of {size}",
@@ -283,15 +212,13 @@ _WORDS = {
 }
 
 
+# Products in the grid (chosen)
 _PRODUCTS = {
     **dict.fromkeys(("position", "position_squared", "fading_along", "beyond_a_place"), ("speed", "pressure")),
     **dict.fromkeys(("speed", "speed_squared", "inverse_speed"), ("pressure",)),
     "speed_squared": ("position", "pressure"),
     "falling_with_speed": ("pressure",),
 }
-"""Products in the grid: a function of the growth times the speed or the pressure, and one of the speed times the travel
-or the pressure, each product once. Chosen: a fall with speed times the travel is left out, because x exp(−ẋ/v₀) is
-nearly x/ẋ, which is time, and would be reported in its place."""
 
 _FACTOR_WORDS = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
 
@@ -306,16 +233,7 @@ class _Range:
 
 
 def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
-    """The grid of all laws; where vines differ in width, also each in proportion to the cross-section.
-
-    Parameters
-    ----------
-    motions : sequence of FittedMotion
-
-    Returns
-    -------
-    list of Law
-    """
+    """The grid of all laws; where vines differ in width, also each in proportion to the cross-section."""
     visited = _visited_range(motions)
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
@@ -343,17 +261,7 @@ def laws_on_grid(motions: Sequence[FittedMotion]) -> list[Law]:
 
 
 def laws_near(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
-    """Laws near the best of the grid: its position, width, period or scale varied by less than a step of the grid.
-
-    Parameters
-    ----------
-    law : the best of the grid.
-    motions : sequence of FittedMotion
-
-    Returns
-    -------
-    list of Law
-    """
+    """Laws near the best of the grid: its position, width, period or scale varied by less than a step of the grid."""
     if law.kind == "patch":
         centre, width = (law.low + law.high) / 2, law.high - law.low
         step = _visited_range(motions).growth_m / PATCH_CENTRES

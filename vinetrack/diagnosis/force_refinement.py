@@ -37,49 +37,33 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import whiten
 
-MAX_STEPS, MOTION_CORRECTIONS = 12, 2
-"""Most Gauss-Newton steps, and corrections of the motions at each. Chosen: every correction leaves a tenth of the
-error."""
+MAX_STEPS, MOTION_CORRECTIONS = 12, 2  # Most Gauss-Newton steps, and corrections of the motions at each (chosen)
 
+# The first steps are undamped Gauss-Newton steps, taken even where the cost rises (chosen)
 UNDAMPED_STEPS, STEPS_WITH_SHAPE_HELD = 5, 2
-"""The first steps are undamped Gauss-Newton steps, taken even where the cost rises: pressure and B of a trial act
-nearly alike, so that a first step along their difference overshoots and the next ones correct it. The shape parameters
-are held for the first two. Chosen; the damped steps that follow make up for a bad choice."""
 
-MAX_STEPS_ON_TRACKS = 10
-"""Most steps on motions that lie on the tracks, before motions respond to the force. Chosen: parameters in which the
-model is nonlinear, such as n, settle in three to six; at half of it some have not, at twice only time is spent."""
+MAX_STEPS_ON_TRACKS = 10  # Most steps on motions that lie on the tracks, before motions respond to the force (chosen)
 
+# Damping factors of Levenberg and Marquardt, for steps that must lower the cost (chosen)
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
-"""Damping factors of Levenberg and Marquardt, for steps that must lower the cost: that of a search after undamped steps
-failed, and the least. Chosen as usual for the method; only time depends on it."""
 
-UNDAMPED_SUCCESS = 0.5
-"""Part of χ² above which the undamped steps have failed. Chosen: half of χ²."""
+UNDAMPED_SUCCESS = 0.5  # Part of χ² above which the undamped steps have failed (chosen)
 
+# Step of finite differences, in the fit's scaling of parameters, and relative for shape parameters (derived)
 DIFFERENCE_STEP = 1e-3
-"""Step of finite differences, in the fit's scaling of parameters, and relative for shape parameters. Derived: 1000
-times the integrator's error."""
 
-LAST_LENGTH_FRACTION = 0.96
-"""Part of the length up to which points are used. Chosen: a hundredth beyond the fit's END_FRACTION."""
+LAST_LENGTH_FRACTION = 0.96  # Part of the length up to which points are used (chosen)
 
-CONVERGENCE_TOLERANCE = 1e-3
-"""Relative fall of χ² below which the search ends. Chosen: a thousandth of χ² changes no law's rank."""
+CONVERGENCE_TOLERANCE = 1e-3  # Relative fall of χ² below which the search ends (chosen)
 
-SHAPE_CUTOFF = 1e-12
-"""Relative eigenvalue of the scaled normal matrix below which a direction does not move. Derived: sums of squares are
-rounded at 1e-14 of the largest."""
+SHAPE_CUTOFF = 1e-12  # Relative eigenvalue of the scaled normal matrix below which a direction does not move (derived)
 
-MAX_RELATIVE_SHAPE_STEP = 0.2
-"""Part of its size by which a shape parameter may move in one step. Chosen: less than the width over which a law
-changes."""
+MAX_RELATIVE_SHAPE_STEP = 0.2  # Part of its size by which a shape parameter may move in one step (chosen)
 
 
 @dataclass(frozen=True)
 class RefinedLaw:
     """A law after the nonlinear fit: amplitudes and the standard error of one, N, and the χ² that remains.
-
     `parameter_shift` is how far the model parameters moved, in the fit's own scaling.
     """
 
@@ -92,10 +76,9 @@ class RefinedLaw:
 
 @dataclass(frozen=True)
 class SearchPoint:
-    """The unknowns at one point of a search, and the motions that they are linearised about.
-
-    Where `motions_include_force`, the motions are those of these parameters and this force. Otherwise they are others
-    near by, and their defect (by how much they violate the equation of motion) is carried as a residual.
+    """The unknowns at one point of a search, and the motions that they are linearised about. Where
+    `motions_include_force`, the motions are those of these parameters and this force. Otherwise they are others near
+    by, and their defect (by how much they violate the equation of motion) is carried as a residual.
     """
 
     theta: Floats
@@ -108,9 +91,8 @@ class SearchPoint:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Gauss-Newton equations `matrix` · step = `score` at a point, and the cost there (χ² with all priors).
-
-    Unknowns in order: model parameters, amplitudes, shape parameters, effects of each trial.
+    """Gauss-Newton equations `matrix` · step = `score` at a point, and the cost there (χ² with all priors). Unknowns in
+    order: model parameters, amplitudes, shape parameters, effects of each trial.
     """
 
     cost: float
@@ -127,23 +109,7 @@ def refine_law(
     *,
     thorough: bool = False,
 ) -> RefinedLaw | None:
-    """Fit a law by nonlinear least squares, starting from the linear inversion.
-
-    Parameters
-    ----------
-    fit : the fit that lacks the force.
-    inversion : its linearisation.
-    motions : sequence of FittedMotion
-        The fitted motions about which it is linear.
-    law : form of the force.
-    linear : its linear estimate.
-    thorough : bool
-        Whether to search again with damped steps where the undamped ones fail.
-
-    Returns
-    -------
-    RefinedLaw, or None where the motions cannot be simulated
-    """
+    """Fit a law by nonlinear least squares, starting from the linear inversion."""
     start = SearchPoint(inversion.state.theta, inversion.trial_effects, law, 0.0 * linear.amplitude, list(motions))
     best = _gauss_newton(fit, inversion, start, 0.0)
     if thorough and (best is None or best[1].cost > UNDAMPED_SUCCESS * inversion.chi2_without_force):
@@ -166,18 +132,7 @@ def refine_law(
 
 
 def optimise_smooth_force(fit: Fit, inversion: LinearInversion, start: SearchPoint) -> SearchPoint | None:
-    """Find the most probable smooth force under the prior of its amplitudes, with all other unknowns free.
-
-    Parameters
-    ----------
-    fit : the fit that lacks the force.
-    inversion : its linearisation.
-    start : where the search starts. If its motions do not include the force, the parameters first settle on them.
-
-    Returns
-    -------
-    SearchPoint, or None where the motions cannot be simulated
-    """
+    """Find the most probable smooth force under the prior of its amplitudes, with all other unknowns free."""
     begin = start if start.motions_include_force else _settled_on_tracks(fit, inversion, start)
     best = _gauss_newton(fit, inversion, begin, LEAST_DAMPING)
     return None if best is None else best[0]
@@ -235,18 +190,7 @@ def _settled_on_tracks(fit: Fit, inversion: LinearInversion, start: SearchPoint)
 
 
 def normal_equations(fit: Fit, inversion: LinearInversion, point: SearchPoint) -> NormalEquations:
-    """Gauss-Newton equations of all unknowns at a point.
-
-    Parameters
-    ----------
-    fit : the fit that lacks the force.
-    inversion : its linearisation, which holds the noise and the priors.
-    point : where the equations are taken.
-
-    Returns
-    -------
-    NormalEquations
-    """
+    """Gauss-Newton equations of all unknowns at a point."""
     theta, trial_effects, q, s = point.theta, point.trial_effects, point.amplitude.size, len(point.law.shape_names)
     problem = inversion.problem
     p, n = theta.size, trial_effects.shape[0]
@@ -355,10 +299,9 @@ def _observed(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
 
 
 def _acceleration_derivatives(fit: Fit, point: SearchPoint) -> list[Floats]:
-    """Derivatives of the acceleration along each motion, shape (n_times, n).
-
-    By [pressure and B of the trial, every model parameter, amplitudes, shape parameters]. Where the motions do not
-    include the force, a last column holds their defect.
+    """Derivatives of the acceleration along each motion, shape (n_times, n). By [pressure and B of the trial, every
+    model parameter, amplitudes, shape parameters]. Where the motions do not include the force, a last column holds
+    their defect.
     """
     layout, theta = fit.predictor.layout, point.theta
     jobs = fit.predictor.jobs(theta, point.trial_effects)

@@ -27,32 +27,21 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import RELEASE
 from vinetrack.inference.trajectory_jobs import Job
 
-N_STEPS = 400
-"""Steps of a motion, denser at its start. Derived: the second-order method errs by 1e-5 with 400 steps, and by 1e-3 for
-what happens within a hundredth of the motion."""
+N_STEPS = 400  # Steps of a motion, denser at its start (derived)
 
+# Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer
 SDIRK_GAMMA = 1 - 1 / math.sqrt(2)
-"""Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer. Anal. 14, 1006
-(1977): it stays stable where friction relaxes much faster than a step."""
 
-EXTRA_FRAMES = 3.0
-"""Frames by which a motion is integrated beyond its recording, in case its release moves. Chosen: a release moves by
-less than a frame."""
+EXTRA_FRAMES = 3.0  # Frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
 
+# Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
 LEAST_RELATIVE_SPEED = 1e-3
-"""Part of the highest speed below which a vine counts as standing still and does not respond to a small force. Chosen:
-motion below a thousandth of the top speed is not visible."""
 
 
 @dataclass(frozen=True)
 class FittedMotion:
-    """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI.
-
-    `mass_kg` is all moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ. `model_acceleration` is the tail's
-    acceleration by the model's forces, `acceleration` that of this motion: they differ where the motion does not
-    satisfy the model. `observed_slope` is the derivative of the observed position by the true position of the leading
-    edge, `observation_offset_m` their difference. Growth ends at `end_s`; positions are used until `counts_until_s`.
-    `model` holds the trial's own parameter values, `measured_Pa` the pressure where it is prescribed.
+    """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI. `mass_kg` is all
+    moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ.
     """
 
     trial: Trial
@@ -84,23 +73,8 @@ class FittedMotion:
 
 
 def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> list[FittedMotion]:
-    """Simulate the fitted motions with given trial effects and, optionally, other model parameters.
-
-    Parameters
-    ----------
-    fit : the fit whose model is simulated.
-    trial_effects : array, shape (n_trials, 4)
-    theta : array, shape (n_free,), optional
-        Model parameters, scaled; those of the fit where None.
-
-    Returns
-    -------
-    list of FittedMotion
-
-    Raises
-    ------
-    SimulationError
-        If a trajectory cannot be integrated.
+    """Simulate the fitted motions with given trial effects and, optionally, other model parameters. Shapes:
+    trial_effects (n_trials, 4); theta (n_free,).
     """
     predictor = fit.predictor
     jobs = predictor.jobs(fit.solution.state.theta if theta is None else theta, trial_effects)
@@ -121,19 +95,7 @@ def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> 
 
 
 def trial_of_job(trial: Trial, job: Job) -> Trial:
-    """The trial with the pressure and yield pressure that its job simulates.
-
-    Parameters
-    ----------
-    trial
-        Row of the sheet.
-    job
-        Trajectory to simulate.
-
-    Returns
-    -------
-    Trial
-    """
+    """The trial with the pressure and yield pressure that its job simulates."""
     yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
     return replace(trial, pressure_Pa=trial.pressure_Pa * (1 + job.pressure_deviation), yield_pressure_Pa=yield_Pa)
 
@@ -154,17 +116,7 @@ def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[
 
 
 def with_model_terms(motion: FittedMotion) -> FittedMotion:
-    """The motion with acceleration, mass, stiffness and friction of the model evaluated along it.
-
-    Parameters
-    ----------
-    motion
-        A fitted motion.
-
-    Returns
-    -------
-    FittedMotion
-    """
+    """The motion with acceleration, mass, stiffness and friction of the model evaluated along it."""
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
     step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
     at_motion, further, faster = (
@@ -197,21 +149,8 @@ def _observed_slope(run: Trajectory) -> Floats:
 def force_sensitivities(
     fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats]
 ) -> list[Floats]:
-    """Derivatives of the observed positions of every trial with respect to force amplitudes.
-
-    Parameters
-    ----------
-    fit : the fit whose model is simulated.
-    trial_effects : array, shape (n_trials, 4)
-    motions : sequence of FittedMotion
-        One a trial.
-    force : callable
-        Gives the forces of unit amplitude along a motion, N, shape (N_STEPS + 1, n_forces).
-
-    Returns
-    -------
-    list of arrays, shape (n_points, n_forces), m
-        One a trial.
+    """Derivatives of the observed positions of every trial with respect to force amplitudes. Shapes: trial_effects
+    (n_trials, 4) → (n_points, n_forces).
     """
     return acceleration_sensitivities(
         fit, trial_effects, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions]
@@ -221,20 +160,8 @@ def force_sensitivities(
 def acceleration_sensitivities(
     fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], accelerations: Sequence[Floats]
 ) -> list[Floats]:
-    """As `force_sensitivities`, for added accelerations of the tail in place of forces.
-
-    Parameters
-    ----------
-    fit : the fit whose model is simulated.
-    trial_effects : array, shape (n_trials, 4)
-    motions : sequence of FittedMotion
-        One a trial.
-    accelerations : sequence of arrays, shape (N_STEPS + 1, n), m/s²
-        Added accelerations of the tail in each trial.
-
-    Returns
-    -------
-    list of arrays, shape (n_points, n), m
+    """As `force_sensitivities`, for added accelerations of the tail in place of forces. Shapes: trial_effects
+    (n_trials, 4); accelerations (N_STEPS + 1, n) → (n_points, n).
     """
     dx, _ = _responses(motions, np.array(accelerations))
     return [
@@ -250,22 +177,9 @@ def acceleration_sensitivities(
 def with_force(
     motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats], rounds: int
 ) -> list[FittedMotion]:
-    """The motions under an added force on the tail that need not be small.
-
-    Each correction leaves about a tenth of the error of the one before. Motions that do not satisfy their models are
-    corrected to do so. The stiffness and friction returned include the force.
-
-    Parameters
-    ----------
-    motions : sequence of FittedMotion
-    force : callable
-        Force along a motion, N, shape (N_STEPS + 1,).
-    rounds : int
-        Number of corrections.
-
-    Returns
-    -------
-    list of FittedMotion
+    """The motions under an added force on the tail that need not be small. Each correction leaves about a tenth of the
+    error of the one before. Motions that do not satisfy their models are corrected to do so. The stiffness and friction
+    returned include the force.
     """
     for _ in range(rounds):
         motions = [_with_force_derivatives(motion, force) for motion in motions]

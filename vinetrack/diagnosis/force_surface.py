@@ -8,15 +8,7 @@ where u are the variables scaled to the range that the trials visited: the Maté
 Williams 2006, §4.2). Its functions are twice differentiable. The squared-exponential kernel exp(−½ s²), whose functions
 are infinitely smooth, gives bands that are far too narrow for a force such as a power of the growth: in a linear fit to
 draws they contain a third of the points instead of nearly all. The model is a penalised spline with an amplitude a, N,
-and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015). Its covariance
-matrix is diagonalised, and modes of negligible variance are dropped: `SmoothForce` holds the coefficients of the rest.
-
-B, n and P_y can take over part of any force: ½ΔB ẋⁿ more of a force that is the same all along the growth gives the
-same positions as ΔB more of B. No data identify the two separately, so that the force drawn follows a convention: B, n
-and P_y are those of the vine where growth begins, and the missing force is what acts in addition from there on. The
-process is conditioned on being zero there (§2.2 of the same book): at a growth of 0 or, without the growth, at 0 s
-since release. Where the tracks contradict this (`force_evidence`), a constant is added, or any function of the other
-variable with `START_FORCE_RATIO` times the amplitude (functional ANOVA, Gu 2013, ch. 2).
+and length scales ℓ_d as hyperparameters (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015).
 """
 
 from __future__ import annotations
@@ -33,93 +25,54 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.cubic_splines import N_NONZERO, nonzero_splines, uniform_knots
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
+# What a force may depend on, and the attribute of a motion that holds it
 VARIABLES = {
     "growth": "lead_position_m",
     "speed": "tail_velocity_m_s",
     "time": "time_s",
     "pressure": "pressure_Pa",
 }
-"""What a force may depend on, and the attribute of a motion that holds it."""
 
 SPLINES_ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+# Splines along a variable, when it is alone and when it is one of two (chosen)
 SPLINES_IN_PAIR = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
-"""Splines along a variable, when it is alone and when it is one of two. Chosen: as fine as positions resolve, which
-respond to the second integral of a force; half as many miss waves of a quarter of the growth, twice as many cost four
-times the time."""
 
+# Length scales that are averaged over, as parts of the visited range (chosen)
 LENGTH_SCALES = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
-"""Length scales that are averaged over, as parts of the visited range. Chosen: from the finest that the splines resolve
-to one that leaves hardly more than a straight line; a finer grid changes no weight by more than a tenth."""
 
+# Amplitudes that are averaged over, as parts of the largest drive (chosen)
 RELATIVE_AMPLITUDES = np.geomspace(0.003, 0.3, 9)
-"""Amplitudes that are averaged over, as parts of the largest drive. Chosen: from what no trial responds to up to a
-gross failure of the model; larger forces that B and n balance mislead the search where the model is far off."""
 
-KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4
-"""Relative variances below which a mode is dropped: from the marginal likelihood, and from the nonlinear search.
-Chosen: forces of a thousandth and of a hundredth of the largest; at a tenth of the second a search takes half as long
-again, at a hundred times the first bands miss half of the truth where noise is small."""
+KEPT_VARIANCE, SEARCHED_VARIANCE = 1e-6, 1e-4  # Relative variances below which a mode is dropped (chosen)
 
+# What a force may be where growth begins
 ZERO_AT_START, CONSTANT_AT_START, FREE_AT_START = "nothing", "a constant", "anything"
-"""What a force may be where growth begins."""
 
+# Prior amplitude of the force where growth begins, as a multiple of that of the rest of the surface (chosen)
 START_FORCE_RATIO = 3.0
-"""Prior amplitude of the force where growth begins, as a multiple of that of the rest of the surface. Chosen: B, n and
-P_y could hold most of it, so that the data say little; at half and at twice of it the band there is narrower and wider
-by as much."""
 
-LOGARITHMIC_VARIABLES = ("speed", "time")
-"""Variables on a logarithmic scale above their median. Chosen: they differ tenfold between slow and fast trials, where
-growth and pressure do not."""
+LOGARITHMIC_VARIABLES = ("speed", "time")  # Variables on a logarithmic scale above their median (chosen)
 
-SPEED_QUANTILE = 0.98
-"""Quantile of a trial's speeds that counts as its highest: the model's peak just after release is not observed.
-Chosen."""
+SPEED_QUANTILE = 0.98  # Quantile of a trial's speeds that counts as its highest (chosen)
 
+# Part of the highest pressure by which pressures must differ for pressure to be a variable (chosen)
 LEAST_PRESSURE_RANGE = 0.02
-"""Part of the highest pressure by which pressures must differ for pressure to be a variable. Chosen: the pressure error
-of single trials."""
 
 
-PRESSURE_MARGIN = 0.03
-"""Part by which the range of pressures is extended at both ends: the pressures of trials deviate from the sheet, and a
-force that is constant beyond the set pressures would have a kink there. Chosen: three times the pressure error of
-single trials."""
+PRESSURE_MARGIN = 0.03  # Part by which the range of pressures is extended at both ends (chosen)
 
 
 def standard_error(basis: Floats, covariance: Floats) -> Floats:
-    """Standard error of a linear combination of coefficients, for each row of a basis.
-
-    Parameters
-    ----------
-    basis : array, shape (n, n_splines)
-    covariance : array, shape (n_splines, n_splines)
-        Of the coefficients, N².
-
-    Returns
-    -------
-    array, shape (n,), N
+    """Standard error of a linear combination of coefficients, for each row of a basis. Shapes: basis (n, n_splines);
+    covariance (n_splines, n_splines) → (n,).
     """
     return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
 
 
 @lru_cache(maxsize=256)
 def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) -> tuple[Floats, Floats]:
-    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines.
-
-    Parameters
-    ----------
-    count : int
-        Number of splines.
-    length : float
-        Length scale, as part of the range.
-    zero_at_start : bool
-        Whether the process is conditioned on being zero at the first centre.
-
-    Returns
-    -------
-    eigenvectors : array, shape (count, count)
-    variances : array, shape (count,)
+    """Eigenvectors and eigenvalues of the covariance of a unit-variance process at the centres of the splines. Returns
+    eigenvectors, variances. Shape (count, count).
     """
     knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
     at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
@@ -137,10 +90,8 @@ def covariance_modes(count: int, length: float, *, zero_at_start: bool = False) 
 
 @dataclass(frozen=True)
 class Domain:
-    """The variables of a force, their visited ranges (SI), and the number of splines along each.
-
-    `log_scale` is the distance above the lowest value from which a variable is taken as its logarithm; infinite for
-    never.
+    """The variables of a force, their visited ranges (SI), and the number of splines along each. `log_scale` is the
+    distance above the lowest value from which a variable is taken as its logarithm; infinite for never.
     """
 
     variables: tuple[str, ...]
@@ -150,18 +101,8 @@ class Domain:
     log_scale: tuple[float, ...]
 
     def normalised(self, values: Sequence[Floats]) -> list[Floats]:
-        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`.
-
-        Speeds and durations of a campaign span decades, and forces change over fractions of them.
-
-        Parameters
-        ----------
-        values : sequence of arrays, shape (n,), SI
-            One a variable.
-
-        Returns
-        -------
-        list of arrays
+        """The variables scaled to 0 to 1 over the visited range, logarithmically beyond `log_scale`. Speeds and
+        durations of a campaign span decades, and forces change over fractions of them. Shapes: values (n,).
         """
         limits = zip(values, self.low, self.high, self.log_scale, strict=True)
         return [
@@ -182,47 +123,19 @@ class Domain:
         return math.prod(self.counts)
 
     def values_along(self, motion: FittedMotion) -> list[Floats]:
-        """The variables along a motion, SI, each of shape (n_times,).
-
-        Parameters
-        ----------
-        motion : a fitted motion.
-
-        Returns
-        -------
-        list of arrays
-        """
+        """The variables along a motion, SI, each of shape (n_times,)."""
         return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
 
     def basis(self, values: Sequence[Floats]) -> Floats:
-        """Design matrix: all splines, or products of splines, at these values.
-
-        Parameters
-        ----------
-        values : sequence of arrays, shape (n,), SI
-            One a variable.
-
-        Returns
-        -------
-        array, shape (n, size)
-        """
+        """Design matrix: all splines, or products of splines, at these values. Shapes: values (n,) → (n, size)."""
         indices, products = self._nonzero_products(values)
         design = np.zeros((len(indices), self.size))
         np.put_along_axis(design, indices, products, axis=1)
         return design
 
     def evaluate(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
-        """Sum of all splines times their coefficients at these values.
-
-        Parameters
-        ----------
-        values : sequence of arrays, shape (n,), SI
-            One a variable.
-        coefficients : array, shape (size,)
-
-        Returns
-        -------
-        array, shape (n,)
+        """Sum of all splines times their coefficients at these values. Shapes: values (n,); coefficients (size,) →
+        (n,).
         """
         indices, products = self._nonzero_products(values)
         return np.asarray(np.einsum("ns,ns->n", products, coefficients[indices]))
@@ -256,20 +169,8 @@ class Domain:
     def prior_modes(
         self, lengths: Sequence[float], at_start: str = FREE_AT_START, least_variance: float = KEPT_VARIANCE
     ) -> Floats:
-        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude.
-
-        Parameters
-        ----------
-        lengths : sequence of float
-            Length scales, as parts of the visited ranges.
-        at_start : str
-            What the force is where growth begins.
-        least_variance : float
-            Relative variance below which a mode is dropped.
-
-        Returns
-        -------
-        array, shape (size, n_modes)
+        """Square root of the prior covariance: coefficients of the splines for each mode at unit amplitude. Shape
+        (size, n_modes).
         """
         start_axis = self.start_axis
         by_axis = [
@@ -303,11 +204,9 @@ def _product(by_axis: Sequence[tuple[Floats, Floats]], least_variance: float) ->
 
 @dataclass(frozen=True)
 class SmoothForce:
-    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`.
-
-    `modes`, shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves
-    the amplitudes free. It has the same methods as `vinetrack.diagnosis.force_laws.Law`, so that
-    `vinetrack.diagnosis.force_refinement` fits either.
+    """A force over a domain whose amplitudes have independent normal priors of standard deviation `sd_N`. `modes`,
+    shape (n_splines, n_amplitudes), are the spline coefficients for unit amplitudes. An infinite `sd_N` leaves the
+    amplitudes free.
     """
 
     domain: Domain
@@ -325,94 +224,28 @@ class SmoothForce:
         return ()
 
     def size_of(self, name: str) -> float:  # pragma: no cover
-        """Not applicable: there are no shape parameters.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        float
-
-        Raises
-        ------
-        KeyError
-            Always.
-        """
+        """Not applicable: there are no shape parameters."""
         raise KeyError(name)
 
     def shifted(self, name: str, by: float) -> SmoothForce:  # pragma: no cover
-        """Not applicable: there are no shape parameters.
-
-        Parameters
-        ----------
-        name : str
-        by : float
-
-        Returns
-        -------
-        SmoothForce
-
-        Raises
-        ------
-        KeyError
-            Always.
-        """
+        """Not applicable: there are no shape parameters."""
         raise KeyError(name, by)
 
     def within_growth(self, growth_m: float) -> SmoothForce:  # noqa: ARG002
-        """Return itself: the force is constant beyond the visited range.
-
-        Parameters
-        ----------
-        growth_m : float
-
-        Returns
-        -------
-        SmoothForce
-        """
+        """Return itself: the force is constant beyond the visited range."""
         return self
 
     def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
-        """The force with these amplitudes along a motion.
-
-        Parameters
-        ----------
-        motion : a fitted motion.
-        amplitude : array, shape (n_columns,), N
-
-        Returns
-        -------
-        array, shape (n_times,), N
-        """
+        """The force with these amplitudes along a motion. Shapes: amplitude (n_columns,) → (n_times,)."""
         return self.domain.evaluate(self.domain.values_along(motion), self.modes @ amplitude)
 
     def unit_force(self, motion: FittedMotion) -> Floats:
-        """The force of each unit amplitude along a motion.
-
-        Parameters
-        ----------
-        motion : a fitted motion.
-
-        Returns
-        -------
-        array, shape (n_times, n_columns), N
-        """
+        """The force of each unit amplitude along a motion. Shape (n_times, n_columns)."""
         return np.asarray(self.domain.basis(self.domain.values_along(motion)) @ self.modes)
 
 
 def candidate_domains(motions: Sequence[FittedMotion]) -> list[Domain]:
-    """Every variable alone, then every pair, over the ranges that the motions visit.
-
-    Parameters
-    ----------
-    motions : sequence of FittedMotion
-
-    Returns
-    -------
-    list of Domain
-    """
+    """Every variable alone, then every pair, over the ranges that the motions visit."""
     ranges: dict[str, tuple[float, float, float]] = {}
     for name, attribute in VARIABLES.items():
         by_trial = [

@@ -28,55 +28,24 @@ from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, feasible_conditions
 
-MAX_ADDED_TRIALS = 48
-"""Most further trials considered where `limits.trials` is not stated. Chosen: a day of filming; at half some effects
-that a day would reveal are given up, at twice nobody films them."""
+MAX_ADDED_TRIALS = 48  # Most further trials considered where `limits.trials` is not stated (chosen)
 
-PAIRS_PER_STEP = (1, 2)
-"""Pairs of one condition that are added at a time; the best gain a pair counts. Chosen: the first trials of a vine
-mainly determine its B."""
+PAIRS_PER_STEP = (1, 2)  # Pairs of one condition that are added at a time; the best gain a pair counts (chosen)
 
-TYPICAL_REQUIRED_SCORE = 4.7
-"""Score that a size needs where the trials so far have no information about it. Derived: threshold of a candidate at
-0.3 % for the family, about 3.4, and 1.28 for a power of 90 %."""
+TYPICAL_REQUIRED_SCORE = 4.7  # Score that a size needs where the trials so far have no information about it (derived)
 
+# What further trials need, in order of effort
 EFFORT_WORDS = {SAME_RIG: "on the rig so far", OTHER_RIG: "with another rig", NEW_VINE: "with a new vine"}
-"""What further trials need, in order of effort."""
 
-SEARCH_ROUNDS = 3
-"""Searches, each with the required information corrected by the shortfall of the one before. Chosen: thresholds and
-scatter change with the trials by a tenth, after two rounds by a hundredth."""
+SEARCH_ROUNDS = 3  # Searches, each with the required information corrected by the shortfall of the one before (chosen)
 
-MAX_VINES_TRIED = 2
-"""New vines that are tried, one at a time. Chosen for time."""
+MAX_VINES_TRIED = 2  # New vines that are tried, one at a time (chosen)
 
 
 def further_trials(
     design: CampaignDesign, now: EffectPower, value: float, target: float, limits: Limits | None = None
 ) -> FurtherTrials:
-    """Find the fewest further trials that give an effect of some size a target power.
-
-    Parameters
-    ----------
-    design : of the trials so far, or of a sheet.
-    now : power of these trials for the effect.
-    value : float
-        Of its parameter, SI.
-    target : float
-        Power to reach, below 1.
-    limits : Limits, optional
-        Within which further trials can be made; what they leave open is as in the trials so far. `limits.trials` counts
-        where it is stated.
-
-    Returns
-    -------
-    FurtherTrials
-
-    Raises
-    ------
-    FitError
-        If further trials cannot be simulated.
-    """
+    """Find the fewest further trials that give an effect of some size a target power."""
     limits = limits or Limits()
     most = limits.trials if "trials" in limits.model_fields_set else MAX_ADDED_TRIALS
     before = now.probability_at(value)

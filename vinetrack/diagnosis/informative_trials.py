@@ -1,4 +1,5 @@
-"""Further trials for a campaign that goes on: those that reveal most where nothing is found, or confirm what is named.
+"""Further trials for a campaign that goes on: those that reveal most where nothing is found, or confirm
+what is named.
 
 A size a of an effect is detected with probability Φ(a √I − c), with I the information about it (`design_information`)
 and c the threshold of its score. Averaged over sizes spread evenly in their logarithm over the decade below the largest
@@ -6,9 +7,6 @@ plausible one, and summed over all candidates, that is the expected number of ef
 were missing in turn. With I_ee − I_ef² / I_ff in place of I, for the most similar other candidate f, it is the expected
 number that it would tell from every other. The design with the largest sum of both is found by adding pairs of trials
 one by one and exchanging them (Fedorov 1972, Theory of Optimal Experiments).
-
-Where one effect is named but the evidence is not sufficient yet, its own information counts, beyond what its closest
-rival has in common with it.
 """
 
 from __future__ import annotations
@@ -35,17 +33,15 @@ from vinetrack.experiment.settings import Limits
 from vinetrack.narrative.plan_text import trial_entries
 from vinetrack.planning.feasible_trials import Condition, feasible_conditions
 
+# Sizes of an effect that are averaged over, relative to its largest plausible one (chosen)
 SIZES = np.geomspace(0.1, 1.0, 9)
-"""Sizes of an effect that are averaged over, relative to its largest plausible one. Chosen: a decade, in steps of a
-third. Over half a decade designs are for large effects; over two, for effects that trials of any kind hardly show."""
 
 
 @dataclass(frozen=True)
 class InformativeTrials:
-    """Recommended trials, and what they would show.
-
-    `trials` are entries as of a next experiment (`plan_text.trial_entries`); `now` and `then` are the power of the
-    trials so far, and of these together with those recommended.
+    """Recommended trials, and what they would show. `trials` are entries as of a next experiment
+    (`plan_text.trial_entries`); `now` and `then` are the power of the trials so far, and of these together with those
+    recommended.
     """
 
     trials: tuple[Mapping[str, Any], ...]
@@ -54,49 +50,14 @@ class InformativeTrials:
 
 
 def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | None = None) -> InformativeTrials | None:
-    """Find the further trials that would reveal most of what could be missing.
-
-    Parameters
-    ----------
-    design : of the trials so far, or of a sheet.
-    power : of these trials.
-    limits : Limits, optional
-        Within which further trials can be made. `limits.trials` trials are recommended; no new vine is.
-
-    Returns
-    -------
-    InformativeTrials or None
-        None where no further trial can be made, or none reveals anything.
-
-    Raises
-    ------
-    FitError
-        If further trials cannot be simulated.
-    """
+    """Find the further trials that would reveal most of what could be missing."""
     return _most_informative(design, power, [entry.effect for entry in power.effects], limits, named="")
 
 
 def confirming_trials(
     design: CampaignDesign, power: Power, name: str, rival: str = "", limits: Limits | None = None
 ) -> InformativeTrials | None:
-    """Find the further trials that tell most about one effect, apart from a rival.
-
-    Parameters
-    ----------
-    design, power, limits : as for `exploratory_trials`, of the model without the effect.
-    name : of the effect.
-    rival : of another candidate that its size must not be mistaken for; blank for none.
-
-    Returns
-    -------
-    InformativeTrials or None
-        As from `exploratory_trials`; None also where these trials cannot show the effect.
-
-    Raises
-    ------
-    FitError
-        If further trials cannot be simulated.
-    """
+    """Find the further trials that tell most about one effect, apart from a rival."""
     known = {entry.effect for entry in power.effects}
     if name not in known:
         return None

@@ -22,26 +22,7 @@ from vinetrack.inference.sensitivity import Predictor
 def candidates_of(
     model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
 ) -> tuple[Effect, ...]:
-    """Candidates of a diagnosis: the `wanted` effects and the user's own, less those in the model.
-
-    Parameters
-    ----------
-    model
-        The model to diagnose.
-    wanted : iterable of str or None
-        Names of effects; the catalogue where None.
-    user_effects : mapping, optional
-        Effects of the user by name.
-
-    Returns
-    -------
-    tuple of Effect
-
-    Raises
-    ------
-    EffectError
-        If a name is unknown; the message suggests the nearest.
-    """
+    """Candidates of a diagnosis: the `wanted` effects and the user's own, less those in the model."""
     user_effects = user_effects or {}
     names = [name for name, effect in catalogue().items() if effect.kind != "base"] if wanted is None else list(wanted)
     names += [name for name in user_effects if name not in names]
@@ -50,19 +31,7 @@ def candidates_of(
 
 
 def with_host(fit: Fit, host: Model | None) -> Fit:
-    """Return a fit whose trajectories are simulated by the compiled form of a larger model.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-    host : Model or None
-        Contains the effects of the model and all candidates.
-
-    Returns
-    -------
-    Fit
-    """
+    """Return a fit whose trajectories are simulated by the compiled form of a larger model."""
     predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
     # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
     predictor.steps = fit.predictor.steps.copy()
@@ -73,28 +42,5 @@ def with_host(fit: Fit, host: Model | None) -> Fit:
 def initial_fit(
     model: Model, pairs: Pairs, candidates: Iterable[Effect], *, profile: bool = True, free: Iterable[str] = ()
 ) -> Fit:
-    """Fit the model in use, as the diagnosis does.
-
-    Parameters
-    ----------
-    model
-        The model in use.
-    pairs
-        Trials with their tracks.
-    candidates
-        Candidates of the diagnosis: they are compiled with the model.
-    profile
-        Whether intervals near a bound are found by profile; values and standard errors do not depend on it.
-    free
-        Parameters to fit although their values are known.
-
-    Returns
-    -------
-    Fit
-
-    Raises
-    ------
-    FitError
-        If there is nothing to fit, or the simulation of the model fails.
-    """
+    """Fit the model in use, as the diagnosis does."""
     return fit(model, pairs, free=free, host=host_for(model, tuple(candidates)), profile=profile, thorough=False)

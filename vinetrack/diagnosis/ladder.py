@@ -40,13 +40,10 @@ LADDER_COLUMNS = (
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
-MAX_FOLDS = 48
-"""Maximum number of folds of the cross-validation; of more conditions several are left out at once, so that the time
-grows with the number of trials and not also with that of conditions. Chosen: each fit still uses 98 % of the
-conditions; at half 96 %, at twice the time of this step doubles."""
+MAX_FOLDS = 48  # Maximum number of folds of the cross-validation (chosen)
 
+# Iterations of a fit without one condition, which starts near its minimum and converges in two or three (chosen)
 MOST_ITERATIONS = 6
-"""Iterations of a fit without one condition, which starts near its minimum and converges in two or three. Chosen."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,9 @@ class Errors:
 
     @cached_property
     def floor(self) -> tuple[float, float]:
-        """Replicate floor over all conditions with replicates, and its standard error, m; NaN where none has any.
-
-        Root of the mean variance of the conditions, weighted by their numbers of trials; the standard error of a
-        variance s² of ν degrees of freedom is s²√(2/ν).
+        """Replicate floor over all conditions with replicates, and its standard error, m; NaN where none has any. Root
+        of the mean variance of the conditions, weighted by their numbers of trials; the standard error of a variance s²
+        of ν degrees of freedom is s²√(2/ν).
         """
         conditions = dict.fromkeys(trial.trial.condition for trial in self.trials)
         squares, counts, degrees = [], [], []
@@ -87,24 +83,7 @@ class Errors:
 
 
 def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
-    """Compute the errors of the initial model and of every enlarged one.
-
-    Parameters
-    ----------
-    fits : fits of the models in order, all to the same trials.
-    added : what each added to the one before; blank for the first.
-    partial : number of partial steps at the end, which remove only part of the misfit.
-
-    Returns
-    -------
-    DataFrame
-        One row for each model, columns `LADDER_COLUMNS`. `attrs["notes"]` reports trials that could not be predicted.
-
-    Raises
-    ------
-    FitError
-        If the simulation of a model fails.
-    """
+    """Compute the errors of the initial model and of every enlarged one."""
     import pandas as pd
 
     rows: list[dict[str, object]] = []
@@ -137,48 +116,18 @@ def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]
 
 
 def excess(rms_m: float, floor_m: float) -> float:
-    """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor.
-
-    Parameters
-    ----------
-    rms_m, floor_m : float, m
-        Error and replicate floor.
-
-    Returns
-    -------
-    float, m
-    """
+    """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor."""
     return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan
 
 
 def in_sample(fit: Fit) -> Errors:
-    """Predictions of the trials that the model was fitted to.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    Errors
-    """
+    """Predictions of the trials that the model was fitted to."""
     return _predicted(fit, [as_recorded(trial_data) for trial_data in fit.predictor.data])
 
 
 def left_out(fit: Fit) -> Errors:
-    """Predictions of every condition by the model fitted to all others (cross-validation).
-
-    Of more than `MAX_FOLDS` conditions several are left out at once, those of one vine spread over the folds.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    Errors
+    """Predictions of every condition by the model fitted to all others (cross-validation). Of more than `MAX_FOLDS`
+    conditions several are left out at once, those of one vine spread over the folds.
     """
     vines = {trial.trial.condition: trial.trial.vine for trial in fit.trials}
     conditions = list(vines) if len(vines) <= MAX_FOLDS else sorted(vines, key=lambda name: vines[name])
@@ -187,17 +136,7 @@ def left_out(fit: Fit) -> Errors:
 
 
 def highest_pressure(fit: Fit) -> Errors:
-    """Predictions of each vine's highest pressure by the model fitted to all lower ones.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    Errors
-    """
+    """Predictions of each vine's highest pressure by the model fitted to all lower ones."""
     highest: dict[str, float] = {}
     for trial_fit in fit.trials:
         trial = trial_fit.trial
@@ -263,19 +202,7 @@ def _notes(what: str, errors: Errors) -> list[str]:
 
 
 def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
-    """Table of the parameters of every model of the ladder, columns `MOVED_COLUMNS`, SI.
-
-    Parameters
-    ----------
-    fits : sequence of Fit
-        One for each step of the ladder.
-    added : sequence of str
-        Effect added by each step; blank for the first.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Table of the parameters of every model of the ladder, columns `MOVED_COLUMNS`, SI."""
     import pandas as pd
 
     rows = [

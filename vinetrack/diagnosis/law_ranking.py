@@ -17,23 +17,17 @@ from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitiv
 from vinetrack.diagnosis.linear_misfit import LinearMisfit
 from vinetrack.inference.fit_result import Fit
 
-DETECTION_SIGMAS = 5.0
-"""Standard errors that the amplitude of a law must differ from zero to be detected: some hundred laws are tried.
-Chosen: five standard errors keep the best of a hundred laws at a chance of 6e-5."""
+DETECTION_SIGMAS = 5.0  # Standard errors that the amplitude of a law must differ from zero to be detected
 
+# Laws that are fitted by nonlinear least squares, if the best linear fit leaves more than this multiple of the noise;
+# otherwise the best alone (chosen)
 LAWS_REFINED, ROUGH_CHI2_PER_POINT = 3, 1.5
-"""Laws that are fitted by nonlinear least squares, if the best linear fit leaves more than this multiple of the noise;
-otherwise the best alone. Chosen for time."""
 
+# Part of χ² that a law must take away to be refined (chosen)
 LEAST_CHI2_FRACTION, MAX_CHI2_RATIO = 0.5, 1.5
-"""Part of χ² that a law must take away to be refined, and the ratio of the refined χ² to the linear one up to which the
-refined fit is accepted. Chosen for time; otherwise a law keeps its linear fit."""
 
+# Multiple of the largest drive, weight and inertia of the trials above which a force is not reported (chosen)
 MAX_DRIVE_RATIO = 10.0
-"""Multiple of the largest drive, weight and inertia of the trials above which a force is not reported: such a law acts
-at the edge of the visited range, where trajectories hardly respond to it. Chosen: one missing force as large as the
-drive is a gross failure already; at half of it a stop that a vine runs into may go unreported, at twice nonsense is as
-rare."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +53,9 @@ class RankedLaw:
 
 
 def ranked_laws(fit: Fit, linear: LinearMisfit) -> list[RankedLaw]:
-    """Rank the best law of each kind: those detected first, then by BIC.
-
-    All laws of a grid are estimated by the linear inversion, then laws near the best of each kind. The first few are
-    fitted by nonlinear least squares and all are ranked again.
-
-    Parameters
-    ----------
-    fit : the fit that lacks a force.
-    linear : its linearisation.
-
-    Returns
-    -------
-    list of RankedLaw
+    """Rank the best law of each kind: those detected first, then by BIC. All laws of a grid are estimated by the linear
+    inversion, then laws near the best of each kind. The first few are fitted by nonlinear least squares and all are
+    ranked again.
     """
     inversion, motions = linear.inversion, linear.motions
 
@@ -116,7 +100,6 @@ def _refined(
     fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion], laws: list[RankedLaw]
 ) -> list[RankedLaw]:
     """The laws ranked again, the best of them after a nonlinear fit, if its χ² hardly exceeds that of the linear fit.
-
     Where the linear fit of the best law leaves only noise, the others keep their linear fits.
     """
     chi2 = inversion.chi2_without_force

@@ -24,13 +24,9 @@ from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.learned_variables import variables_in_words
 from vinetrack.narrative.verdict_summary import joined
 
-CHECKS_PER_SPLINE = 4
-"""Positions per spline at which the two sets of splines are matched by least squares. Chosen: more than there are
-coefficients; both span the same functions, so that the result is exact for any number above that."""
+CHECKS_PER_SPLINE = 4  # Positions per spline at which the two sets of splines are matched by least squares (chosen)
 
-TABLE_DIGITS = 6
-"""Significant digits of a coefficient in the file. Chosen: a thousandth of the precision to which positions determine a
-force; at half of it 1e-3 of the force is lost, at twice the table is harder to read."""
+TABLE_DIGITS = 6  # Significant digits of a coefficient in the file (chosen)
 
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 _SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
@@ -38,30 +34,13 @@ _UNIT = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pre
 
 
 def table_name(learned: LearnedForce) -> str:
-    """Name of the effect that holds a learned force, such as `learned_growth_speed`.
-
-    Parameters
-    ----------
-    learned : the force.
-
-    Returns
-    -------
-    str
-    """
+    """Name of the effect that holds a learned force, such as `learned_growth_speed`."""
     return "_".join(["learned", *learned.domain.variables])
 
 
 def table_text(learned: LearnedForce, remark: str = "") -> str:
-    """Source of an effect file that holds a learned force: docstring, table, parameter, function and a worked example.
-
-    Parameters
-    ----------
-    learned : the force.
-    remark : sentences for the docstring about the data that the force comes from.
-
-    Returns
-    -------
-    str
+    """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
+    worked example.
     """
     domain = learned.domain
     table = uniform_table(domain, learned.best.mean)
@@ -129,19 +108,9 @@ _SUM_OF_TWO = (
 
 
 def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
-    """Convert the coefficients of a domain's splines to those of identical splines at even steps, N.
-
-    The splines of a domain have repeated knots at its ends; those of the file are all alike. Both span the same
-    functions.
-
-    Parameters
-    ----------
-    domain : the variables and their splines.
-    coefficients : array, shape (n_splines,), N
-
-    Returns
-    -------
-    array, shape (n_first,) or (n_first, n_second), N
+    """Convert the coefficients of a domain's splines to those of identical splines at even steps, N. The splines of a
+    domain have repeated knots at its ends; those of the file are all alike. Both span the same functions. Shapes:
+    coefficients (n_splines,) → (n_first,).
     """
     table = coefficients.reshape(domain.counts)
     for axis, count in enumerate(domain.counts):

@@ -7,20 +7,7 @@ prior; positions are never differentiated. For each choice of variables
 
     ln Z = −½ χ²(ĉ) − ½ ln |H| + ½ ln |K⁻¹|,   H = ∇∇ ½χ² + K⁻¹
 
-is the log marginal likelihood in Laplace's approximation (exact where positions are linear in the force), with χ²
-including the priors of all parameters, and averaged over the amplitude and the length scales of the process. Positions
-are not linear in a large force: for the best choices the nonlinear problem is solved (`force_refinement`) and ln Z is
-computed at its solution. Posterior weights of the choices follow from ln Z, with equal prior odds for one variable and
-for two (Rasmussen & Williams 2006, ch. 5).
-
-Misfit that no force explains is treated as further noise: χ² is divided by what the best force leaves per point. The
-search ends once χ² falls by less than a fraction of itself (`CONVERGENCE_TOLERANCE`); differences of ln Z are measured
-in units of that. These data cannot decide on a force that B, n and P_y could take over as well: the force is measured
-from the start of growth (`force_surface`). The band includes everything else: noise, between-trial scatter, length
-scales and amplitude, and a constant. Where speeds are steady, growth, speed and time are hardly three separate
-variables, and the weights then favour whichever surface is smoother; choices that the tracks themselves do not exclude
-are reported with the best (`learned_variables`). `vinetrack.diagnosis.propose` looks for a law for the force, or
-writes it as a table.
+Misfit that no force explains is treated as further noise: χ² is divided by what the best force leaves per point.
 """
 
 from __future__ import annotations
@@ -67,50 +54,29 @@ if TYPE_CHECKING:
 
 LEARNED_COLUMNS = (*VARIABLES.values(), "force_N", "sigma_N", "trials", "condition")
 
-LEAST_LOG_BAYES_FACTOR = 18.0
-"""ln Z in excess of that of no force from which a force is reported. Chosen: six standard deviations; at half of it
-noise that differs somewhat from its model is drawn as a force now and then, at twice a weak force is not drawn."""
+LEAST_LOG_BAYES_FACTOR = 18.0  # ln Z in excess of that of no force from which a force is reported (chosen)
 
-LEAST_CHI2_PER_POINT = 2.0
-"""χ² per point of the fit from which a force is estimated: below, noise and scatter that differ somewhat from their
-models would be taken for one. Chosen as in the words for what is missing."""
+LEAST_CHI2_PER_POINT = 2.0  # χ² per point of the fit from which a force is estimated (chosen)
 
-CHOICES_REFINED = {1: 1, 2: 3}
-"""Choices of one variable and of two for which the nonlinear problem is solved: the best by the linear inversion.
-Chosen for time."""
+CHOICES_REFINED = {1: 1, 2: 3}  # Choices of one variable and of two for which the nonlinear problem is solved (chosen)
 
+# Relative singular value below which a force along the motions does not determine a combination of splines (chosen)
 PROJECTION_CUTOFF = 1e-3
-"""Relative singular value below which a force along the motions does not determine a combination of splines. Chosen:
-splines where there are hardly any trials stay at zero; only the start of a search depends on it."""
 
+# Effective number of independent residuals in a trial where a model leaves more than noise (chosen)
 INDEPENDENT_PARTS_PER_TRIAL = 20
-"""Effective number of independent residuals in a trial where a model leaves more than noise. Chosen as the number of
-splines of an acceleration in `smoothed_motions`: points within a part err together, and count as one (the design effect
-of Kish 1965, §5.4). At half of it weights are nearer to each other, at twice farther apart, by as much."""
 
-HYPERPARAMETER_UPDATES = 2
-"""Rounds of optimising the force and then its amplitude and length scales. Chosen: a third changes no weight."""
+HYPERPARAMETER_UPDATES = 2  # Rounds of optimising the force and then its amplitude and length scales (chosen)
 
-LEAST_EXPLAINED = 0.95
-"""Part of the misfit that the refined force must take away to be reported. Chosen: if it leaves more, the search has
-not converged or something else is missing as well, and the weights of the variables mean nothing. At half of the misfit
-wrong variables are named where a force is as large as the drive."""
+LEAST_EXPLAINED = 0.95  # Part of the misfit that the refined force must take away to be reported (chosen)
 
-PLOT_POINTS, VISITED_DISTANCE = (60, 30), 0.06
-"""Points of a curve, and along each side of a map; and the distance to a point of the map, as a part of each side,
-within which a trial counts as having visited it. Chosen for the picture."""
+PLOT_POINTS, VISITED_DISTANCE = (60, 30), 0.06  # Points of a curve, and along each side of a map (chosen)
 
 
 @dataclass(frozen=True)
 class LearnedForce:
-    """The missing force over the variables that it most likely depends on.
-
-    `best` is the posterior of the force; `motions` are those of the trials at the solution. `weights` are posterior
-    weights of choices of variables (`growth`, `growth+speed`, …); `not_excluded` names further choices that the tracks
-    do not exclude. `table`, columns `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` those near
-    each point) and along the first trial of each condition; variables that the force does not depend on are NaN.
-    `undecided_N` is the standard error, N, of a part of the force that is the same all along the growth, which B, n and
-    P_y could take over.
+    """The missing force over the variables that it most likely depends on. `best` is the posterior of the force;
+    `motions` are those of the trials at the solution.
     """
 
     best: ForcePosterior
@@ -156,21 +122,7 @@ class _RefinedChoice:
 def learned_force(
     fit: Fit, inversion: LinearInversion, motions: Sequence[FittedMotion], replicates: int
 ) -> LearnedForce | None:
-    """Estimate the missing force over the variables with the highest marginal likelihood.
-
-    Parameters
-    ----------
-    fit : the fit that lacks the force.
-    inversion : its linearisation.
-    motions : sequence of FittedMotion
-        The fitted motions about which it is linear.
-    replicates : int
-        Trials beyond the first of each condition.
-
-    Returns
-    -------
-    LearnedForce, or None where no force is detected, or none can be simulated
-    """
+    """Estimate the missing force over the variables with the highest marginal likelihood."""
     if inversion.chi2_without_force < LEAST_CHI2_PER_POINT * inversion.n_points:
         return None
     largest_N = max(float(np.max(np.nan_to_num(motion.pressure_Pa) * motion.trial.area_m2)) / 2 for motion in motions)
@@ -221,10 +173,9 @@ def learned_force(
 
 @dataclass(frozen=True)
 class _LinearChoices:
-    """All choices of variables about motions on the tracks, by the linear inversion, most likely first.
-
-    Each has the point where its nonlinear fit starts. `inflation` is the ratio of residual to noise variance that the
-    best of them leaves.
+    """All choices of variables about motions on the tracks, by the linear inversion, most likely first. Each has the
+    point where its nonlinear fit starts. `inflation` is the ratio of residual to noise variance that the best of them
+    leaves.
     """
 
     choices: list[tuple[VariableChoice, SearchPoint]]
@@ -281,10 +232,9 @@ def _correlation_error(inversion: LinearInversion, inflation: float) -> float:
 def _refined_choices(
     fit: Fit, inversion: LinearInversion, linear: _LinearChoices, largest_N: float
 ) -> list[_RefinedChoice]:
-    """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated.
-
-    One variable is refined too, even where two are more likely: far from the solution the linear inversion errs, most
-    for what has few coefficients.
+    """The best choices of each number of variables after the nonlinear fit, without those that cannot be simulated. One
+    variable is refined too, even where two are more likely: far from the solution the linear inversion errs, most for
+    what has few coefficients.
     """
     best_of_size = [
         pair
@@ -306,10 +256,9 @@ def _restarted_from_best(
     inflation: float,
     largest_N: float,
 ) -> list[_RefinedChoice]:
-    """Every choice of two variables searched again from the solution of the best, and the lower χ² kept.
-
-    The first search starts from the choice's own linear inversion. Where that is far off it may stop in a local
-    minimum, and the choice would be excluded though it could represent the very force of the best.
+    """Every choice of two variables searched again from the solution of the best, and the lower χ² kept. The first
+    search starts from the choice's own linear inversion. Where that is far off it may stop in a local minimum, and the
+    choice would be excluded though it could represent the very force of the best.
     """
     best = min(refined, key=lambda each: each.likelihood.chi2_at_zero - each.likelihood.delta_chi2)
     least_chi2 = best.likelihood.least_chi2
@@ -339,9 +288,8 @@ def _refined(
     inflation: float,
     largest_N: float,
 ) -> tuple[SearchPoint, CoefficientLikelihood] | None:
-    """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters.
-
-    The force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
+    """The nonlinear fit of a force over given variables, alternating between the force and its hyperparameters. The
+    force is constrained to be constant at the start of growth, and freed in a last round if that is more likely.
     """
     solution: tuple[SearchPoint, CoefficientLikelihood] | None = None
     every_spline = SmoothForce(choice.domain, np.eye(choice.domain.size))

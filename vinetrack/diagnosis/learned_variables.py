@@ -21,19 +21,15 @@ from vinetrack.narrative.verdict_summary import joined
 if TYPE_CHECKING:
     import pandas as pd
 
-LEAST_WEIGHT_NAMED = 0.05
-"""Weight from which a choice of variables is reported with the best. Chosen: the usual 5 %."""
+LEAST_WEIGHT_NAMED = 0.05  # Weight from which a choice of variables is reported with the best (chosen)
 
-CERTAIN_WEIGHT = 0.95
-"""Weight from which a choice counts as certain. Chosen: the usual 95 %."""
+CERTAIN_WEIGHT = 0.95  # Weight from which a choice counts as certain (chosen)
 
+# Part of a variable's variance left by smooth functions of others, up to which it counts as a function of them
+# (measured)
 LARGEST_FREE_VARIANCE = 0.1
-"""Part of a variable's variance left by smooth functions of others, up to which it counts as a function of them.
-Measured on tuning seeds 20500 and 20520 to 20522: of growth, speed and time any two leave at most 8 % of the third, one
-leaves 25 % and more of another. At half of it the speed is not named where it leaves 8 %, at twice most pairs are."""
 
-POINTS_PER_MOTION = 40
-"""Points of a motion at which one variable is regressed on others. Chosen: more than there are splines."""
+POINTS_PER_MOTION = 40  # Points of a motion at which one variable is regressed on others (chosen)
 
 _WORDS = {
     "growth": "the growth",
@@ -44,35 +40,12 @@ _WORDS = {
 
 
 def variables_in_words(name: str) -> str:
-    """A choice of variables in words.
-
-    Parameters
-    ----------
-    name : str
-        As `growth+speed`.
-
-    Returns
-    -------
-    str
-    """
+    """A choice of variables in words."""
     return " and ".join(_WORDS[variable] for variable in name.split("+"))
 
 
 def dependent_variables(domain: Domain, singles: Sequence[Domain], motions: Sequence[FittedMotion]) -> list[str]:
-    """Variables that are smooth functions of those of a domain, along all trials.
-
-    Parameters
-    ----------
-    domain : the variables that others are regressed on.
-    singles : sequence of Domain
-        Every variable alone.
-    motions : sequence of FittedMotion
-
-    Returns
-    -------
-    list of str
-        Without those of the domain itself.
-    """
+    """Variables that are smooth functions of those of a domain, along all trials."""
     counts = [np.count_nonzero(motion.time_s <= motion.counts_until_s) for motion in motions]
     points = [np.linspace(0, count - 1, POINTS_PER_MOTION).astype(int) for count in counts]
 
@@ -100,28 +73,8 @@ def not_excluded(
     others: Sequence[Domain],
     motions: Sequence[FittedMotion],
 ) -> list[str]:
-    """Choices of variables, besides the best, that the trials do not exclude; highest weight first.
-
-    Among the refined choices: those with enough weight, and those of no more variables than the best whose χ² is hardly
-    larger. Among the others: those of as many variables as the best from which the variables of the best follow,
-    because any force over the best is then a force over them.
-
-    Parameters
-    ----------
-    best : the most likely choice.
-    weights : mapping
-        Posterior weights of the refined choices, by name.
-    losses : mapping
-        By how much their χ² exceeds that of the best, in units of the noise.
-    threshold : float
-        The loss above which a choice is excluded.
-    others : sequence of Domain
-        All choices.
-    motions : sequence of FittedMotion
-
-    Returns
-    -------
-    list of str
+    """Choices of variables, besides the best, that the trials do not exclude; highest weight first. Among the refined
+    choices: those with enough weight, and those of no more variables than the best whose χ² is hardly larger.
     """
     singles = [domain for domain in others if len(domain.variables) == 1]
     names = []
@@ -140,21 +93,7 @@ def not_excluded(
 
 
 def dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[str]) -> str:
-    """What the force depends on and how certain that is: a sentence without its full stop.
-
-    Parameters
-    ----------
-    name : str
-        The most likely choice, as `growth+speed`.
-    weights : mapping
-        Posterior weights by choice.
-    alternatives : sequence of str
-        Further choices that are not excluded.
-
-    Returns
-    -------
-    str
-    """
+    """What the force depends on and how certain that is: a sentence without its full stop."""
     subject = "Learned as a smooth function inside the fit, the missing force"
     if not alternatives:
         likely = "is described" if weights[name] >= CERTAIN_WEIGHT else "is most likely described"
@@ -178,20 +117,7 @@ def dependence(name: str, weights: Mapping[str, float], alternatives: Sequence[s
 
 
 def reference(domain: Domain, at_start: str, undecided_N: float) -> str:
-    """From where the force is measured, and which part of it the trials do not determine: whole sentences.
-
-    Parameters
-    ----------
-    domain : its variables.
-    at_start : str
-        What the force is where growth begins, as in `force_surface`.
-    undecided_N : float
-        Standard error of a part that is the same all along the growth, N.
-
-    Returns
-    -------
-    str
-    """
+    """From where the force is measured, and which part of it the trials do not determine: whole sentences."""
     if domain.start_axis < 0:
         return "These trials do not decide how much of it belongs to B, n and P_y; it is drawn as small as they allow."
     if at_start == FREE_AT_START:
@@ -220,26 +146,7 @@ def force_sentence(
     table: pd.DataFrame,
     undecided_N: float,
 ) -> str:
-    """The variables of the force and how sure they are, its range and error, and from where it is measured.
-
-    Parameters
-    ----------
-    best : posterior of the force.
-    weights : mapping
-        Posterior weights by choice of variables.
-    alternatives : sequence of str
-        Further choices that are not excluded.
-    explained : float
-        Part of the misfit that the force takes away.
-    table : DataFrame
-        The force on a grid, as `LearnedForce.table`.
-    undecided_N : float
-        Standard error of a part that is the same all along the growth, N.
-
-    Returns
-    -------
-    str
-    """
+    """The variables of the force and how sure they are, its range and error, and from where it is measured."""
     visited = table[(table["condition"] == "") & (table["trials"] > 0)]
     low, high, sigma = (
         float(value) for value in (visited["force_N"].min(), visited["force_N"].max(), visited["sigma_N"].median())
@@ -254,22 +161,7 @@ def force_sentence(
 
 
 def remarks(replicates: int, domains: Sequence[Domain], alternatives: Sequence[str]) -> list[str]:
-    """What limits the result, and which trials would help.
-
-    Parameters
-    ----------
-    replicates : int
-        Trials beyond the first of each condition.
-    domains : sequence of Domain
-        All choices of variables.
-    alternatives : sequence of str
-        Choices that are not excluded, besides the best.
-
-    Returns
-    -------
-    list of str
-        Whole sentences.
-    """
+    """What limits the result, and which trials would help."""
     sentences = []
     if not replicates:
         sentences.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")

@@ -21,36 +21,24 @@ from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 
-ANSWER_SET_DELTA_CHI2 = 9.0
-"""A hypothesis whose −2 ln L lies within this of the best cannot be excluded. Derived: three standard deviations."""
+ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of the best cannot be excluded (derived)
 
+# Upper limit of the variance inflation, the observed scatter of trials over that of the noise model (chosen)
 MAX_INFLATION = 6.0
-"""Upper limit of the variance inflation, the observed scatter of trials over that of the noise model: a larger value
-from few trials is unreliable. Chosen: at half fewer differences count as scatter, at twice weak effects are missed."""
 
-CREDIBLE_RANGE_FACTOR = 3.0
-"""Multiple of its plausible range within which a size is still credible: a drag that needs C_D 17 is no drag. Chosen:
-plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
+CREDIBLE_RANGE_FACTOR = 3.0  # Multiple of its plausible range within which a size is still credible (chosen)
 
-MIN_SIZE_SIGMAS = 1.0
-"""A size below this many of its standard errors is compatible with zero. Chosen: an effect that a likelihood ratio
-finds at 4 σ has a size of about 4 standard errors, unless size and shape are confounded; at half, C = 0.0000057 ±
-0.0000095 N would pass, at twice, effects whose size and shape are correlated would be lost."""
+MIN_SIZE_SIGMAS = 1.0  # A size below this many of its standard errors is compatible with zero (chosen)
 
+# Squared distance of two predictions, in units of the noise, below which they count as the same curve (derived)
 SAME_CURVE_DISTANCE = 4.0
-"""Squared distance of two predictions, in units of the noise, below which they count as the same curve. Derived: two
-standard deviations of one parameter."""
 
 
 @dataclass(frozen=True)
 class LikelihoodRatio:
     """A hypothesis compared with the fit without it: the effects it adds, its own fit, and the likelihood ratio.
-
     `delta_chi2` is the fall of −2 ln L, `sigma` the normal deviate as unlikely as that with one degree of freedom a
-    size, reduced where trials scatter more than the noise model predicts. Sizes outside their range are not
-    `plausible`; sizes several times outside it are not `credible`, and the hypothesis is no explanation. `reason`
-    states why. `inflation` (at least 1) is the variance of the sizes from the scatter of trials over that of the noise
-    model; differences of −2 ln L are inflated alike.
+    size, reduced where trials scatter more than the noise model predicts.
     """
 
     effects: tuple[Effect, ...]
@@ -78,7 +66,6 @@ class LikelihoodRatio:
     @property
     def log_bayes(self) -> float:
         """Logarithm of the Bayes factor against the fit without it, with the likelihood ratio reduced by `inflation`.
-
         Shared parameters are at their maximum likelihood in both; those added are integrated over their priors, see
         `vinetrack.diagnosis.plausibility_prior`.
         """
@@ -99,31 +86,12 @@ class LikelihoodRatio:
         return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
 
     def deviance_excess(self, other: LikelihoodRatio) -> float:
-        """−2 ln L of this hypothesis minus that of another.
-
-        Parameters
-        ----------
-        other : LikelihoodRatio
-
-        Returns
-        -------
-        float
-        """
+        """−2 ln L of this hypothesis minus that of another."""
         return 2 * (other.fit.log_likelihood - self.fit.log_likelihood)
 
 
 def best_of(hypotheses: Iterable[LikelihoodRatio]) -> LikelihoodRatio:
-    """The hypothesis with the highest likelihood.
-
-    Parameters
-    ----------
-    hypotheses : iterable of LikelihoodRatio
-        At least one.
-
-    Returns
-    -------
-    LikelihoodRatio
-    """
+    """The hypothesis with the highest likelihood."""
     return max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
@@ -135,26 +103,7 @@ def likelihood_ratio(
     widened_by: Collection[str] | None = None,
     sizes: int | None = None,
 ) -> LikelihoodRatio:
-    """Compare a refit with the fit without the effects.
-
-    Parameters
-    ----------
-    before
-        The fit without the effects.
-    effects : sequence of Effect
-        Those that were added.
-    after
-        The fit with them.
-    widened_by : collection of str, optional
-        Names, as in `robust_ratio`, of the sizes whose scatter between trials reduces the significance; by default
-        those of the effects.
-    sizes : int, optional
-        Degrees of freedom, by default those of `sizes_of`.
-
-    Returns
-    -------
-    LikelihoodRatio
-    """
+    """Compare a refit with the fit without the effects."""
     delta_chi2 = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
     plausible, reason = plausibility(effects, after)
@@ -176,9 +125,8 @@ def likelihood_ratio(
 
 
 def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> str:
-    """Say that a fitted size is smaller than its standard error; blank where none is.
-
-    Such a fit is better because of the parameters that shape the effect, and its size is not determined.
+    """Say that a fitted size is smaller than its standard error; blank where none is. Such a fit is better because of
+    the parameters that shape the effect, and its size is not determined.
     """
     for effect in effects:
         # Differences between groups are contrasts: each group's value may be uncertain where their difference is not.
@@ -194,27 +142,10 @@ def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> str:
 
 
 def sizes_of(effects: Sequence[Effect], after: Fit) -> int:
-    """Number of sizes of effects in a fit: the degrees of freedom of their likelihood ratio.
-
-    The first parameter of an effect is its size, one for all trials or one for each vine or day. The others shape the
-    effect. Where its size is zero nothing depends on them, so that Wilks' theorem does not hold for them (Davies,
-    Biometrika 74, 33, 1987): the likelihood ratio is the largest of many with one degree of freedom. For that choice
-    the threshold of an effect pays, which is that of the largest score of all shapes tried
-    (`vinetrack.diagnosis.family_test`); a refit gains a little more, for it also tries the shapes between. Measured on
-    white noise for four effects of two and three parameters, at the level of the first round: without the shape
-    parameters chance exceeds the threshold 1.2 to 3.5 times as often as the level says, and with all of them 0.1 to
-    0.4 times. They are not counted, because a score test at that level comes first.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-    after
-        The fit with them.
-
-    Returns
-    -------
-    int
-        At least one for each effect.
+    """Number of sizes of effects in a fit: the degrees of freedom of their likelihood ratio. The first parameter of an
+    effect is its size, one for all trials or one for each vine or day. The others shape the effect. Where its size is
+    zero nothing depends on them, so that Wilks' theorem does not hold for them (Davies, Biometrika 74, 33, 1987): the
+    likelihood ratio is the largest of many with one degree of freedom.
     """
     sizes = [f"{effect.name}.{effect.parameters[0].name}" if effect.parameters else "" for effect in effects]
     return sum(max(sum(number.key == size for number in after.numbers), 1) for size in sizes)
@@ -222,19 +153,8 @@ def sizes_of(effects: Sequence[Effect], after: Fit) -> int:
 
 def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
     """Normal deviate of the same two-sided tail probability as Δχ² with these degrees of freedom (Wilks' theorem).
-
-    Parameters
-    ----------
-    delta_chi2 : float
-        Divided by the variance inflation where trials scatter more than the noise model predicts: with several degrees
-        of freedom the normal deviate is not proportional to its root.
-    degrees_of_freedom : int
-        At least 1.
-
-    Returns
-    -------
-    float
-        Negative where the fit is worse; with several degrees of freedom 0 where it is no better than chance makes it.
+    Returns negative where the fit is worse; with several degrees of freedom 0 where it is no better than chance makes
+    it.
     """
     if degrees_of_freedom < 2 or delta_chi2 <= 0:
         return math.copysign(math.sqrt(abs(delta_chi2)), delta_chi2)
@@ -246,21 +166,8 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
 
 
 def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
-    """Whether the fitted sizes are plausible, and if not, why.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-    after
-        The fit with them.
-    widened : float
-        Factor by which plausible ranges are widened.
-
-    Returns
-    -------
-    plausible : bool
-    reason : str
-        Blank where they are plausible.
+    """Whether the fitted sizes are plausible, and if not, why. Returns plausible, reason (blank where they are
+    plausible).
     """
     for effect in effects:
         for parameter in effect.parameters:
@@ -279,18 +186,7 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:
     """Ratio of the standard error of a size from the scatter of trials to that from the noise model; at least 1.
-
-    Parameters
-    ----------
-    after
-        The fit with the sizes.
-    names : collection of str
-        Of effects, or of single parameters (`effect.parameter`).
-
-    Returns
-    -------
-    float
-        The largest ratio of all these sizes.
+    Returns the largest ratio of all these sizes.
     """
     if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
@@ -324,23 +220,10 @@ def _complexity(hypothesis: LikelihoodRatio) -> int:
 
 
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
-    """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words.
-
-    A hypothesis is excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best, both
-    with the film mass as stated and with the film mass free (`film_gain`). The penalty of its sizes (`prior_penalty`)
-    is added. Among the others, rejected are those that contain a simpler one as a limit and fit no better than it by 9,
-    and those of incredible sizes where another has credible ones.
-
-    Parameters
-    ----------
-    hypotheses : sequence of LikelihoodRatio
-        At least one.
-
-    Returns
-    -------
-    members : list of LikelihoodRatio
-    rejected : dict
-        Reason by label; hypotheses excluded by their likelihood alone are not listed.
+    """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words. A hypothesis is
+    excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best, both with the film mass
+    as stated and with the film mass free (`film_gain`). Returns members, rejected (reason by label; hypotheses excluded
+    by their likelihood alone are not listed).
     """
     best = best_of(hypotheses)
 
@@ -394,27 +277,15 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
 
 def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
-    """Whether equal predictions mean that one hypothesis is a limit of the other.
-
-    They do not for differences between trials: as every trial has its deviations of B and pressure, all of these
-    predict the same curves.
+    """Whether equal predictions mean that one hypothesis is a limit of the other. They do not for differences between
+    trials: as every trial has its deviations of B and pressure, all of these predict the same curves.
     """
     return all(ratio.effects[-1].kind != BETWEEN_TRIALS for ratio in (hypothesis, other))
 
 
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
-    """Posterior probabilities of hypotheses by label, equally likely beforehand; they add up to 1.
-
-    ln L is divided by the best one's inflation. The film mass of each vine is free within `systematics.FILM_ERROR` of
-    the stated value.
-
-    Parameters
-    ----------
-    hypotheses : sequence of LikelihoodRatio
-
-    Returns
-    -------
-    dict of float
+    """Posterior probabilities of hypotheses by label, equally likely beforehand; they add up to 1. ln L is divided by
+    the best one's inflation. The film mass of each vine is free within `systematics.FILM_ERROR` of the stated value.
     """
     if not hypotheses:
         return {}

@@ -16,19 +16,13 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
+# Splines of a force along the growth of one condition, and the extra knots in the first tenth of it (chosen)
 N_SPLINES, EARLY_KNOTS = 15, (0.01, 0.03, 0.06)
-"""Splines of a force along the growth of one condition, and the extra knots in the first tenth of it. Chosen: finer
-than any force that positions resolve."""
 
 
 @dataclass(frozen=True)
 class LinearMisfit:
-    """A fit linearised about one set of trial effects, and a smooth force estimated in every condition.
-
-    `motions` are those about which it is linear; `longest` is the largest lead position of each condition, m;
-    `sensitivities` has an array for every trial, shape (n_points, N_SPLINES), m/N, of the positions to each spline of
-    the force along the growth; `smooth_force` is the estimate of all these splines, separately in every condition.
-    """
+    """A fit linearised about one set of trial effects, and a smooth force estimated in every condition."""
 
     inversion: LinearInversion
     motions: list[FittedMotion]
@@ -38,22 +32,8 @@ class LinearMisfit:
 
 
 def linear_misfit(fit: Fit) -> LinearMisfit:
-    """Linearise about the trial effects of the fit or about those estimated trial by trial.
-
-    Of the two, the one is taken whose misfit a smooth force in every condition explains further.
-
-    Parameters
-    ----------
-    fit : the fit that lacks a force.
-
-    Returns
-    -------
-    LinearMisfit
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated.
+    """Linearise about the trial effects of the fit or about those estimated trial by trial. Of the two, the one is
+    taken whose misfit a smooth force in every condition explains further.
     """
     try:
         scatter = replicate_scatter(fit, residual_courses(fit)[0])
@@ -65,16 +45,8 @@ def linear_misfit(fit: Fit) -> LinearMisfit:
 
 
 def growth_splines(part: Floats) -> Floats:
-    """Splines of a force along the growth, narrower at the start, where the vine accelerates.
-
-    Parameters
-    ----------
-    part : array, shape (n,)
-        Lead positions as parts of the largest of their condition.
-
-    Returns
-    -------
-    array, shape (n, N_SPLINES)
+    """Splines of a force along the growth, narrower at the start, where the vine accelerates. Shapes: part (n,) → (n,
+    N_SPLINES).
     """
     uniform_knots = np.linspace(0.0, 1.0, N_SPLINES - 2 - len(EARLY_KNOTS))[1:]
     return splines(part, np.concatenate([[0.0, *EARLY_KNOTS], uniform_knots]))

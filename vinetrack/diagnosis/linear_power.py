@@ -7,18 +7,6 @@ The diagnosis calls a candidate missing when its score, in standard errors, exce
 
 where k is the shape of the effect and I the information between shapes, with free parameters and trial effects
 projected out. A size is therefore detected with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_kk. Refinements:
-
-- The diagnosis also requires that the score exceed a threshold from the scatter of single trials (Student's t). With
-  independent scores of single trials, s_i ~ N(I_i a, I_i), the required mean μ > c max(1, t_c r / c) − z₀, with r the
-  ratio of the two standard errors, is drawn jointly with z₀; its quantiles replace c + Φ⁻¹(p).
-- The fit without the effect takes part of it for between-trial scatter, which inflates σ (`error_inflation`): the score
-  x at the true standard deviations must exceed c g(x), with g the ratio of the standard errors.
-- The diagnosis does not count an effect that moves positions by less than their systematic errors, unless it predicts
-  left-out conditions better (`contradictions`). An effect that small does so about half of the time: below the size
-  that moves positions so far, the probability counts half (`expected_scores.half_power_below`).
-- An effect to which nothing responds at small sizes is computed at finite sizes, and μ_j(a) interpolated between them.
-
-How often other candidates score higher follows from draws of the joint normal distribution at that size.
 """
 
 from __future__ import annotations
@@ -48,28 +36,22 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS
 
-DRAWS, SEED = 4000, 5
-"""Draws of the normal distributions, and their seed. Derived: the quantile at 90 % is then known to 0.03 standard
-errors of the score (√(0.9 · 0.1 / 4000) / 0.175), 0.5 % of a detectable size."""
+DRAWS, SEED = 4000, 5  # Draws of the normal distributions, and their seed (derived)
 
+# Factors on the between-trial standard deviations at which the information is computed (chosen)
 SD_FACTORS = (1.0, 1.1, 1.25, 1.45, 1.75, 2.2, 3.0)
-"""Factors on the between-trial standard deviations at which the information is computed. Chosen: steps of a fifth, so
-that a detectable size is known to some per cent; beyond 3 the fit would scatter so much that other tests reject it."""
 
+# Scores at the true standard deviations for which the inflation is tabulated (chosen)
 SCORE_GRID = np.linspace(0.0, 40.0, 401)
-"""Scores at the true standard deviations for which the inflation is tabulated. Chosen: ten times any threshold."""
 
-LEAST_TAKEN_FOR = 0.05
-"""Probability from which another candidate is listed. Chosen: one time in twenty; at half lists grow long, at twice a
-name that occurs once in ten is left out."""
+LEAST_TAKEN_FOR = 0.05  # Probability from which another candidate is listed (chosen)
 
 
 @dataclass(frozen=True)
 class _Response:
-    """Expected scores of all shapes when an effect has one of several sizes.
-
-    `index` is that of `shape` among all. `sizes`, shape (n_sizes,), are deviations from absence in SI, increasing
-    in absolute value; `scores`, shape (n_sizes, n_shapes), are the means of the scores in standard errors.
+    """Expected scores of all shapes when an effect has one of several sizes. `index` is that of `shape` among all.
+    `sizes`, shape (n_sizes,), are deviations from absence in SI, increasing in absolute value; `scores`, shape
+    (n_sizes, n_shapes), are the means of the scores in standard errors.
     """
 
     effect: Effect
@@ -87,25 +69,7 @@ def power_of(
     nonlinear: bool = False,
     first_round: MisfitTests | None = None,
 ) -> Power:
-    """Compute which effects, at which sizes, the trials of a fit can detect.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-    not_testable : mapping, optional
-        Candidates that were not tested, with the reason.
-    inputs : sequence of PowerInput
-        What the power is based on, with its origin; noise and between-trial standard deviations of the fit where empty.
-    nonlinear : bool
-        Whether scores are computed by fits to noise-free trajectories with the effect, a tenth of a second each,
-        instead of by linear theory.
-    first_round : MisfitTests, optional
-        Of the first model of a diagnosis, where effects were added to it: its tests decide whether an alarm is raised.
-
-    Returns
-    -------
-    Power
-    """
+    """Compute which effects, at which sizes, the trials of a fit can detect."""
     null_scores, inflation, least = _null_scores(tests), error_inflation(tests), sizes_at_systematic_error(tests)
     effects = [
         power
@@ -130,18 +94,7 @@ def power_of(
 
 
 def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
-    """Compute at which sizes the trials of a fit can detect one candidate among all others.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-    name : of the effect.
-
-    Returns
-    -------
-    EffectPower or None
-        As in `power_of` with `nonlinear`; None where no score responds to it.
-    """
+    """Compute at which sizes the trials of a fit can detect one candidate among all others."""
     responses = _responses(tests, nonlinear=True, only=name)
     if not responses:
         return None
@@ -155,33 +108,14 @@ def effect_power(tests: MisfitTests, name: str) -> EffectPower | None:
 
 
 def typical_shape_index(tests: MisfitTests, name: str) -> int | None:
-    """Index of the shape by which an effect is represented; None where no trial has information about it.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with candidates.
-    name : of an effect among them.
-
-    Returns
-    -------
-    int or None
-    """
+    """Index of the shape by which an effect is represented; None where no trial has information about it."""
     effect = next(effect for effect in tests.effects if effect.name == name)
     indices = _typical_shapes(tests, effect)
     return indices[-1] if indices else None
 
 
 def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
-    """Noise and between-trial standard deviations that a fit estimated or was given.
-
-    Parameters
-    ----------
-    fit : of the trials.
-
-    Returns
-    -------
-    tuple of PowerInput
-    """
+    """Noise and between-trial standard deviations that a fit estimated or was given."""
     rows = [
         PowerInput("noise of a position", f"{1e3 * fit.noise_m:.3g} mm, correlation {fit.noise_correlation:.2f}", "fit")
     ]
@@ -289,9 +223,8 @@ def _size_with_mean(means: Floats, sizes: Floats, mean: float) -> float:
 
 
 def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats:
-    """For each draw of the noise, the mean that the score of a shape needs to exceed both thresholds.
-
-    Derivation at the head of the module; p_i is the share of trial i in the information about the shape.
+    """For each draw of the noise, the mean that the score of a shape needs to exceed both thresholds. Derivation at the
+    head of the module; p_i is the share of trial i in the information about the shape.
     """
     scores = tests.scores
     limit = tests.family.threshold(tests.sensitivities.effects[index])
@@ -313,24 +246,14 @@ def _required_means(tests: MisfitTests, index: int, inflation: Floats) -> Floats
 
 
 def error_inflation(tests: MisfitTests) -> Floats:
-    """Factor by which the standard error of every shape grows because the fit takes part of the effect for scatter.
-
-    The between-trial standard deviations of pressure and B are estimated without the effect. Multiplied by f_P and f_B
-    they are those that minimise
+    """Factor by which the standard error of every shape grows because the fit takes part of the effect for scatter. The
+    between-trial standard deviations of pressure and B are estimated without the effect. Multiplied by f_P and f_B they
+    are those that minimise
 
         Σ_s ν (ln f_s² + 1 / f_s²) + x² I(f_P, f_B) / I(1, 1),
 
-    the expected −2 ln L of ν degrees of freedom of between-trial scatter, plus what the effect leaves unabsorbed. Its
-    information I is computed on a grid of factors.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-
-    Returns
-    -------
-    array, shape (n_scores, n_shapes)
-        For an effect whose score at the true standard deviations would be `SCORE_GRID`; 1 where they are not estimated.
+    Returns for an effect whose score at the true standard deviations would be `SCORE_GRID`; 1 where they are not
+    estimated. Shape (n_scores, n_shapes).
     """
     fit, scores = tests.fit, tests.scores
     information = np.diag(scores.information)
@@ -359,10 +282,9 @@ def _null_scores(tests: MisfitTests) -> Floats:
 def _confusion(
     tests: MisfitTests, response: _Response, size: float, null_scores: Floats
 ) -> tuple[dict[str, float], float]:
-    """How often each other candidate scores highest at a size, and how often the effect is named alone.
-
-    Both among draws in which any candidate exceeds its threshold. A score counts where its size is credible; an effect
-    that contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
+    """How often each other candidate scores highest at a size, and how often the effect is named alone. Both among
+    draws in which any candidate exceeds its threshold. A score counts where its size is credible; an effect that
+    contains another as a limit, be it this one or its rival, must be better by the Δχ² of the answer set.
     """
     if not math.isfinite(size):
         return {}, math.nan

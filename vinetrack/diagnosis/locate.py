@@ -38,9 +38,7 @@ from vinetrack.inference.fit_result import Fit, TrialFit
 if TYPE_CHECKING:
     import pandas as pd
 
-FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0
-"""Significance, in standard deviations, from which a model is said to fail (with a Bonferroni correction for single
-conditions), and from which a condition then counts as failing."""
+FAILED_SIGMAS, MISSED_SIGMAS = 3.0, 2.0  # Significance, in standard deviations, from which a model is said to fail
 
 CONDITION_COLUMNS = (
     "vine",
@@ -66,13 +64,9 @@ SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s",
 
 @dataclass(frozen=True)
 class Failure:
-    """Where a model fails; tables in SI, a residual is measurement minus model.
-
-    `by_condition`, columns `CONDITION_COLUMNS`, has the largest root mean square first, which all pages call the worst
-    condition; `z` is the significance of the mean residual compared with the scatter of replicates. `along_time`,
-    `along_position` and `along_speed` (since release; growth and speed of the leading edge in the model) hold the mean
-    residual of each stretch with its standard error; rows with a blank `condition` combine all trials of a vine.
-    `drift` states which parameters depend on a condition on which they should not.
+    """Where a model fails; tables in SI, a residual is measurement minus model. `by_condition`, columns
+    `CONDITION_COLUMNS`, has the largest root mean square first, which all pages call the worst condition; `z` is the
+    significance of the mean residual compared with the scatter of replicates.
     """
 
     model: str
@@ -94,22 +88,7 @@ class Failure:
 
 
 def locate(fit: Fit) -> Failure:
-    """Find where a fitted model fails.
-
-    Parameters
-    ----------
-    fit
-        The fit of the model.
-
-    Returns
-    -------
-    Failure
-
-    Raises
-    ------
-    FitError
-        If the simulation of the model fails.
-    """
+    """Find where a fitted model fails."""
     import pandas as pd
 
     courses, predicted = residual_courses(fit)

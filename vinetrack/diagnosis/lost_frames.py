@@ -20,17 +20,7 @@ class LostFrames:
     certain: tuple[str, ...] = ()
 
     def including(self, trial: str, track: Track) -> LostFrames:
-        """Add a trial if its times were corrected for dropped frames.
-
-        Parameters
-        ----------
-        trial : str
-        track : Track
-
-        Returns
-        -------
-        LostFrames
-        """
+        """Add a trial if its times were corrected for dropped frames."""
         if not with_flag(track.flag, "retimed").any():
             return self
         certain = (trial,) if frames_surely_missing(track) else ()
@@ -38,17 +28,7 @@ class LostFrames:
 
 
 def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], LostFrames]:
-    """Correct the times of tracks with dropped and repeated frames.
-
-    Parameters
-    ----------
-    pairs : (Trial, Track) of every trial
-
-    Returns
-    -------
-    pairs : list of (Trial, Track)
-    dropped : LostFrames
-    """
+    """Correct the times of tracks with dropped and repeated frames. Returns pairs, dropped."""
     corrected: list[tuple[Trial, Track]] = []
     dropped = LostFrames()
     for trial, track in pairs:
@@ -60,16 +40,7 @@ def correct_dropped_frames(pairs: Pairs) -> tuple[list[tuple[Trial, Track]], Los
 
 
 def dropped_frames_in(fit: Fit) -> LostFrames:
-    """Find trials of a fit whose dropped frames were not corrected.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-
-    Returns
-    -------
-    LostFrames
-    """
+    """Find trials of a fit whose dropped frames were not corrected."""
     dropped = LostFrames()
     for trial_data in fit.predictor.data:
         track = correct_frames(plain_track(trial_data.time_s, trial_data.lead_position_m))
@@ -78,18 +49,8 @@ def dropped_frames_in(fit: Fit) -> LostFrames:
 
 
 def with_lost_frames(result: Diagnosis, dropped: LostFrames) -> Diagnosis:
-    """Put certain dropped frames first in a diagnosis, and its verdict with corrected times into a note.
-
-    A jump that a few outlying points may have caused becomes a note only.
-
-    Parameters
-    ----------
-    result : the diagnosis with corrected times.
-    dropped : LostFrames
-
-    Returns
-    -------
-    Diagnosis
+    """Put certain dropped frames first in a diagnosis, and its verdict with corrected times into a note. A jump that a
+    few outlying points may have caused becomes a note only.
     """
     if not dropped.trials:
         return result

@@ -29,36 +29,25 @@ from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.goodness_of_fit import is_poor_fit, relative_residual
 from vinetrack.inference.systematics import systematics_of
 
+# Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4
-"""Probability that the best of all candidates exceeds its threshold where nothing is missing: in the first round, and
-once an effect was added. The later level is smaller because a pair of effects can imitate what is in no catalogue.
-Chosen as a tenth of the required 3 % false alarms on null campaigns, for each of the tests that may raise one; measured
-0 of 42 (benchmarks/hidden_effects.py, scoring seeds 16000 and 17000)."""
 
-SINGLE_PROBE_LEVEL = 3e-4
-"""Level of the test of the single most significant probe. Chosen: a tenth of FALSE_ALARM_LEVEL_FIRST_ROUND, for eight
-kinds of probes are tried."""
+SINGLE_PROBE_LEVEL = 3e-4  # Level of the test of the single most significant probe (chosen)
 
+# χ² per degree of freedom, against the noise of the tracks alone, from which a model is far off (chosen)
 FAR_OFF_CHI2_PER_DOF = 4.0
-"""χ² per degree of freedom, against the noise of the tracks alone, from which a model is far off. Chosen: twice the 1.8
-that heavy-tailed noise reaches."""
 
+# Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any tracker
 MISSED_FRACTION, MISSED_FRACTION_WITHOUT_SLOW_ERRORS = 6e-4, 1.5e-4
-"""Root mean square misfit of the median trial, as a fraction of its growth, that exceeds the slow errors of any
-tracker: 0.1 mm of 170 mm. The second holds for positions measured elsewhere under a set pressure, which have no known
-slow errors."""
 
+# A model that passes every test is searched nevertheless from this χ² per degree of freedom, or below this p-value of
+# the trial effects; an effect must then reach this many standard deviations (chosen)
 SEARCH_CHI2_PER_DOF, SEARCH_P_VALUE, SEARCH_SIGMAS = 1.5, 1e-2, 6.0
-"""A model that passes every test is searched nevertheless from this χ² per degree of freedom, or below this p-value of
-the trial effects; an effect must then reach this many standard deviations. Chosen: heavy tails alone reach a χ² per
-degree of freedom of 1.5."""
 
+# Significance that the largest plausible size of an effect must reach for the effect to be testable (chosen)
 TESTABLE_SIGMAS = 3.0
-"""Significance that the largest plausible size of an effect must reach for the effect to be testable. Chosen: below
-three standard deviations it would not pass FALSE_ALARM_LEVEL_FIRST_ROUND."""
 
-ONE_SIDED_95 = 1.645
-"""Derived: quantile of the normal distribution."""
+ONE_SIDED_95 = 1.645  # Derived: quantile of the normal distribution
 
 
 @dataclass(frozen=True)
@@ -75,10 +64,9 @@ class MisfitTests:
 
     @cached_property
     def one_sided_z(self) -> Floats:
-        """Score of every shape in standard errors (z) where its sign is allowed; 0 where it is not.
-
-        The smaller of two: by the noise model, and by the scatter of single trials, whose Student's t is converted to
-        the normal quantile of the same tail probability.
+        """Score of every shape in standard errors (z) where its sign is allowed; 0 where it is not. The smaller of two:
+        by the noise model, and by the scatter of single trials, whose Student's t is converted to the normal quantile
+        of the same tail probability.
         """
         from scipy.stats import norm, t
 
@@ -102,16 +90,7 @@ class MisfitTests:
         return family_test(self.scores.cosines, self.signs, self.sensitivities.effects, self.level)
 
     def largest_excess(self, family: FamilyTest) -> float:
-        """Largest excess of a candidate's z over its threshold; negative where no candidate exceeds its own.
-
-        Parameters
-        ----------
-        family : thresholds of all candidates.
-
-        Returns
-        -------
-        float
-        """
+        """Largest excess of a candidate's z over its threshold; negative where no candidate exceeds its own."""
         thresholds = np.array([family.threshold(name) for name in self.sensitivities.effects])
         return float(np.max(self.one_sided_z - thresholds, initial=-math.inf))
 
@@ -186,17 +165,7 @@ class MisfitTests:
         return np.where(sign_allowed, self.scores.score * size, 0.0), size
 
     def ranked_shapes(self, name: str) -> list[int]:
-        """Indices of an effect's shapes, the largest predicted gain first.
-
-        Parameters
-        ----------
-        name : str
-            Name of an effect.
-
-        Returns
-        -------
-        list of int
-        """
+        """Indices of an effect's shapes, the largest predicted gain first."""
         gains = self.predicted_gains[0]
         return sorted(self._shapes_of(name), key=lambda i: -gains[i])
 
@@ -205,32 +174,13 @@ class MisfitTests:
         return [i for i, effect in enumerate(self.sensitivities.effects) if effect == name]
 
     def predicted_gain(self, name: str) -> float:
-        """Largest fall of −2 ln L that is predicted for any shape of an effect; 0 without shapes.
-
-        Parameters
-        ----------
-        name : str
-            Name of an effect.
-
-        Returns
-        -------
-        float
-        """
+        """Largest fall of −2 ln L that is predicted for any shape of an effect; 0 without shapes."""
         indices = self.ranked_shapes(name)
         return float(self.predicted_gains[0][indices[0]]) if indices else 0.0
 
     def best_z(self, name: str) -> tuple[float, int]:
         """Largest z of an effect and the index of its shape; 0 and −1 where no trial responds to it.
-
-        Parameters
-        ----------
-        name : str
-            Name of an effect.
-
-        Returns
-        -------
-        z : float
-        index : int
+        Returns z, index.
         """
         indices = self._shapes_of(name)
         if not indices:
@@ -239,33 +189,14 @@ class MisfitTests:
         return float(self.one_sided_z[index]), index
 
     def cosine(self, first: str, second: str) -> float:
-        """Largest |cosine| between shapes of two effects.
-
-        Parameters
-        ----------
-        first, second : str
-            Names of effects.
-
-        Returns
-        -------
-        float
-        """
+        """Largest |cosine| between shapes of two effects."""
         pairs = np.ix_(self._shapes_of(first), self._shapes_of(second))
         return float(np.max(np.abs(self.scores.cosines[pairs]), initial=0.0))
 
     def upper_limits(self, effect: Effect) -> tuple[dict[str, float], bool]:
         """Upper limit (one-sided 95 %) of an undetected size, and whether a plausible size would be detected at all.
-
-        Parameters
-        ----------
-        effect
-            An effect of the catalogue or of the user.
-
-        Returns
-        -------
-        limits : dict of float
-            By `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable.
-        testable : bool
+        Returns limits (by `effect.parameter`, SI; empty where no trial responds to the effect or it is not testable),
+        testable.
         """
         indices = self._shapes_of(effect.name)
         if not indices or not effect.parameters:
@@ -285,17 +216,7 @@ class MisfitTests:
         return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
 
     def predicted_size(self, effect: Effect, index: int) -> tuple[Number, ...]:
-        """One-step estimate of an effect's size with its standard error; empty where the model is too far off.
-
-        Parameters
-        ----------
-        effect : the effect of the shape.
-        index : index of one of its shapes, negative where it has none.
-
-        Returns
-        -------
-        tuple of Number
-        """
+        """One-step estimate of an effect's size with its standard error; empty where the model is too far off."""
         if index < 0 or not effect.parameters or self.poorly_fitted:
             return ()
         size, sigma = float(self.scores.size[index]), float(self.scores.sigma[index])
@@ -320,22 +241,7 @@ class MisfitTests:
 
 
 def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: bool = False) -> MisfitTests:
-    """Test a fit for these candidates and for misfit that none of them describes.
-
-    Parameters
-    ----------
-    fit : the fitted model.
-    effects : sequence of Effect
-        Candidates; those already in the model are skipped.
-    level : float
-        Family-wise false-alarm probability of the candidates.
-    film : bool
-        Whether the film mass of each vine is a nuisance parameter, free within its usual error.
-
-    Returns
-    -------
-    MisfitTests
-    """
+    """Test a fit for these candidates and for misfit that none of them describes."""
     effects = tuple(effect for effect in effects if effect.name not in fit.model)
     trials = [trial.trial for trial in fit.trials]
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]

@@ -37,30 +37,21 @@ if TYPE_CHECKING:
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
 LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
 
+# Splines of a force that depends on one variable alone, the same in all trials
 SPLINES_OF_VARIABLE = {"growth": 24, "speed": 10, "time": 10}
-"""Splines of a force that depends on one variable alone, the same in all trials."""
 
-N_BINS = 10
-"""Bins along each axis in which the mean over all conditions is taken. Chosen for the picture."""
+N_BINS = 10  # Bins along each axis in which the mean over all conditions is taken (chosen)
 
-LEAST_EXPLAINED_TO_NAME = 0.7
-"""Part of what is missing that a law must explain to be named. Chosen: below, a sentence that names a law would
-mislead; at 0.85 a law with a wrong exponent is not named either."""
+LEAST_EXPLAINED_TO_NAME = 0.7  # Part of what is missing that a law must explain to be named (chosen)
 
-CURVE_POINTS = 24
-"""Points of a curve. Chosen for the picture."""
+CURVE_POINTS = 24  # Points of a curve (chosen)
 
-MAX_RELATIVE_ERROR = 2.0
-"""Multiple of the median standard error above which a force is not drawn: near the end it has no time left to move
-anything. Chosen for the picture."""
+MAX_RELATIVE_ERROR = 2.0  # Multiple of the median standard error above which a force is not drawn (chosen)
 
+# Part of the misfit that a smooth force in every condition must take away for the misfit to count as a force (chosen)
 LEAST_MISFIT_REDUCTION = 0.5
-"""Part of the misfit that a smooth force in every condition must take away for the misfit to count as a force. Chosen:
-half of the misfit; below it the sentence says that what is missing is no force."""
 
-EQUALLY_EXPLAINED = 0.05
-"""Difference of the explained parts within which other laws are named with the best. Chosen: a twentieth, by which the
-explained part of a single law scatters from trial to trial."""
+EQUALLY_EXPLAINED = 0.05  # Difference of the explained parts within which other laws are named with the best (chosen)
 
 
 @dataclass(frozen=True)
@@ -75,13 +66,8 @@ class DetectedLaw:
 
 @dataclass(frozen=True)
 class MissingForce:
-    """What is missing, as a force on the tail, N.
-
-    `table`, columns `FORCE_COLUMNS`: the force of every condition (blank: mean over all) against `lead_position_m`,
-    `tail_velocity_m_s`, `time_s` and `pressure_Pa`. `laws`, columns `LAW_COLUMNS`, has the best law of each kind, best
-    first; `explained` is relative to what any smooth force could explain. `depends_on` is the same for a force of one
-    variable alone. `detected` are the laws whose amplitude differs significantly from zero, best first. `learned` is
-    the force as a smooth function of one or two variables; None where no such force is detected.
+    """What is missing, as a force on the tail, N. `table`, columns `FORCE_COLUMNS`: the force of every condition
+    (blank: mean over all) against `lead_position_m`, `tail_velocity_m_s`, `time_s` and `pressure_Pa`.
     """
 
     table: pd.DataFrame
@@ -103,23 +89,7 @@ class MissingForce:
 
 @in_one_blas_thread
 def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
-    """Estimate the force that a fit lacks and compare it with simple laws.
-
-    Parameters
-    ----------
-    fit : the fit that lacks a force.
-    learn : bool
-        Whether to estimate it as a smooth function of its variables as well, which takes most of the time.
-
-    Returns
-    -------
-    MissingForce
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated.
-    """
+    """Estimate the force that a fit lacks and compare it with simple laws."""
     linear = linear_misfit(fit)
     inversion, motions = linear.inversion, linear.motions
     ranked = ranked_laws(fit, linear)
@@ -150,21 +120,7 @@ def missing_force(fit: Fit, *, learn: bool = True) -> MissingForce:
 
 @in_one_blas_thread
 def learn_missing_force(fit: Fit) -> LearnedForce | None:
-    """Estimate the force that a fit lacks as a smooth function, without comparing it with laws.
-
-    Parameters
-    ----------
-    fit : the fit that lacks a force.
-
-    Returns
-    -------
-    LearnedForce or None
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated.
-    """
+    """Estimate the force that a fit lacks as a smooth function, without comparing it with laws."""
     return _learned(fit, linear_misfit(fit))
 
 

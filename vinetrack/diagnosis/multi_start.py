@@ -31,48 +31,36 @@ from vinetrack.inference.solving import SLOW_NOISE
 from vinetrack.inference.starts import align, one_trial_per_condition
 from vinetrack.inference.trace_errors import as_recorded
 
-Start = tuple[Sequence[Effect], Mapping[str, Value]]
-"""Effects to add, and parameter values to start from."""
+Start = tuple[Sequence[Effect], Mapping[str, Value]]  # Effects to add, and parameter values to start from
 
-SUBSET_SPREADS = (0.01, 0.03)
-"""Between-trial standard deviations of pressure and ln B in a subset fit. Chosen as FIRST_SPREADS of the optimiser."""
+SUBSET_SPREADS = (0.01, 0.03)  # Between-trial standard deviations of pressure and ln B in a subset fit (chosen)
 
+# Iterations of a subset fit from each start, and of the best one each further time (chosen)
 SUBSET_FIRST_ITERATIONS, SUBSET_FURTHER_ITERATIONS = 4, 10
-"""Iterations of a subset fit from each start, and of the best one each further time. Chosen for time: a start that
-leads anywhere has shown it after four steps."""
 
-MAX_SUBSET_TRIALS = 14
-"""Trials of a subset fit: one of every condition, at most this many. Chosen for time."""
+MAX_SUBSET_TRIALS = 14  # Trials of a subset fit: one of every condition, at most this many (chosen)
 
+# Iterations of a full fit at first and in all (chosen)
 FULL_FIT_FIRST_ITERATIONS, FULL_FIT_MAX_ITERATIONS, ABANDONED_BEHIND = 14, 40, 50.0
-"""Iterations of a full fit at first and in all, and the difference in ln L to the best from which a fit is not
-continued. Chosen for time."""
 
+# Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it (chosen)
 MIN_SHARE_OF_BEST_GAIN = 0.3
-"""Share of the best hypothesis's gain that a hypothesis needs for larger sets to be built on it. A fit that is far off
-and cannot reach it need not be completed. Chosen for time: effects that share a misfit evenly explain a third of it
-each; at half weaker ones are built on too (time), at twice two that explain half each may not be."""
 
+# Fall of −2 ln L of a subset fit from which its start is worth a full fit (chosen)
 MIN_DEVIANCE_FALL, MIN_DEVIANCE_FALL_PER_POINT = 1.0, 0.02
-"""Fall of −2 ln L of a subset fit from which its start is worth a full fit. Chosen: iterations that have not settled
-differ by as much."""
 
-HOPELESS_RANGE_FACTOR = 6.0
-"""Multiple of its plausible range beyond which a size of a subset fit is hopeless. Chosen: twice
-CREDIBLE_RANGE_FACTOR."""
+HOPELESS_RANGE_FACTOR = 6.0  # Multiple of its plausible range beyond which a size of a subset fit is hopeless (chosen)
 
-START_EXPONENTS = (0.2, 0.4, 0.7)
-"""Exponents from which a model is started. Chosen: about the published 0.37, each within a factor of two."""
+START_EXPONENTS = (0.2, 0.4, 0.7)  # Exponents from which a model is started (chosen)
 
+# −2 ln L per point by which a subset fit may stay behind the best so far after its first iterations and still be
+# continued (chosen)
 HOPELESS_DEVIANCE_PER_POINT = 0.5
-"""−2 ln L per point by which a subset fit may stay behind the best so far after its first iterations and still be
-continued. Chosen for time."""
 
 
 @dataclass(frozen=True)
 class SubsetFit:
     """End of a subset fit, from which a full fit starts: −2 ln L on its trials, values, and whether it is far off.
-
     `yields_Pa` are yield pressures by name of number: with a friction at rest added, those fitted without it may stop a
     vine altogether. A start that no subset fit was made for has the deviance NaN.
     """
@@ -117,25 +105,7 @@ class SubsetFitter:
         align_first: bool = True,
         search: bool = False,
     ) -> SubsetFit | None:
-        """Fit the model with these effects added; None where the fit fails.
-
-        Parameters
-        ----------
-        effects : sequence of Effect
-            Added to the model.
-        start : mapping
-            Values of parameters to start from, SI.
-        iterations : int
-            Maximum number of iterations.
-        align_first : bool
-            Whether releases are searched first.
-        search : bool
-            Whether it is one of many fits, see `optimiser.solve`.
-
-        Returns
-        -------
-        SubsetFit or None
-        """
+        """Fit the model with these effects added; None where the fit fails."""
         model = self.fit.model.with_effects(effects).with_values({**self.fit.model.values, **start})
         layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
         predictor = Predictor(layout, self.data, self.fit.predictor.host)
@@ -184,7 +154,6 @@ def _values(layout: ParameterMap, theta: Floats) -> tuple[dict[str, Value], dict
 
 def _subset(data: Sequence[FitTrial]) -> list[int]:
     """Indices of one trial of every condition, that with the most points; evenly thinned where there are too many.
-
     Every vine keeps at least one trial.
     """
     candidates = one_trial_per_condition(data)
@@ -198,19 +167,8 @@ def _subset(data: Sequence[FitTrial]) -> list[int]:
 
 
 def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
-    """Values of an effect's parameters to start from: the predicted size, limited to what is possible.
-
-    Parameters
-    ----------
-    shape
-        Shape of the effect.
-    size : float, SI
-        Predicted size, from the parameter's zero.
-
-    Returns
-    -------
-    dict
-        By `effect.parameter`, SI.
+    """Values of an effect's parameters to start from: the predicted size, limited to what is possible. Returns by
+    `effect.parameter`, SI.
     """
     effect = shape.effect
     if not effect.parameters:
@@ -234,24 +192,7 @@ def start_values(shape: CandidateShape, size: float) -> dict[str, Value]:
 def best_subset_fit(
     fitter: SubsetFitter, starts: Sequence[Start], goal: float, *, search: bool = False
 ) -> SubsetFit | None:
-    """Fit one hypothesis to the subset from several starts: a few iterations from each, then the best one on.
-
-    Parameters
-    ----------
-    fitter
-        Makes the subset fits.
-    starts : sequence of Start
-        Of one hypothesis.
-    goal : float
-        Best deviance of any hypothesis so far; a hypothesis that is far above it is not continued.
-    search : bool
-        Whether the hypothesis is one of many: if it is far off, it is not continued where it improves slowly.
-
-    Returns
-    -------
-    SubsetFit or None
-        None where the fit fails from every start.
-    """
+    """Fit one hypothesis to the subset from several starts: a few iterations from each, then the best one on."""
     first_fits = [
         subset_fit
         for effects, start in starts
@@ -277,25 +218,7 @@ def best_subset_fit(
 def full_fit(
     before: Fit, start: SubsetFit, best: float = -math.inf, *, reset: bool = False, rescue: bool = True
 ) -> Fit | None:
-    """Fit a hypothesis to all trials from where its subset fit ended; None where the fit fails.
-
-    Parameters
-    ----------
-    before
-        The fit without the effects.
-    start
-        Where the subset fit ended.
-    best : float
-        Largest ln L of any hypothesis so far. A fit that is far below it after the first iterations is not continued.
-    reset : bool
-        Start with releases, deviations and noise as the tracks show them, not as `before` has adapted them.
-    rescue : bool
-        Whether a fit that ends far off is started again, see `refit`.
-
-    Returns
-    -------
-    Fit or None
-    """
+    """Fit a hypothesis to all trials from where its subset fit ended; None where the fit fails."""
     model = before.model.with_effects(start.effects)
     goal = (
         before.log_likelihood + MIN_SHARE_OF_BEST_GAIN * (best - before.log_likelihood) if start.effects else -math.inf
@@ -324,17 +247,7 @@ def full_fit(
 
 
 def restart_exponents(fit: Fit) -> Fit:
-    """Refit a model from several exponents of the damping law; return the better of this and the given fit.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    Fit
-    """
+    """Refit a model from several exponents of the damping law; return the better of this and the given fit."""
     starts = exponent_starts(fit)
     if len(starts) == 1:
         return fit
@@ -343,37 +256,15 @@ def restart_exponents(fit: Fit) -> Fit:
 
 
 def exponent_starts(fit: Fit) -> list[Start]:
-    """Starts from several exponents n of the damping law; the fit's own values alone where n is not free.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    list of Start
-    """
+    """Starts from several exponents n of the damping law; the fit's own values alone where n is not free."""
     if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
         return [((), {})]
     return [((), {EXPONENT: n}) for n in START_EXPONENTS]
 
 
 def restart_without(fit: Fit, larger: Fit) -> Fit:
-    """Refit a model from the values of a larger model's fit; return the better of this and the given fit.
-
-    The refit is made where a subset fit from there recovers half of the larger model's advantage.
-
-    Parameters
-    ----------
-    fit
-        The fit without the effects.
-    larger
-        A fit whose model contains that of `fit`.
-
-    Returns
-    -------
-    Fit
+    """Refit a model from the values of a larger model's fit; return the better of this and the given fit. The refit is
+    made where a subset fit from there recovers half of the larger model's advantage.
     """
     fitter, names = SubsetFitter(fit), set(fit.model.parameter_names)
     added = [effect for effect in larger.model if effect.name not in fit.model]
@@ -398,17 +289,7 @@ def _restart(fitter: SubsetFitter, starts: Sequence[Start], null_deviance: float
 
 
 def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
-    """Starts of one effect from its shapes at their predicted sizes, without duplicates.
-
-    Parameters
-    ----------
-    shapes : iterable of (CandidateShape, float)
-        Shapes of one effect with their predicted sizes, SI.
-
-    Returns
-    -------
-    list of Start
-    """
+    """Starts of one effect from its shapes at their predicted sizes, without duplicates."""
     seen: set[str] = set()
     starts: list[Start] = []
     for shape, size in shapes:
@@ -421,16 +302,7 @@ def distinct_starts(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Star
 
 
 def sheet_slip_starts(effect: Effect) -> list[Start]:
-    """Starts of one effect from the sizes that common slips in the sheet would produce.
-
-    Parameters
-    ----------
-    effect
-
-    Returns
-    -------
-    list of Start
-    """
+    """Starts of one effect from the sizes that common slips in the sheet would produce."""
     return [
         ((effect,), {f"{effect.name}.{parameter.name}": size})
         for parameter in effect.parameters

@@ -15,34 +15,18 @@ from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
+# Standard errors by which an additional parameter must differ from zero for the simpler form to be ruled out without a
+# fit
 CERTAIN_SIGMAS = 6.0
-"""Standard errors by which an additional parameter must differ from zero for the simpler form to be ruled out without
-a fit. Chosen: six standard errors are beyond doubt even where errors are half as large as they should be."""
 
+# A hypothesis and its ln L, one of its effects, and the simpler form of that effect
 NestedForm = tuple[str, float, str, str]
-"""A hypothesis and its ln L, one of its effects, and the simpler form of that effect."""
 
 
 def simpler_forms(
     before: Fit, hypothesis: LikelihoodRatio, effects: Sequence[Effect], tried: set[NestedForm]
 ) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
-    """Refit a hypothesis with one of its effects replaced by a simpler effect that it contains.
-
-    Parameters
-    ----------
-    before : the fit without the effects.
-    hypothesis : with one effect or several.
-    effects : sequence of Effect
-        All candidates.
-    tried : set
-        Simpler forms that were fitted already and are skipped; those fitted here are added.
-
-    Yields
-    ------
-    effects : tuple of Effect
-    fit : Fit
-        Started from the parameters of the hypothesis.
-    """
+    """Refit a hypothesis with one of its effects replaced by a simpler effect that it contains."""
     for larger in hypothesis.effects:
         for simpler in effects:
             contained = simpler.name in larger.replaces and simpler.name not in hypothesis.names

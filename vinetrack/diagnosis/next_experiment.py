@@ -42,46 +42,30 @@ from vinetrack.planning.simulated_tracks import growth_courses, sampling_of
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 
-LEAST_SEPARATION = 3.0
-"""Separation, in standard deviations, below which trials are not recommended. Chosen: the usual three."""
+LEAST_SEPARATION = 3.0  # Separation, in standard deviations, below which trials are not recommended (chosen)
 
+# Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended (chosen)
 SUFFICIENT_SEPARATION = 8.0
-"""Separation, in standard deviations, beyond which no further effort, such as making a new vine, is recommended.
-Chosen."""
 
-MAX_HYPOTHESES = 5
-"""Most hypotheses that a design separates. Chosen for time: pairs grow with the square."""
+MAX_HYPOTHESES = 5  # Most hypotheses that a design separates (chosen)
 
-NO_FURTHER_EFFECT = "nothing more"
-"""Name of the hypothesis whose effects all other hypotheses share."""
+NO_FURTHER_EFFECT = "nothing more"  # Name of the hypothesis whose effects all other hypotheses share
 
-CHECK_DRAWS = {2: 3, 3: 2}
-"""Draws of the check by number of hypotheses, otherwise one: every draw takes as many refits as the square of that
-number. Chosen for time."""
+CHECK_DRAWS = {2: 3, 3: 2}  # Draws of the check by number of hypotheses, otherwise one (chosen)
 
-CLEAR_SEPARATION = 20.0
-"""Separation, in standard deviations, beyond which the check takes one draw less. Chosen for time."""
+CLEAR_SEPARATION = 20.0  # Separation, in standard deviations, beyond which the check takes one draw less (chosen)
 
+# Factor by which the worth of a design must exceed that with less effort for it to be considered (chosen)
 LEAST_GAIN = 1.01
-"""Factor by which the worth of a design must exceed that with less effort for it to be considered. Chosen for time."""
 
-MAX_VINES_TRIED = 2
-"""New vines that are tried, at most. Chosen for time."""
+MAX_VINES_TRIED = 2  # New vines that are tried, at most (chosen)
 
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The recommended next trials.
-
-    `trials` has an entry for each condition: the columns of the sheet that may be chosen (`schema.LIMITED`; NaN where
-    the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names of what differs from the rig so far.
-    Empty where no trials are recommended.
-
-    `separation_sigma` holds, by pair (`"a | b"`), the expected separation once the trials are made and all are fitted
-    together, in standard deviations: the smaller of those if a is true and if b is true, which `if_true_sigma` gives by
-    pair and name. `simulated_sigma` holds the mean and standard deviation of that separation in the check by
-    simulation. `alternatives` are the next best sets of trials with their separations. `calibration` states what to
-    measure, where that is needed or would do as well.
+    """The recommended next trials. `trials` has an entry for each condition: the columns of the sheet that may be
+    chosen (`schema.LIMITED`; NaN where the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names
+    of what differs from the rig so far.
     """
 
     text: str
@@ -140,26 +124,7 @@ class _Option:
 
 @in_one_blas_thread
 def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
-    """Recommend trials that separate hypotheses which fit the same trials equally well.
-
-    Parameters
-    ----------
-    tied : sequence of Fit
-        Fits of two hypotheses or more to the same trials, most likely first; of more than five the first five count.
-    limits : Limits, optional
-        Within which further trials can be made; what it leaves open is as in the trials so far.
-    seed : int
-        Of the random numbers of the simulated trials.
-
-    Returns
-    -------
-    NextExperiment
-
-    Raises
-    ------
-    FitError
-        If there are fewer than two fits, they are not of the same trials, or further trials cannot be simulated.
-    """
+    """Recommend trials that separate hypotheses which fit the same trials equally well."""
     limits = limits or Limits()
     _check_fits(tied)
     tied = list(tied)[:MAX_HYPOTHESES]
@@ -223,9 +188,8 @@ def _feasible_trials(
 
 
 def _options(bench: DesignProblem, terms: list[RefitTerms], limits: Limits, seed: int) -> list[_Option]:
-    """The best set of trials for each level of effort that gains over the lower ones, with its expected separation.
-
-    One level beyond a sufficient one is computed as well, for comparison.
+    """The best set of trials for each level of effort that gains over the lower ones, with its expected separation. One
+    level beyond a sufficient one is computed as well, for comparison.
     """
     options: list[_Option] = []
     before = -math.inf

@@ -8,8 +8,6 @@ mean for this design. With k of N at least as extreme as the observed one, its M
 
 Where the levels are right, −ln p of null campaigns is exponential with rate 1. With another rate a, the calibrated
 p-value is p^a; a is estimated by N/Σ(−ln p), with an exact interval, since 2aΣ(−ln p) is χ² with 2N degrees of freedom.
-That reaches further into the tail than N campaigns do, and is reported only where a Kolmogorov-Smirnov test does not
-reject an exponential distribution.
 """
 
 from __future__ import annotations
@@ -40,19 +38,17 @@ from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError
 from vinetrack.planning.simulated_campaigns import make
 
+# Tests of a first model and their levels, as `MisfitTests.something` sets them (derived)
 TESTS = {
     "scores of all candidates": FALSE_ALARM_LEVEL_FIRST_ROUND,
     "any smooth force": 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND,
     "the loudest probe": SINGLE_PROBE_LEVEL,
     "replicates that err alike, noise in motion": 0.1 * FALSE_ALARM_LEVEL_FIRST_ROUND,
 }
-"""Tests of a first model and their levels, as `MisfitTests.something` sets them. Derived."""
 
-TAIL_TEST_LEVEL = 0.05
-"""Level of the test of the exponential tail. A convention."""
+TAIL_TEST_LEVEL = 0.05  # Level of the test of the exponential tail
 
-LEAST_P = 1e-12
-"""Smaller p-values are set to this: they no longer come from noise. Chosen."""
+LEAST_P = 1e-12  # Smaller p-values are set to this: they no longer come from noise (chosen)
 
 
 @dataclass(frozen=True)
@@ -132,10 +128,9 @@ class CalibratedTest:
 
     @property
     def still_called(self) -> bool | None:
-        """Whether the null distribution of this design would reject as well; None where that is not known.
-
-        By the Monte-Carlo p-value where there are enough campaigns, and by the tail where the level lies outside its
-        interval. It does not reject where the interval of the rate of more extreme campaigns lies above the level.
+        """Whether the null distribution of this design would reject as well; None where that is not known. By the
+        Monte-Carlo p-value where there are enough campaigns, and by the tail where the level lies outside its interval.
+        It does not reject where the interval of the rate of more extreme campaigns lies above the level.
         """
         low, _ = self.exceeding.interval
         if low > self.level:
@@ -170,9 +165,8 @@ class CalibratedTest:
 
 @dataclass(frozen=True)
 class NullCalibration:
-    """Calibration of all tests of a first model. `failed` counts campaigns that could not be fitted.
-
-    `model` names the effects of the true model of the null campaigns.
+    """Calibration of all tests of a first model. `failed` counts campaigns that could not be fitted. `model` names the
+    effects of the true model of the null campaigns.
     """
 
     tests: tuple[CalibratedTest, ...]
@@ -214,34 +208,14 @@ class NullCalibration:
 
 
 def p_values_of(tests: MisfitTests) -> dict[str, float]:
-    """p-value of each test of a fitted model.
-
-    Parameters
-    ----------
-    tests : the misfit tests of the fit with all candidates.
-
-    Returns
-    -------
-    dict of float
-        By name, as in `TESTS`.
-    """
+    """p-value of each test of a fitted model. Returns by name, as in `TESTS`."""
     family = family_p_value(tests.scores.cosines, tests.signs, tests.sensitivities.effects, tests.one_sided_z)
     structure = tests.structure
     return dict(zip(TESTS, (family, structure.p, structure.smallest_probe_p, tests.trial_effect_p), strict=True))
 
 
 def null_p_values(design: CampaignDesign, seed: int) -> CampaignPValues:
-    """Simulate one campaign of a design with nothing missing, fit it, and compute the p-value of every test.
-
-    Parameters
-    ----------
-    design : of the campaign.
-    seed : of the random numbers.
-
-    Returns
-    -------
-    CampaignPValues
-    """
+    """Simulate one campaign of a design with nothing missing, fit it, and compute the p-value of every test."""
     try:
         candidates = candidates_of(design.to_fit, design.candidates, design.model.user_effects)
         draw = np.random.default_rng([seed, 78])
@@ -258,18 +232,7 @@ def null_p_values(design: CampaignDesign, seed: int) -> CampaignPValues:
 
 
 def calibrate(observed: Mapping[str, float], null: Sequence[CampaignPValues], model: Sequence[str]) -> NullCalibration:
-    """Compare the p-values of a diagnosis with those of null campaigns.
-
-    Parameters
-    ----------
-    observed : p-values by test.
-    null : of simulated campaigns; those that failed are counted separately.
-    model : names of the effects of the fitted model.
-
-    Returns
-    -------
-    NullCalibration
-    """
+    """Compare the p-values of a diagnosis with those of null campaigns."""
     completed = [campaign for campaign in null if not campaign.failed]
     tests = tuple(
         CalibratedTest(name, level, observed[name], tuple(campaign.p_values[name] for campaign in completed))

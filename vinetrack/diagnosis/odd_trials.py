@@ -7,9 +7,7 @@ detected without the model that failed: over the middle of the growth damping ro
 
 with a curvature c for a force of another power of speed. The residual of a trial from a robust fit of these curves is
 compared with the residuals of the others. An effect that the model lacks changes all trials of a condition alike; a
-pressure with its digits swapped does not. Only the user can tell whether row or recording is wrong: no trial is left
-out automatically, but the diagnosis without it is reported too, and an effect that only such trials support is
-withdrawn.
+pressure with its digits swapped does not.
 """
 
 from __future__ import annotations
@@ -33,42 +31,29 @@ from vinetrack.narrative.verdict_text import odd_in_words
 
 Indices = NDArray[np.int_]
 
-USUAL_EXPONENT = 0.37
-"""Starting value of the exponent. PHYSICS: published for vines of 6 to 24 mm."""
+USUAL_EXPONENT = 0.37  # Starting value of the exponent (PHYSICS)
 
-USUAL_SCATTER = 0.05
-"""Residual of ln F at which the robust fit halves the weight of a trial. Chosen: B of one vine scatters by 1 to 4 % and
-the pressure by 1 to 2 %; at half and twice mainly the efficiency of the fit changes."""
+USUAL_SCATTER = 0.05  # Residual of ln F at which the robust fit halves the weight of a trial (chosen)
 
-LEAST_SCATTER = 0.02
-"""Lower limit of the scatter of ln F: the scatter of careful trials. Chosen; at half and twice only campaigns of a few
-very careful trials change."""
+LEAST_SCATTER = 0.02  # Lower limit of the scatter of ln F: the scatter of careful trials (chosen)
 
-CHANCE = 1e-4
-"""Probability that normal scatter makes any trial of a campaign an outlier. Chosen: small, since outliers matter where
-the verdict is `unexplained`; at ten times the limit falls from 9.9 to 7.5 standard deviations for 24 trials."""
+CHANCE = 1e-4  # Probability that normal scatter makes any trial of a campaign an outlier (chosen)
 
+# Efficiency of a standard deviation from the median absolute deviation, relative to that from the mean square, and
+# degrees of freedom added to so many times those that the fitted curves leave (derived)
 EFFICIENCY, FEW_TRIALS_DOF = 0.37, 1.0
-"""Efficiency of a standard deviation from the median absolute deviation, relative to that from the mean square, and
-degrees of freedom added to so many times those that the fitted curves leave. Derived for the normal distribution of
-many trials; the second measured, for the median of few is more efficient. Half and twice of it change the limit for 12
-trials of one vine by a tenth, and that for 48 by nothing to speak of."""
 
+# Slope and curvature of the fitted curves, common to all vines, besides a level for each vine (derived)
 CURVE_SHAPE_PARAMETERS = 2
-"""Slope and curvature of the fitted curves, common to all vines, besides a level for each vine. Derived: they are the
-parameters of `_fit_curves`; with half or twice of them the scatter of 12 trials is wrong by 5 %."""
 
+# Number of trials from which outliers are looked for, and the largest fraction that may be outliers (chosen)
 FEWEST_TRIALS, LARGEST_SHARE = 8, 0.125
-"""Number of trials from which outliers are looked for, and the largest fraction that may be outliers (at least two, for
-rows get exchanged). Chosen: with eight, most trials define what is usual; where more than an eighth deviate, they are
-not slips but a group of their own."""
 
 
 @dataclass(frozen=True)
 class OddTrial:
-    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa.
-
-    `implied_pressure_Pa` is NaN where it is not known.
+    """An outlying trial, with its stated pressure and the pressure that its motion implies, Pa. `implied_pressure_Pa`
+    is NaN where it is not known.
     """
 
     name: str
@@ -77,17 +62,7 @@ class OddTrial:
 
 
 def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
-    """Find trials whose speed contradicts the sheet although the other trials agree with it.
-
-    Parameters
-    ----------
-    data : trials of everting tubes, as they were fitted.
-
-    Returns
-    -------
-    list of OddTrial
-        In the order of the trials; empty where there would be many, or too few trials to define what is usual.
-    """
+    """Find trials whose speed contradicts the sheet although the other trials agree with it."""
     trials = [trial_data.trial for trial_data in data]
     if len(data) < FEWEST_TRIALS or any(trial.travel_ratio != 2 for trial in trials):
         return []
@@ -129,9 +104,8 @@ def odd_trials(data: Sequence[FitTrial]) -> list[OddTrial]:
 
 
 def _limit(count: int, remaining: int) -> float:
-    """Residual, in standard deviations, beyond which one of so many trials is an outlier (Bonferroni).
-
-    `remaining` are the degrees of freedom that the fitted curves leave to the residuals.
+    """Residual, in standard deviations, beyond which one of so many trials is an outlier (Bonferroni). `remaining` are
+    the degrees of freedom that the fitted curves leave to the residuals.
     """
     from scipy.stats import t
 
@@ -180,21 +154,8 @@ def _fit_curves(log_force: Floats, log_speed: Floats, vine_index: Indices) -> Ca
 
 
 def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callable[[list[str]], Diagnosis]) -> Diagnosis:
-    """Add what outlying trials mean for a diagnosis.
-
-    Where the model is adequate, or the other trials support the same effect, they are a note. Where no effect explains
-    all trials but one explains the others, the explanation says so. Where the other trials are explained without the
-    effect, only the outliers support it, and the verdict becomes `unexplained`.
-
-    Parameters
-    ----------
-    result : the diagnosis of all trials.
-    odd : the outlying trials.
-    without : returns the diagnosis without the trials of these names.
-
-    Returns
-    -------
-    Diagnosis
+    """Add what outlying trials mean for a diagnosis. Where the model is adequate, or the other trials support the same
+    effect, they are a note. Where no effect explains all trials but one explains the others, the explanation says so.
     """
     if not odd:
         return result

@@ -30,37 +30,20 @@ CURVE_COLUMNS = (
     "final_lead_velocity_m_s",
     "final_lead_velocity_sigma_m_s",
 )
-PAYLOADS = 25
-"""Points on each curve, evenly spaced from the smallest payload to the largest. Chosen for the picture."""
+PAYLOADS = 25  # Points on each curve, evenly spaced from the smallest payload to the largest (chosen)
 
-TIME_FACTOR = 2.0
-"""Time for which motions are simulated, as a multiple of the longest of their trials. Chosen as a safeguard."""
+TIME_FACTOR = 2.0  # Time for which motions are simulated, as a multiple of the longest of their trials (chosen)
 
-N_TIMES = 801
-"""Output times of a motion. Derived: linear interpolation then errs by 1e-6 of the growth."""
+N_TIMES = 801  # Output times of a motion (derived)
 
+# Factor by which the output times extend beyond the arrival, which a changed parameter may delay (chosen)
 ARRIVAL_MARGIN = 1.05
-"""Factor by which the output times extend beyond the arrival, which a changed parameter may delay. Chosen: fifty times
-RELATIVE_STEP."""
 
-RELATIVE_STEP = 1e-3
-"""Relative finite-difference step of a parameter: far above the integrator's error, and small enough for linearity.
-Derived: 1000 times the integrator's error."""
+RELATIVE_STEP = 1e-3  # Relative finite-difference step of a parameter (derived)
 
 
 def payload_curves(fit: Fit, final_at_fraction: float) -> pd.DataFrame:
-    """Final speed of the leading edge against payload, columns `CURVE_COLUMNS`; empty where payloads do not vary.
-
-    Parameters
-    ----------
-    fit : a fit; its trials determine which vines, pressures and payloads arrived are.
-    final_at_fraction : float
-        Fraction of the length at which the speed is taken.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Final speed of the leading edge against payload, columns `CURVE_COLUMNS`; empty where payloads do not vary."""
     import pandas as pd
 
     rows: list[tuple[object, ...]] = []
@@ -98,28 +81,8 @@ def _but_for_payload(trial: Trial) -> str:
 
 
 def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, longest_s: float) -> tuple[Floats, Floats]:
-    """Speed of the leading edge at `at_m` of growth and its standard error, m/s, shape (n_trials,) each.
-
-    A motion that does not reach `at_m` has speed 0.
-
-    Parameters
-    ----------
-    fit : a fit.
-    trials : sequence of Trial
-        Of one vine.
-    at_m : float
-        Growth at which the speed is taken, m.
-    longest_s : float
-        Simulated time, s.
-
-    Returns
-    -------
-    speed, sigma : arrays, shape (n_trials,), m/s
-
-    Raises
-    ------
-    ValueError
-        If the speeds do not depend smoothly on the fitted parameters.
+    """Speed of the leading edge at `at_m` of growth and its standard error, m/s, shape (n_trials,) each. A motion that
+    does not reach `at_m` has speed 0. Returns speed, sigma : arrays, shape (n_trials,), m/s.
     """
     vine = trials[0].vine
     times = _output_times(fit, trials, at_m, longest_s)

@@ -15,28 +15,20 @@ from vinetrack.inference.left_out import aligned_to_trials, rest_is_seen
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
 
-NEWTON_STEPS = 5
-"""Gauss–Newton steps. Chosen."""
+NEWTON_STEPS = 5  # Gauss–Newton steps (chosen)
 
-LARGEST_STEP = 0.3
-"""Largest step of ln B, or of a parameter in units of its scale. Chosen as the trust region of the linear model."""
+LARGEST_STEP = 0.3  # Largest step of ln B, or of a parameter in units of its scale (chosen)
 
-MAX_DEVIATION_SCALES = 3.0
-"""Largest deviation from the common value, in scales: a trial that hardly depends on the parameter would drift without
-limit. Chosen: three scales cover the plausible range."""
+MAX_DEVIATION_SCALES = 3.0  # Largest deviation from the common value, in scales (chosen)
 
-TYPICAL_SCATTER = (0.01, 0.03)
-"""Typical standard deviations of pressure and ln B between trials; only the relative weights of trials depend on them.
-Chosen as FIRST_SPREADS of the optimiser."""
+TYPICAL_SCATTER = (0.01, 0.03)  # Typical standard deviations of pressure and ln B between trials (chosen)
 
 
 @dataclass(frozen=True)
 class PerTrialEstimates:
     """Estimates of one parameter by trial; arrays of shape (n_trials,), SI, NaN where a trial does not depend on it.
-
     `value` is the best fit of the trial, `base` the common value, and `deviation` their difference, of logarithms where
     `logarithmic`. `variance` is the variance of `value` from a typical scatter of pressure and B, up to a factor.
-    `trial_effects`, shape (n_trials, 4), belong to these values.
     """
 
     key: str
@@ -55,7 +47,6 @@ class PerTrialEstimates:
 @dataclass(frozen=True)
 class AlignedTrials:
     """A fitted model aligned with its trials: each has its own release and origin, but no deviation of pressure or B.
-
     `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`.
     """
 
@@ -65,22 +56,7 @@ class AlignedTrials:
 
 
 def align_trials(fit: Fit) -> AlignedTrials:
-    """Align the model with the trials that it was fitted to, by release and origin.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    AlignedTrials
-
-    Raises
-    ------
-    FitError
-        If the simulation of the model fails.
-    """
+    """Align the model with the trials that it was fitted to, by release and origin."""
     predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
     try:
         return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
@@ -89,25 +65,7 @@ def align_trials(fit: Fit) -> AlignedTrials:
 
 
 def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:
-    """Fit the value of `key` to each trial by least squares of position, with its release free.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-    key : str
-        Name of a parameter, `effect.parameter`.
-    aligned : the model aligned with its trials, from `align_trials`.
-
-    Returns
-    -------
-    PerTrialEstimates
-
-    Raises
-    ------
-    SimulationError
-        If the simulation of a trial fails.
-    """
+    """Fit the value of `key` to each trial by least squares of position, with its release free."""
     predictor, trial_effects = aligned.predictor, aligned.trial_effects
     parameter = _parameter(fit, key)
     column = fit.model.parameter_names.index(key)
@@ -169,9 +127,8 @@ def _gauss_newton_step(
     scale: Floats,
     logarithmic: bool,
 ) -> tuple[Floats, Floats, list[Floats]]:
-    """One Gauss–Newton step for every trial: scaled deviation, trial effects, and the projected sensitivities.
-
-    The sensitivities of position to the parameter are projected off those to release and origin.
+    """One Gauss–Newton step for every trial: scaled deviation, trial effects, and the projected sensitivities. The
+    sensitivities of position to the parameter are projected off those to release and origin.
     """
     step = 1e-3
     plain = predictor.jobs(np.empty(0), trial_effects)
@@ -206,16 +163,8 @@ def _gauss_newton_step(
 
 
 def orthogonal_part(column: Floats, others: Floats) -> Floats:
-    """Component of a column that is orthogonal to all linear combinations of others.
-
-    Parameters
-    ----------
-    column : array, shape (n_points,)
-    others : array, shape (n_points, n)
-
-    Returns
-    -------
-    array, shape (n_points,)
+    """Component of a column that is orthogonal to all linear combinations of others. Shapes: column (n_points,); others
+    (n_points, n) → (n_points,).
     """
     return np.asarray(column - others @ np.linalg.lstsq(others, column, rcond=1e-9)[0])
 

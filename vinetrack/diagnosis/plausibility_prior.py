@@ -22,15 +22,14 @@ from vinetrack.diagnosis.candidates import plausible_range, slip_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_result import Fit, Number
 
+# Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
+# penalised (derived)
 RANGE_EDGE_DISTANCE = 4.0
-"""Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
-penalised. Derived: the edge of the range."""
 
 
 def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
-    """Mean and standard deviation of the prior of a plausible range, in the parameter's unit.
-
-    A size that a common slip in the sheet would produce has its prior about that size, as wide as ordinary errors.
+    """Mean and standard deviation of the prior of a plausible range, in the parameter's unit. A size that a common slip
+    in the sheet would produce has its prior about that size, as wide as ordinary errors.
     """
     low, high = plausible_range(parameter)
     mean, sd = 0.5 * (low + high), 0.25 * (high - low)
@@ -39,23 +38,7 @@ def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
 
 
 def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """Penalty of sizes outside their plausible ranges, on the scale of −2 ln L; 0 inside.
-
-    Parameters
-    ----------
-    fit : the fit with the effects.
-    parameters : mapping
-        Those of the effects that a hypothesis adds, by `effect.parameter`.
-
-    Returns
-    -------
-    float
-
-    Notes
-    -----
-    Each size's squared distance from the middle of its range over σ² + τ², less that at the edge of the range. A size
-    of large standard error (σ ≫ τ) has no penalty wherever it lies.
-    """
+    """Penalty of sizes outside their plausible ranges, on the scale of −2 ln L; 0 inside."""
     total = 0.0
     for number in fit.numbers:
         parameter = parameters.get(number.key)
@@ -70,18 +53,7 @@ def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
 def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant common to all fits of the same trials.
-
     Parameters that no trajectory depends on, or that have no finite standard error, keep their prior and cost nothing.
-
-    Parameters
-    ----------
-    fit : the fit with the effects.
-    parameters : mapping
-        Those of the effects that a hypothesis adds, by `effect.parameter`.
-
-    Returns
-    -------
-    float
     """
     indices, means, sds = [], [], []
     for k, number in enumerate(fit.numbers):
@@ -108,16 +80,7 @@ def _log_det(matrix: Floats) -> float:
 
 
 def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
-    """Posterior probabilities of hypotheses of equal prior probability; they add up to 1.
-
-    Parameters
-    ----------
-    log_evidences : sequence of float
-
-    Returns
-    -------
-    list of float
-    """
+    """Posterior probabilities of hypotheses of equal prior probability; they add up to 1."""
     if not log_evidences:
         return []
     values = np.array(log_evidences)

@@ -1,4 +1,5 @@
-"""Power of a campaign: detectable sizes of every candidate, how often each is confused with others, false-alarm rates.
+"""Power of a campaign: detectable sizes of every candidate, how often each is confused with others,
+false-alarm rates.
 
 Computed by `vinetrack.diagnosis.linear_power`; read by the terminal, the report and `diagnosis.json`.
 """
@@ -22,24 +23,16 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.null_calibration import NullCalibration
 
-STATED_95 = 0.95
-"""Confidence of the intervals of rates; a convention."""
+STATED_95 = 0.95  # Confidence of the intervals of rates; a convention
 
+# Probabilities at which detectable sizes are tabulated (chosen)
 PROBABILITIES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
-"""Probabilities at which detectable sizes are tabulated. Chosen: between them a normal distribution function is linear
-to 1 %."""
 
 
 @dataclass(frozen=True)
 class EffectPower:
-    """Detectable sizes of one effect.
-
-    `sizes` are values of the parameter, SI, at which the effect is detected with `PROBABILITIES`; infinite where no
-    size is detectable. `zero` is the value at which the effect vanishes; `largest` is the end of the plausible range
-    farther from it, and `least` the nearer end where zero is not plausible, else `zero`. `taken_for` maps other
-    candidates to the probability that they score highest; `named_alone` is the probability that no other candidate is
-    in the answer set. Both are among campaigns with an alarm, at the size detected with 90 %. `other_values` are those
-    of the further parameters that were held, SI.
+    """Detectable sizes of one effect. `sizes` are values of the parameter, SI, at which the effect is detected with
+    `PROBABILITIES`; infinite where no size is detectable.
     """
 
     effect: str
@@ -56,34 +49,16 @@ class EffectPower:
     other_values: tuple[float, ...] = ()
 
     def size_at(self, probability: float) -> float:
-        """The value of the parameter at which the effect is detected with this probability.
-
-        Parameters
-        ----------
-        probability : float
-            Between the first and the last of `PROBABILITIES`.
-
-        Returns
-        -------
-        float
-            SI; infinite where no size is detectable.
+        """The value of the parameter at which the effect is detected with this probability. Returns SI; infinite where
+        no size is detectable.
         """
         if not np.isfinite(self.sizes).all():
             return math.inf
         return float(np.interp(probability, PROBABILITIES, self.sizes))
 
     def probability_at(self, value: float) -> float:
-        """The probability with which the effect is detected at a value of its parameter.
-
-        Parameters
-        ----------
-        value : float
-            SI, on the side of `zero` on which the sizes lie.
-
-        Returns
-        -------
-        float
-            0 below and 1 above the tabulated sizes.
+        """The probability with which the effect is detected at a value of its parameter. Returns 0 below and 1 above
+        the tabulated sizes.
         """
         if not np.isfinite(self.sizes).all():
             return 0.0
@@ -118,16 +93,7 @@ class EffectPower:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> EffectPower:
-        """Read what `to_json` wrote.
-
-        Parameters
-        ----------
-        entry : of `power.effects`.
-
-        Returns
-        -------
-        EffectPower
-        """
+        """Read what `to_json` wrote."""
         return cls(
             **{key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")},
             zero=or_nan(entry.get("zero")),
@@ -166,9 +132,8 @@ class PowerInput:
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happened in simulated campaigns, with the exact binomial 95 % interval.
-
-    Clopper & Pearson, Biometrika 26, 404 (1934).
+    """How often something happened in simulated campaigns, with the exact binomial 95 % interval. Clopper & Pearson,
+    Biometrika 26, 404 (1934).
     """
 
     count: int
@@ -193,7 +158,6 @@ class Rate:
 @dataclass(frozen=True)
 class SimulatedRates:
     """Outcomes of complete diagnoses of simulated campaigns with one effect; with none where `effect` is blank.
-
     `detections` counts those in which the effect was found; `promised` is its probability by linear theory (that of a
     false alarm, where nothing is missing); `named` counts what was named, most frequent first.
     """
@@ -234,12 +198,9 @@ class AddedTrial:
 
 @dataclass(frozen=True)
 class FurtherTrials:
-    """Further trials that bring the power for an effect of one size to a target.
-
-    `before` is the power with the trials so far; `unlimited` that with unlimited replicates of all trials within the
-    limits; `n_conditions` counts the conditions considered. `trials` come in order of how much they help; empty where
-    none is needed or none helps. `needed` is the number of trials required, by what they need: the rig so far, another
-    rig, a new vine. `power` is that of all trials together.
+    """Further trials that bring the power for an effect of one size to a target. `before` is the power with the trials
+    so far; `unlimited` that with unlimited replicates of all trials within the limits; `n_conditions` counts the
+    conditions considered.
     """
 
     effect: str
@@ -293,17 +254,7 @@ class FurtherTrials:
 
 
 def sheet_cells(trial: Trial) -> dict[str, float]:
-    """Cells of the sheet that describe how to set up a further trial, without blank ones.
-
-    Parameters
-    ----------
-    trial : to make.
-
-    Returns
-    -------
-    dict
-        By column.
-    """
+    """Cells of the sheet that describe how to set up a further trial, without blank ones. Returns by column."""
     names = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g",
              "chamber_l", "inlet_mm", "growth_angle_deg", "capture_fps")  # fmt: skip
     cells = {name: COLUMNS[name].of_trial(trial) for name in names}
@@ -313,13 +264,8 @@ def sheet_cells(trial: Trial) -> dict[str, float]:
 @dataclass(frozen=True)
 class Power:
     """Which effects the trials of a campaign can detect, and at which sizes. Printed, it is the text on the terminal.
-
     `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
-    each test to its false-alarm rate; the total is at most their sum. `not_testable` maps other candidates to the
-    reason why they cannot be detected. `wary` is the reason why the sizes are not reliable, blank where they are.
-    `simulated` holds rates of complete diagnoses of simulated campaigns, `further` the trials that would raise the
-    power for an effect, where they were asked for; `calibration` compares the tests of a first model with null
-    campaigns.
+    each test to its false-alarm rate; the total is at most their sum.
     """
 
     n_trials: int
@@ -341,26 +287,11 @@ class Power:
         return float(sum(self.false_alarms.values()))
 
     def __getitem__(self, name: str) -> EffectPower:
-        """The power for an effect, by its name.
-
-        Raises
-        ------
-        KeyError
-            If the effect is not among those that the trials could show.
-        """
+        """The power for an effect, by its name."""
         return {entry.effect: entry for entry in self.effects}[name]
 
     def of_effects(self, names: Sequence[str]) -> Power:
-        """The same for a selection of effects.
-
-        Parameters
-        ----------
-        names : of effects; all where empty.
-
-        Returns
-        -------
-        Power
-        """
+        """The same for a selection of effects."""
         from dataclasses import replace
 
         if not names:
@@ -394,16 +325,7 @@ class Power:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Power:
-        """Read what `to_json` wrote.
-
-        Parameters
-        ----------
-        content : `power` of `diagnosis.json`.
-
-        Returns
-        -------
-        Power
-        """
+        """Read what `to_json` wrote."""
         return cls(
             n_trials=int(content.get("n_trials") or 0),
             threshold=or_nan(content.get("threshold_sigma")),
@@ -420,18 +342,7 @@ class Power:
         )
 
     def plot(self, name: str = "power", **options: Any) -> Figure:
-        """Draw the map of effects against size.
-
-        Parameters
-        ----------
-        name : of the figure.
-        **options
-            Passed on to the drawing.
-
-        Returns
-        -------
-        Figure
-        """
+        """Draw the map of effects against size."""
         return plot(self, name, **options)
 
     def __str__(self) -> str:

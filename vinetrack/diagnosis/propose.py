@@ -40,20 +40,15 @@ from vinetrack.inference.fit_data import FitError, Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
 
-MAX_LAWS_FITTED = 4
-"""Most laws that are fitted in the equation of motion. Chosen for time: a fit each, 5 to 20 s."""
+MAX_LAWS_FITTED = 4  # Most laws that are fitted in the equation of motion (chosen)
 
-MAX_EXPLAINED_DEFICIT = 0.2
-"""Laws that explain less than the best by more than this part are not fitted. Chosen: twice the scatter from trial to
-trial; at half a correct law whose linear fit errs is dropped, at twice laws are fitted that the likelihood then
-rejects."""
+MAX_EXPLAINED_DEFICIT = 0.2  # Laws that explain less than the best by more than this part are not fitted (chosen)
 
 
 @dataclass(frozen=True)
 class _Expression:
-    """How a law is written: its size parameter, its shape as code and as a formula, and its shape parameters.
-
-    The size has a name, a symbol and a unit, the unit given by its exponents of N, m, s and Pa.
+    """How a law is written: its size parameter, its shape as code and as a formula, and its shape parameters. The size
+    has a name, a symbol and a unit, the unit given by its exponents of N, m, s and Pa.
     """
 
     size: tuple[str, str, tuple[int, int, int, int]]
@@ -107,25 +102,24 @@ _EXPRESSIONS = {
     ),
 }
 
+# What a law may be multiplied by: code, symbol, and the change of the unit of the size
 _FACTORS = {
     "position": ("s.tail_position", "x", (0, -1, 0, 0)),
     "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
     "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
 }
-"""What a law may be multiplied by: code, symbol, and the change of the unit of the size."""
 
+# State of the worked example; a convention of this file
 _WORKED_STATE = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
-"""State of the worked example; a convention of this file."""
 
+# Endings that turn the names of a state into those of a `FittedMotion`
 _SUFFIX = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s", "pressure": "_Pa", "time": "_s"}
-"""Endings that turn the names of a state into those of a `FittedMotion`."""
 
 
 @dataclass(frozen=True)
 class ProposedLaw:
-    """A law that was fitted as an effect.
-
-    `rms_left_out_m` is its error on left-out conditions, m; NaN where the likelihood of others is far higher.
+    """A law that was fitted as an effect. `rms_left_out_m` is its error on left-out conditions, m; NaN where the
+    likelihood of others is far higher.
     """
 
     law: DetectedLaw
@@ -141,10 +135,9 @@ class ProposedLaw:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Fitted laws, best first, and the error on left-out conditions of the model without them, m.
-
-    `tied` are those that the data do not exclude; empty where no law is proposed, for the `reason` given. `table` is
-    the learned force, where it explains what no law does.
+    """Fitted laws, best first, and the error on left-out conditions of the model without them, m. `tied` are those that
+    the data do not exclude; empty where no law is proposed, for the `reason` given. `table` is the learned force, where
+    it explains what no law does.
     """
 
     before: Fit
@@ -180,24 +173,7 @@ class Proposal:
 
 @in_one_blas_thread
 def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Proposal:
-    """Find laws of force that explain the misfit of a model, and fit each in the equation of motion.
-
-    Parameters
-    ----------
-    model : the model that lacks something.
-    pairs : trials with their tracks.
-    report : called with a sentence at each step.
-
-    Returns
-    -------
-    Proposal
-        With the learned force as a table where no law reproduces it.
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated.
-    """
+    """Find laws of force that explain the misfit of a model, and fit each in the equation of motion."""
     candidates = candidates_of(model, None, {})
     report("fitting the model")
     before = initial_fit(model, pairs, candidates, profile=False)
@@ -271,16 +247,8 @@ def _loaded(law: DetectedLaw, folder: Path) -> Effect:
 
 
 def effect_text(detected: DetectedLaw, remark: str = "") -> str:
-    """Source of an effect file that holds a law: docstring, parameters with units and bounds, function, worked example.
-
-    Parameters
-    ----------
-    detected : the law with its size.
-    remark : sentences for the docstring about the data that the law comes from.
-
-    Returns
-    -------
-    str
+    """Source of an effect file that holds a law: docstring, parameters with units and bounds, function,
+    worked example.
     """
     law, expression = detected.law, _EXPRESSIONS[detected.law.kind]
     factor_code, factor_symbol, factor_unit = _FACTORS.get(law.factor, ("", "", (0, 0, 0, 0)))

@@ -19,15 +19,10 @@ from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
-LEAST_SIGMAS = 6.0
-"""Standard deviations by which a law must improve the fit to be proposed: some hundred laws are tried, and none is
-known beforehand. Chosen as SEARCH_SIGMAS of the misfit tests; at half one is found in noise, at twice only in gross
-misfits."""
+LEAST_SIGMAS = 6.0  # Standard deviations by which a law must improve the fit to be proposed
 
+# Part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
 LAW_REPRODUCES = 0.9
-"""Part of the misfit that a law must take away for the learned force not to be tried as a table. Chosen: the noise is
-then within a third of what is left, where a model misses by four times its noise; at 0.8 a law that bends where the
-force does not is accepted, at 0.95 nearly every law is followed by a table."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +35,7 @@ class ProposedTable:
     rms_left_out_m: float
 
     def sentences(self, before: Fit) -> list[str]:
-        """How much of the misfit the table explains.
-
-        Parameters
-        ----------
-        before : the fit without it.
-
-        Returns
-        -------
-        list of str
-        """
+        """How much of the misfit the table explains."""
         after = self.ratio.fit
         return [
             f"No formula in the list reproduces the learned force. As a table ({self.effect.name}) it reduces χ² per"
@@ -61,20 +47,7 @@ class ProposedTable:
 def proposed_table(
     model: Model, before: Fit, laws: Sequence[Fit], report: Callable[[str], None]
 ) -> ProposedTable | None:
-    """Estimate the missing force as a smooth function and fit it as a table.
-
-    Parameters
-    ----------
-    model : the model that lacks something.
-    before : its fit.
-    laws : sequence of Fit
-        Those with the laws that are proposed.
-    report : called with a sentence at each step.
-
-    Returns
-    -------
-    ProposedTable, or None where a law does as well, or where the learned force does not explain the misfit
-    """
+    """Estimate the missing force as a smooth function and fit it as a table."""
     misfit = before.chi2_per_dof - 1
     remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
     if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - LAW_REPRODUCES) * misfit:

@@ -20,27 +20,21 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE
 
-START_VALUES = (0.01, 0.03, 0.2)
-"""Starting values of the search: pressure, ln B, residual scatter. Chosen."""
+START_VALUES = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
 
-LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
-"""Bounds of the search. Chosen: from exact to worse than any rig; it ends there only where replicates hold no
-information."""
+LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)  # Bounds of the search (chosen)
 
+# Lower limits of the standard deviations of pressure and B where both are needed (chosen)
 LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
-"""Lower limits of the standard deviations of pressure and B where both are needed: replicates determine their sum much
-better than either. Chosen: half of a usual scatter."""
 
-POSITION_FLOOR_M = 1e-6
-"""Lower limit of the error of a stretch mean, m. Chosen: a hundredth of a good tracker's error."""
+POSITION_FLOOR_M = 1e-6  # Lower limit of the error of a stretch mean, m (chosen)
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """Stretches of the motion that all replicates of a condition cover.
-
-    `means_m`, shape (n_trials, n), are the mean residuals; `sensitivities`, shape (n, 2), their derivatives by pressure
-    and ln B; `noise_m2`, shape (n, n), their covariance from the noise of the tracks alone.
+    """Stretches of the motion that all replicates of a condition cover. `means_m`, shape (n_trials, n), are the mean
+    residuals; `sensitivities`, shape (n, 2), their derivatives by pressure and ln B; `noise_m2`, shape (n, n), their
+    covariance from the noise of the tracks alone.
     """
 
     means_m: Floats
@@ -51,7 +45,6 @@ class Stretches:
 @dataclass(frozen=True)
 class Scatter:
     """Between-trial standard deviations of pressure (relative) and ln B, and of a residual, relative to their effect.
-
     `dof` counts replicates beyond the first of each condition. Where it is 0, the standard deviations of pressure and B
     are those of the fit.
     """
@@ -68,17 +61,9 @@ class Scatter:
 
 
 def scatter_sensitivities(aligned: AlignedTrials) -> list[Floats]:
-    """Sensitivities of positions to pressure and ln B, orthogonal to those to release and origin, of every trial.
-
-    Where growth has ended in the model they would be zero, but the vine may still grow: the last values are kept.
-
-    Parameters
-    ----------
-    aligned : the model aligned with its trials.
-
-    Returns
-    -------
-    list of arrays, shape (n_points, 2), m
+    """Sensitivities of positions to pressure and ln B, orthogonal to those to release and origin, of every trial. Where
+    growth has ended in the model they would be zero, but the vine may still grow: the last values are kept. Shape
+    (n_points, 2).
     """
     origin_fixed = rest_is_seen(aligned.predictor.data)
     sensitivities = []
@@ -97,18 +82,7 @@ def scatter_sensitivities(aligned: AlignedTrials) -> list[Floats]:
 
 
 def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
-    """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates.
-
-    Parameters
-    ----------
-    fit : its between-trial standard deviations are used where there are no replicates.
-    groups : sequence of Stretches
-        One for each condition.
-
-    Returns
-    -------
-    Scatter
-    """
+    """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates."""
     from scipy.optimize import minimize
 
     dof = sum(len(group.means_m) - 1 for group in groups)
@@ -138,18 +112,8 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
 
 
 def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
-    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m².
-
-    Parameters
-    ----------
-    scatter
-        Between-trial scatter.
-    group
-        Stretches of one condition.
-
-    Returns
-    -------
-    array, shape (n_stretches, n_stretches), m²
+    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m². Shape (n_stretches,
+    n_stretches).
     """
     return _covariance(group, scatter.variances)
 
@@ -162,24 +126,9 @@ def _covariance(group: Stretches, variances: Floats) -> Floats:
 
 def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
     """Test whether between-trial scatter explains stretch means as large as observed; the p-value as a normal deviate.
-
     The test statistic is the mean square of the means in units of their standard errors, with the effective degrees of
-    freedom of Satterthwaite's approximation, because stretches are correlated. The scatter itself has `dof` degrees of
-    freedom.
-
-    Parameters
-    ----------
-    mean : array, shape (n_stretches,), m
-        Means over the trials of a condition.
-    covariance : array, shape (n_stretches, n_stretches), m²
-        Of one trial.
-    trials : int
-        Number of trials.
-    scatter : between-trial scatter, for its degrees of freedom.
-
-    Returns
-    -------
-    float
+    freedom of Satterthwaite's approximation, because stretches are correlated. Shapes: mean (n_stretches,); covariance
+    (n_stretches, n_stretches).
     """
     from scipy.stats import chi2, norm
     from scipy.stats import f as fisher

@@ -20,42 +20,26 @@ from vinetrack.inference.left_out import FEWEST_AT_REST, scaled_least_squares
 from vinetrack.tracks.outliers import FEWEST_POINTS, local_fit
 from vinetrack.tracks.position_noise import rest_points, rough_noise
 
+# Smallest scaled singular value with which a shift in time and one in position are both fitted (chosen)
 MIN_SINGULAR_VALUE = 0.05
-"""Smallest scaled singular value with which a shift in time and one in position are both fitted. Chosen: below it the
-motion is so straight that the two cannot be separated; at half noise drives both, at twice curved motions are left
-misaligned."""
 
-MAX_ROUNDS = 200
-"""Maximum number of rounds, each of which shifts every replicate towards the mean. A round moves a trial by two frames
-at most, so that this covers 400 frames. Chosen as a safeguard; most conditions converge within twenty."""
+MAX_ROUNDS = 200  # Maximum number of rounds, each of which shifts every replicate towards the mean (chosen)
 
-SETTLED_FRAMES = 1e-3
-"""Largest shift of a round, in frames, at which the alignment has converged: for 3 mm a frame it is 3 µm. Chosen: far
-below the noise of any tracker."""
+SETTLED_FRAMES = 1e-3  # Largest shift of a round, in frames, at which the alignment has converged (chosen)
 
-LARGEST_STEP_FRAMES = 2.0
-"""Largest shift of a round, in frames: farther away the speed of the motion is different. Chosen: at half alignment
-takes twice as many rounds, at twice it may overshoot a steep start."""
+LARGEST_STEP_FRAMES = 2.0  # Largest shift of a round, in frames (chosen)
 
+# Fraction of the shorter motion that must overlap with the longer one where no standstill shows when it began (chosen)
 LEAST_OVERLAP = 0.8
-"""Fraction of the shorter motion that must overlap with the longer one where no standstill shows when it began. Motions
-of different speed agree best where they hardly overlap: without this limit, replicates that differ by 14 % in speed
-were shifted apart until the 10 mm in which they were equally fast gave a floor of 0.05 mm. Chosen: tracks that begin in
-motion begin within a fifth of their length of each other; at 0.6 the floor may be half too small, at 0.9 a clip that
-begins late is misaligned."""
 
-N_COARSE_SHIFTS = 201
-"""Number of shifts in time tried for a track that begins in motion. Chosen: steps of a hundredth of the duration, which
-the rounds then refine."""
+N_COARSE_SHIFTS = 201  # Number of shifts in time tried for a track that begins in motion (chosen)
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Replicates on a common clock.
-
-    `time_s`, shape (n_times,), is since the mean release; `deviation_m`, shape (n_trials, n_times), that of each trial
-    from the mean of all trials present, NaN where it is absent; `present`, shape (n_times,), counts the trials present.
-    `release_s` and `origin_m`, shape (n_trials,), align the trials. `begin_s` is when the first trial moves.
+    """Replicates on a common clock. `time_s`, shape (n_times,), is since the mean release; `deviation_m`, shape
+    (n_trials, n_times), that of each trial from the mean of all trials present, NaN where it is absent; `present`,
+    shape (n_times,), counts the trials present.
     """
 
     time_s: Floats
@@ -81,9 +65,8 @@ class Alignment:
 
     @property
     def degrees(self) -> int:
-        """Degrees of freedom of the floor: one for each replicate beyond the first.
-
-        Deviations vary slowly along the whole motion, by pressure and B: a trial counts once, however many its frames.
+        """Degrees of freedom of the floor: one for each replicate beyond the first. Deviations vary slowly along the
+        whole motion, by pressure and B: a trial counts once, however many its frames.
         """
         return self.release_s.size - 1
 
@@ -113,33 +96,13 @@ class _Reference:
 
 
 def frames_at_rest(trial: TrialFit) -> int:
-    """Number of frames before the motion; 0 where the track begins in motion.
-
-    Parameters
-    ----------
-    trial
-        A trial under the model.
-
-    Returns
-    -------
-    int
-    """
+    """Number of frames before the motion; 0 where the track begins in motion."""
     count = rest_points(trial.lead_position_m)
     return count if count < trial.time_s.size else 0
 
 
 def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
-    """Align the measured motions of one condition in time and position.
-
-    Parameters
-    ----------
-    trials : sequence of TrialFit
-        Trials of one condition; only their times and measured positions are used.
-
-    Returns
-    -------
-    Alignment
-    """
+    """Align the measured motions of one condition in time and position."""
     rests = [frames_at_rest(trial) for trial in trials]
     release_s, origin_m = (np.array(values) for values in zip(*map(_begin, trials, rests), strict=True))
     rest_seen = np.array([n > 0 or trial.imprecise_rest is not None for trial, n in zip(trials, rests, strict=True)])
@@ -175,22 +138,7 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
 
 def sampled(at_s: Floats, release_s: float, time_s: Floats, values: Floats) -> Floats:
     """Values of the frames nearest to times since release, NaN where none is within half a frame's spacing.
-
-    Interpolation would average the noise of positions away.
-
-    Parameters
-    ----------
-    at_s : array, shape (n,), s
-        Times since release.
-    release_s : float, s
-        Release on the clock of `time_s`.
-    time_s : array, shape (n_points,), s
-        Increasing.
-    values : array, shape (n_points,)
-
-    Returns
-    -------
-    array, shape (n,)
+    Interpolation would average the noise of positions away. Shapes: at_s (n,); time_s, values (n_points,) → (n,).
     """
     target_s = at_s + release_s
     k = np.clip(np.searchsorted(time_s, target_s), 1, time_s.size - 1)
@@ -233,9 +181,8 @@ def _coarse_alignment(trial: TrialFit, reference: _Reference) -> tuple[float, fl
 def _deviations(
     trials: Sequence[TrialFit], reference: _Reference, time_s: Floats, release_s: Floats, origin_m: Floats
 ) -> tuple[Floats, Floats]:
-    """Deviation of each trial from the mean at every instant, and the number of trials present.
-
-    Differences from the reference are compared, because frames of different trials are not taken at the same instants.
+    """Deviation of each trial from the mean at every instant, and the number of trials present. Differences from the
+    reference are compared, because frames of different trials are not taken at the same instants.
     """
     difference_m = np.array(
         [
@@ -265,18 +212,8 @@ def _shifts(deviation_m: Floats, speed_m_s: Floats, origin_known: Floats) -> tup
 
 
 def mean_of(values: Floats, present: Floats) -> Floats:
-    """Mean over trials of shape (n_trials, n_times) where they are present, NaN where none is.
-
-    Parameters
-    ----------
-    values : array, shape (n_trials, n_times)
-        NaN where a trial is absent.
-    present : array, shape (n_times,)
-        Number of trials present.
-
-    Returns
-    -------
-    array, shape (n_times,)
+    """Mean over trials of shape (n_trials, n_times) where they are present, NaN where none is. Shapes: values
+    (n_trials, n_times); present (n_times,) → (n_times,).
     """
     total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)
     return np.where(present > 0, total / np.maximum(present, 1), math.nan)
@@ -285,11 +222,8 @@ def mean_of(values: Floats, present: Floats) -> Floats:
 @dataclass(frozen=True)
 class Replicates:
     """Residuals of the trials of one condition on a common clock; shapes (n_trials, n_times), NaN where absent.
-
     `time_s`, shape (n_times,), is since release. `residual_m` is measurement minus model; `present`, shape (n_times,),
-    counts the trials. `model_m`, shape (n_times,), is the model's growth in the longest trial. `begin_s` is when the
-    first of model and measurement moves; errors are evaluated from there on. `variance_m2`, shape (n_times,), is that
-    of single replicates, and `alignment` their alignment, both from the measurements alone.
+    counts the trials. `model_m`, shape (n_times,), is the model's growth in the longest trial.
     """
 
     time_s: Floats
@@ -307,18 +241,8 @@ class Replicates:
 
 
 def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
-    """Residuals of a model for the trials of one condition on a common clock.
-
-    Each instant uses the nearest frame of each trial, because interpolation would average the noise of positions away.
-
-    Parameters
-    ----------
-    trials : sequence of TrialFit
-        Trials of one condition as a model predicts them, see `vinetrack.inference.fit.predict`.
-
-    Returns
-    -------
-    Replicates
+    """Residuals of a model for the trials of one condition on a common clock. Each instant uses the nearest frame of
+    each trial, because interpolation would average the noise of positions away.
     """
     longest = max(trials, key=lambda trial: trial.time_s[-1] - trial.release_s)
     frame_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
@@ -337,17 +261,7 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
 
 
 def first_that_counts(trial: TrialFit) -> int:
-    """Index of the frame where model or measurement begins to move: a standstill would only dilute an error.
-
-    Parameters
-    ----------
-    trial
-        A trial under the model.
-
-    Returns
-    -------
-    int
-    """
+    """Index of the frame where model or measurement begins to move: a standstill would only dilute an error."""
     released = int(np.searchsorted(trial.time_s, trial.release_s))
     # While the pressure is still rising, nothing moves yet.
     moved = np.flatnonzero(trial.predicted_position_m > trial.origin_m)

@@ -31,59 +31,37 @@ ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
     "unexplained",
 )
 
-REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"
-"""Status of a candidate: fitted, only tested by its score, or not testable with these data."""
+REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"  # Status of a candidate
 
-DROPPED_FRAMES = "dropped_frames"
-"""Member of an answer set where a recording has dropped frames: a fault of the measurement without a formula."""
+DROPPED_FRAMES = "dropped_frames"  # Member of an answer set where a recording has dropped frames
 
-MAX_STRETCHES = 8
-"""Most stretches of the growth over which a diagnosis and its figures average residuals. Chosen: a trial has two or
-three independent errors, and a page shows eight side by side. At half, a misfit confined to the start is averaged out;
-at twice, neighbours share their errors and each mean has few frames."""
+MAX_STRETCHES = 8  # Most stretches of the growth over which a diagnosis and its figures average residuals (chosen)
 
-BETWEEN_TRIALS = "between_trials"
-"""Kind of a hypothesis that trials differ: neither missing physics nor a fault of camera or gauge."""
+BETWEEN_TRIALS = "between_trials"  # Kind of a hypothesis that trials differ
 
 N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen", "day")
 
+# Hypotheses that trials differ, by their names in an answer set
 BETWEEN_SUMMARIES = {
     N_BY_VINE: "the exponent n differs between the vines",
     ORDER_DRIFT: "B or the pressure drifts with the order of the trials",
     SPECIMEN: "specimens (tubes of one kind) differ",
     DAY: "B or the zero of the gauge differs from day to day",
 }
-"""Hypotheses that trials differ, by their names in an answer set."""
 
 
 def limit_reason(name: str) -> str:
     """Return the beginning of `Candidate.reason` of a richer form: a candidate that equals another in a limit.
-
     `Candidate.is_richer_form_of` recognises it in a stored diagnosis.
-
-    Parameters
-    ----------
-    name : of the effect that it contains.
-
-    Returns
-    -------
-    str
     """
     return f"it contains {name} as a limit"
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One candidate effect: a row of the ranking.
-
-    `delta_chi2` is the fall of −2 ln L when it is added (predicted by the linear model where only `screened`), and
-    `sigma` its significance as a normal deviate, with one degree of freedom for each size. `numbers` are its sizes with
-    standard errors and 95 % intervals, `along` the other parameters of the fit, where it is in the answer set.
-    `largest` maps each parameter to the upper limit of an undetected size, one-sided 95 %.
-    `reason` states in words why it is not testable, not plausible, or rejected. `posterior_weight` is its posterior
-    probability among all that were refitted, with equal prior probabilities and plausible ranges as priors.
-    `confounded_by` lists other effects that its sizes may include. `log_bayes` is the logarithm of the Bayes factor
-    against the model without it, with plausible ranges as priors.
+    """One candidate effect: a row of the ranking. `delta_chi2` is the fall of −2 ln L when it is added (predicted by
+    the linear model where only `screened`), and `sigma` its significance as a normal deviate, with one degree of
+    freedom for each size.
     """
 
     effect: str
@@ -102,16 +80,7 @@ class Candidate:
     log_bayes: float = math.nan
 
     def is_richer_form_of(self, name: str) -> bool:
-        """Whether it was set aside because it contains another effect as a limit.
-
-        Parameters
-        ----------
-        name : of the other effect.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether it was set aside because it contains another effect as a limit."""
         return self.reason.startswith(limit_reason(name))
 
     def to_json(self) -> dict[str, Any]:
@@ -135,16 +104,7 @@ class Candidate:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
-        """Read an entry of `ranking`; absent keys take their defaults.
-
-        Parameters
-        ----------
-        entry : `effect` at least.
-
-        Returns
-        -------
-        Candidate
-        """
+        """Read an entry of `ranking`; absent keys take their defaults."""
         numbers = tuple(Number.from_json(number) for number in entry.get("numbers") or ())
         return cls(
             effect=str(entry["effect"]),
@@ -166,13 +126,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Round:
-    """One model and its tests against all candidates.
-
-    `ranking` has the best candidate first, those not testable last. `cosines` are the correlations of the candidates'
-    scores, with the fitted parameters projected off: names, and a matrix in their order. `fit` is that of the model,
-    `fits` those of the hypotheses by name of effect. `sets` are the members of the answer set, each with all its
-    effects, where any has more than one. `partial` are steps, one effect each, that remove part of a misfit that no
-    hypothesis removes entirely, with `partial_fits`; none of these effects is said to be missing.
+    """One model and its tests against all candidates. `ranking` has the best candidate first, those not testable last.
+    `cosines` are the correlations of the candidates' scores, with the fitted parameters projected off: names, and a
+    matrix in their order.
     """
 
     model: tuple[str, ...]
@@ -203,16 +159,7 @@ class Round:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Round:
-        """Read an entry of `rounds`, which holds no fits.
-
-        Parameters
-        ----------
-        entry : `verdict` at least.
-
-        Returns
-        -------
-        Round
-        """
+        """Read an entry of `rounds`, which holds no fits."""
         cosines = entry.get("cosines") or {}
         return cls(
             model=tuple(entry.get("model") or ()),
@@ -229,15 +176,8 @@ class Round:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """The result of a diagnosis. Printed, it is the text on the terminal.
-
-    `effects` are those added, in order; `fits` the initial model and every enlarged one. `drift` holds one row for each
-    drifting parameter, `ladder` the errors of every model (None where not computed), `next_experiment` the trials that
-    would discriminate between hypotheses that remain. `failure` states where the initial model fails, `force_table`
-    which force it lacks, `learned_table` the same as learned inside the fit.
-    A diagnosis read from a file has no `fits`, but the parameters of the last model in `stored_parameters`. `refused`
-    is the reason why no diagnosis was possible; there are no rounds then. `power` is the power of these trials to
-    detect further effects. `odd_trials` are single trials without which the others are explained.
+    """The result of a diagnosis. Printed, it is the text on the terminal. `effects` are those added, in order; `fits`
+    the initial model and every enlarged one.
     """
 
     rounds: tuple[Round, ...]
@@ -304,14 +244,7 @@ class Diagnosis:
         return self.fits[-1]
 
     def candidates(self) -> pd.DataFrame:
-        """The candidates of all rounds, one row each.
-
-        Returns
-        -------
-        DataFrame
-            Columns `round, effect, kind, status, delta_chi2, sigma, size, in_answer_set, plausible, reason`; the size
-            is text with its standard error and unit, because units differ between effects.
-        """
+        """The candidates of all rounds, one row each."""
         import pandas as pd
 
         from vinetrack.narrative.verdict_summary import estimates_text
@@ -359,18 +292,7 @@ class Diagnosis:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any], ladder: pd.DataFrame | None = None) -> Diagnosis:
-        """Read what `to_json` wrote.
-
-        Parameters
-        ----------
-        content : of `diagnosis.json`.
-        ladder : of `ladder.csv`; None where there is none.
-
-        Returns
-        -------
-        Diagnosis
-            Without fits, `failure` and `force_table`, which are not in the file.
-        """
+        """Read what `to_json` wrote."""
         rounds = list(content.get("rounds") or [{}] if content.get("verdict") else [])
         if rounds:
             whole = {key: content[key] for key in ("verdict", "answer_set", "cosines") if key in content}
@@ -392,19 +314,7 @@ class Diagnosis:
         )
 
     def plot(self, name: str = "", **options: Any) -> Figure:
-        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name.
-
-        Parameters
-        ----------
-        name : str
-            Name of the figure.
-        **options
-            Passed on to the drawing.
-
-        Returns
-        -------
-        Figure
-        """
+        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name."""
         return plot(self, name, **options)
 
     def __repr__(self) -> str:

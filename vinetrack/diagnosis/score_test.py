@@ -7,8 +7,7 @@ projected off. Each candidate then has a score, an information, and a cosine wit
 
 The standard error is computed twice: from the noise and the between-trial standard deviations of the fit, and from the
 scatter of the scores of single trials (White, Econometrica 48, 817, 1980, with trials as clusters), which is valid for
-many independent trials whatever the noise within a trial is like. Tests use the larger of the two; of few trials
-(`robust_covariance.FEWEST_CLUSTERS`) there is only the first.
+many independent trials whatever the noise within a trial is like.
 """
 
 from __future__ import annotations
@@ -37,20 +36,14 @@ from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.whitening import at_correlation
 
+# Share of its information below which what remains of a shape is rounding, because other columns reproduce it exactly
+# (derived)
 ROUNDING_SHARE = 1e-9
-"""Share of its information below which what remains of a shape is rounding, because other columns reproduce it exactly.
-Derived: products of some hundred points agree to 1e-13, and to 1e-10 after the projection."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Score statistics of every shape given the fit, per unit of its size.
-
-    `score`, shape (n_shapes,), and `information`, shape (n_shapes, n_shapes), are sums over trials of `trial_scores`,
-    shape (n_trials, n_shapes), and `trial_informations`, shape (n_trials, n_shapes, n_shapes), and of contributions of
-    priors, which belong to no trial. `degrees` is the number of trials less that of the estimated parameters, at least
-    1.
-    """
+    """Score statistics of every shape given the fit, per unit of its size."""
 
     score: Floats
     information: Floats
@@ -77,9 +70,8 @@ class Scores:
 
     @property
     def robust_sigma(self) -> Floats:
-        """Cluster-robust standard error, from the scatter of trial scores about what the size predicts.
-
-        0 for few trials, see `cluster_variance`.
+        """Cluster-robust standard error, from the scatter of trial scores about what the size predicts. 0 for few
+        trials, see `cluster_variance`.
         """
         diagonal = np.diag(self.information)
         residual = self.trial_scores - np.einsum("njj->nj", self.trial_informations) * self.size
@@ -100,12 +92,9 @@ class Scores:
 
 @dataclass(frozen=True)
 class Projection:
-    """Shapes and systematic errors with the trial effects eliminated and the free parameters projected off.
-
-    `blocks`, shape (n_trials, q, q), are cross products of keys, residual, shapes, and the systematic errors to which
-    each trial responds. `lever`, shape (n_free, n_tested), is I_θθ⁻¹ I_θs, `step`, shape (n_free,), the Newton step of
-    the free parameters, and `estimated` their indices, without those at a bound. `score`, shape (n_tested,), and
-    `information`, squared, are what remains of shapes and systematic errors; `empty` marks those without information.
+    """Shapes and systematic errors with the trial effects eliminated and the free parameters projected off. `blocks`,
+    shape (n_trials, q, q), are cross products of keys, residual, shapes, and the systematic errors to which each trial
+    responds.
     """
 
     blocks: Floats
@@ -118,17 +107,7 @@ class Projection:
 
 
 def projected(fit: Fit, products: Products, state: FitState) -> Projection:
-    """Project shapes and residual on the free parameters of a fit, with the trial effects eliminated.
-
-    Parameters
-    ----------
-    fit, products, state
-        As of `scores_of`.
-
-    Returns
-    -------
-    Projection
-    """
+    """Project shapes and residual on the free parameters of a fit, with the trial effects eliminated."""
     problem = fit.solution.problem
     p, size, n_tested = products.n_keys, problem.prior_mean.size, products.n_tested
     X, r, C = slice(0, p), p, slice(p + 1, None)
@@ -165,19 +144,9 @@ def _sum_of_blocks(blocks: Floats, places: NDArray[np.int_], size: int) -> Float
 
 
 def levers_of(fit: Fit, products: Products) -> Floats:
-    """Bias of each parameter per unit of an omitted effect's size (omitted-variable bias), by the linear model.
-
-    A parameter falls by this much when the effect is added.
-
-    Parameters
-    ----------
-    fit : the fit.
-    products : its products with the shapes.
-
-    Returns
-    -------
-    ndarray, shape (n_numbers, n_shapes)
-        I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the parameter over those of the size.
+    """Bias of each parameter per unit of an omitted effect's size (omitted-variable bias), by the linear model. A
+    parameter falls by this much when the effect is added. Returns I_θθ⁻¹ I_θs with systematic errors integrated out, in
+    units of the parameter over those of the size. Shape (n_numbers, n_shapes).
     """
     projection = projected(fit, products, fit.state)
     lever = projection.lever @ _marginalisation(projection.information, products.n_shapes)
@@ -190,19 +159,7 @@ def levers_of(fit: Fit, products: Products) -> Floats:
 
 
 def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Scores:
-    """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    products : from `products_of`.
-    state : FitState, optional
-        Noise and between-trial standard deviations in place of the fit's.
-
-    Returns
-    -------
-    Scores
-    """
+    """Compute the scores at a fit, or with the noise and between-trial standard deviations of another `state`."""
     projection = projected(fit, products, state or fit.state)
     blocks, index, tested = projection.blocks, fit.solution.problem.index, products.tested_indices
     p, n_shapes = products.n_keys, products.n_shapes
@@ -233,21 +190,9 @@ def scores_of(fit: Fit, products: Products, state: FitState | None = None) -> Sc
 
 
 def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float, float]]) -> Floats:
-    """Information of every shape's size, each alone, at other between-trial standard deviations.
-
-    Equal to that of `scores_of`, but summed over trials first: the standard deviations only change the contribution of
-    each trial's two deviations, of rank two, so that no block of all shapes is needed for any trial.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    products : from `products_of`.
-    spreads : sequence of (float, float)
-        Of pressure, relative, and of ln B.
-
-    Returns
-    -------
-    array, shape (n_spreads, n_shapes)
+    """Information of every shape's size, each alone, at other between-trial standard deviations. Equal to that of
+    `scores_of`, but summed over trials first: the standard deviations only change the contribution of each trial's two
+    deviations, of rank two, so that no block of all shapes is needed for any trial. Shape (n_spreads, n_shapes).
     """
     state, size, p = fit.state, fit.solution.problem.prior_mean.size, products.n_keys
     problem = with_shapes(fit.solution.problem, products.n_tested)
@@ -282,7 +227,6 @@ def informations_at(fit: Fit, products: Products, spreads: Sequence[tuple[float,
 
 def _shape_information(fit: Fit, information: Floats, n_shapes: int) -> Floats:
     """Information of the shapes, with the free parameters projected off and systematic errors integrated out.
-
     `information` is that of free parameters, shapes and systematic errors together, without the parameters' priors.
     """
     problem = fit.solution.problem
@@ -297,9 +241,8 @@ def _shape_information(fit: Fit, information: Floats, n_shapes: int) -> Floats:
 
 
 def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Information with the rows of shapes that other columns reproduce set to zero, and which these are.
-
-    What the projection leaves of such a shape is rounding. `before` is the information before the projection.
+    """Information with the rows of shapes that other columns reproduce set to zero, and which these are. What the
+    projection leaves of such a shape is rounding. `before` is the information before the projection.
     """
     empty = np.diag(information) < ROUNDING_SHARE * np.maximum(np.diag(before)[: len(information)], 1e-300)
     cleaned = information.copy()
@@ -308,9 +251,8 @@ def _without_rounding(information: Floats, before: Floats) -> tuple[Floats, NDAr
 
 
 def _marginalisation(information: Floats, n_shapes: int) -> Floats:
-    """Matrix that integrates systematic errors of standard deviation 1 out, shape (n_tested, n_shapes).
-
-    Applied to the columns of shapes and systematic errors, it gives those of the shapes with the errors integrated out.
+    """Matrix that integrates systematic errors of standard deviation 1 out, shape (n_tested, n_shapes). Applied to the
+    columns of shapes and systematic errors, it gives those of the shapes with the errors integrated out.
     """
     n_tested = len(information)
     matrix = np.zeros((n_tested, n_shapes))
@@ -336,22 +278,10 @@ def _adapting(fit: Fit, hessian: Floats) -> NDArray[np.intp]:
 
 
 def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floats]:
-    """Predicted fall of −2 ln L with each shape, and the size at which it is reached, in the linear model.
-
-    The noise has the correlation of the tracks' noise and one variance for all trials, estimated from the residuals:
-    where a model is far off, the noise of its fit has absorbed part of the misfit. The between-trial standard
-    deviations are 1 % of pressure and 3 % of B.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    products : from `products_of`.
-    rho : float
-        Lag-one correlation of the tracks' noise.
-
-    Returns
-    -------
-    gain, size : arrays, shape (n_shapes,)
+    """Predicted fall of −2 ln L with each shape, and the size at which it is reached, in the linear model. The noise
+    has the correlation of the tracks' noise and one variance for all trials, estimated from the residuals: where a
+    model is far off, the noise of its fit has absorbed part of the misfit. Returns gain, size : arrays, shape
+    (n_shapes,).
     """
     state = fit.solution.state
     total = fit.solution.problem.points.sum()
@@ -371,7 +301,6 @@ def linear_gains(fit: Fit, products: Products, rho: float) -> tuple[Floats, Floa
 
 def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> float:
     """Residual sum of squares, in units of the noise, with the fit's parameters at their best; priors included.
-
     Parameters at a bound, or fixed, stay where they are, as in `projected`: their steps there are 0.
     """
     problem, blocks = fit.solution.problem, projection.blocks

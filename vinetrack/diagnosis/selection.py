@@ -40,42 +40,30 @@ from vinetrack.diagnosis.trial_effect_tests import has_excess_scatter
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
-MAX_RESTARTS = 2
-"""Times that the selection is repeated from a better minimum of the model. Chosen as a safeguard."""
+MAX_RESTARTS = 2  # Times that the selection is repeated from a better minimum of the model (chosen)
 
+# Standard deviations by which a score must exceed its threshold to count although no refit confirms it
 CLEAR_SCORE_EXCESS = 1.0
-"""Standard deviations by which a score must exceed its threshold to count although no refit confirms it. Chosen."""
 
+# If the model is still far off, a third or further effect must reduce χ² to less than this share, or no more effects
+# are added (chosen)
 STALLED_CHI2_SHARE = 0.7
-"""If the model is still far off, a third or further effect must reduce χ² to less than this share, or no more effects
-are added. Chosen for time: where the truth is not in the catalogue, steps would go on forever; at half of it four equal
-effects would not be found, at twice no step is refused."""
 
+# Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them
+# (chosen)
 PARTIAL_SHARE = 0.5
-"""Share of the excess of χ² per degree of freedom over 1 that partial steps must remove for `unexplained` to show them.
-Chosen: what explains less than half says little of where to look; at half of it a quarter is enough, at twice nothing
-is shown."""
 
+# Effects that are the leading term of a series in the image position (derived)
 LEADING_TERMS, LEADING_TERM_SHARE = ("lens", "perspective"), 0.95
-"""Effects that are the leading term of a series in the image position, and the share of a set's gain that such a term
-must gain alone for the rest of the set to count as possibly its next term. Derived: at the edge of the picture the
-fifth order of a lens is up to a fifth of its third, 4 % of the squares, so that up to 5 % of the gain is left to the
-rest of the set. With 10 % (0.9), physics that is a few times weaker than a lens is named only after the lens was
-corrected; with 2.5 % (0.975), a strong lens is taken for a lens and physics."""
 
-NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)
-"""Kinds of hypotheses that are not physics: faults of the measurement, and differences between trials."""
+NONPHYSICAL_KINDS = ("measurement", BETWEEN_TRIALS)  # Kinds of hypotheses that are not physics
 
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One round of the selection: a model, its tests, and the hypotheses compared.
-
-    `answer_set` holds the hypotheses that cannot be excluded (of sets of effects, what they add to the effects of
-    earlier rounds), `answer_names` their names; `fitted` every hypothesis fitted; `rejected` labels and reasons.
-    `confounded` lists other effects that the sizes may include. `unstated_differences` are differences between trials
-    by an order that the sheet does not state, reported beside an adequate model. `partial` are the steps, one effect
-    each, that remove most of a misfit that no hypothesis removes entirely.
+    """One round of the selection: a model, its tests, and the hypotheses compared. `answer_set` holds the hypotheses
+    that cannot be excluded (of sets of effects, what they add to the effects of earlier rounds), `answer_names` their
+    names; `fitted` every hypothesis fitted; `rejected` labels and reasons.
     """
 
     verdict: str
@@ -92,28 +80,8 @@ class SelectionStep:
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, restarts: int = 0) -> list[SelectionStep]:
-    """Select the effects that a model lacks.
-
-    If the model's fit is only a local optimum, any added effect seems to help. A fit that is far off is therefore
-    refitted from other starts first, and the model, without any effect added, is also refitted from where the best
-    hypothesis ended. If its likelihood is then higher than before, the selection is repeated from that fit, twice at
-    most.
-
-    Parameters
-    ----------
-    fit
-        The fit of the model.
-    effects : sequence of Effect
-        Candidates.
-    report : callable
-        Called with a sentence at each step.
-    restarts : int
-        How often the selection was repeated already.
-
-    Returns
-    -------
-    list of SelectionStep
-        One a round; the first is about the model itself.
+    """Select the effects that a model lacks. If the model's fit is only a local optimum, any added effect seems to
+    help.
     """
     if fit.chi2_per_dof > FAR_OFF_CHI2_PER_DOF and not restarts:
         report("fitting the model from other starts")
@@ -176,7 +144,6 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, resta
 
 def _may_be_improved(hypotheses: Sequence[LikelihoodRatio]) -> bool:
     """Whether a better hypothesis may exist: the best one so far is far off, or its trial effects absorb a misfit.
-
     Nothing is left to gain once the residuals are no larger than the noise of the tracks and trials scatter no more
     than careful work allows.
     """
@@ -194,10 +161,9 @@ def _is_better(hypotheses: Sequence[LikelihoodRatio], reference: LikelihoodRatio
 
 
 def _slack_rounds(tests: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
-    """Rounds in which a tail that may go slack explains the misfit; None where it does not.
-
-    The rule is tried first: a tail cannot push, and the rule has no parameter that could absorb another effect. If
-    trials scatter much, their effects may have adapted to the rule, and it stands only if no single effect fits better.
+    """Rounds in which a tail that may go slack explains the misfit; None where it does not. The rule is tried first: a
+    tail cannot push, and the rule has no parameter that could absorb another effect. If trials scatter much, their
+    effects may have adapted to the rule, and it stands only if no single effect fits better.
     """
     slack = slack_fit(tests.fit)
     if slack is None or not _exceeds_threshold(slack, tests):
@@ -218,9 +184,8 @@ def _exceeds_threshold(hypothesis: LikelihoodRatio, tests: MisfitTests) -> bool:
 
 
 def _any_exceeds_threshold(hypotheses: Sequence[LikelihoodRatio], tests: MisfitTests) -> bool:
-    """Whether the best hypothesis, or one that cannot be excluded beside it, exceeds its threshold.
-
-    Significances differ within the answer set, because each is reduced by the scatter of its own size between trials.
+    """Whether the best hypothesis, or one that cannot be excluded beside it, exceeds its threshold. Significances
+    differ within the answer set, because each is reduced by the scatter of its own size between trials.
     """
     best = best_of(hypotheses)
     return any(
@@ -268,17 +233,7 @@ def _negligible_note(best: LikelihoodRatio, tests: MisfitTests) -> str:
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
-    """Verdict that follows from an answer set: `artefact` where it holds no physics, else `missing` or `ambiguous`.
-
-    Parameters
-    ----------
-    adequate : sequence of LikelihoodRatio
-        The answer set.
-
-    Returns
-    -------
-    str
-    """
+    """Verdict that follows from an answer set: `artefact` where it holds no physics, else `missing` or `ambiguous`."""
     if all(effect.kind in NONPHYSICAL_KINDS for hypothesis in adequate for effect in hypothesis.effects):
         return ARTEFACT
     return MISSING if len(adequate) == 1 else AMBIGUOUS
@@ -333,7 +288,6 @@ def _rounds_of_sets(
     after: MisfitTests,
 ) -> list[SelectionStep]:
     """Rounds from adequate sets of effects: one for each effect that all sets share, then one for the alternatives.
-
     Physics comes before faults of the measurement, and within both the effect with the largest gain alone. A distortion
     of the picture whose leading term gains nearly everything comes first: the rest of the set may be its next term.
     """

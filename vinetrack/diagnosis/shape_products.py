@@ -22,17 +22,13 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
 from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import all_products
 
-TRIALS_AT_ONCE = 64
-"""Trials whose cross products are held at once, each of half a megabyte. Chosen for memory; no result depends on it."""
+TRIALS_AT_ONCE = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
 
 
 @dataclass(frozen=True)
 class Products:
-    """Columns of a fit, of candidate shapes and of systematic errors, shape (n_points, n_columns) a trial.
-
-    In this order: trial effects, keys, residual, shapes, systematic errors. A trial has columns only for the systematic
-    errors that affect it; `places`, shape (n_trials, n_affecting), holds their indices among the `n_systematics`, and
-    `n_systematics` for none.
+    """Columns of a fit, of candidate shapes and of systematic errors, shape (n_points, n_columns) a trial. In this
+    order: trial effects, keys, residual, shapes, systematic errors.
     """
 
     columns: tuple[Floats, ...]
@@ -50,7 +46,6 @@ class Products:
     @property
     def tested_indices(self) -> NDArray[np.int_]:
         """Indices of each trial's shapes and systematic errors among all, shape (n_trials, n_shapes + n_affecting).
-
         `n_tested` for a systematic error that does not affect a trial.
         """
         shapes = np.tile(np.arange(self.n_shapes), (len(self.columns), 1))
@@ -62,31 +57,13 @@ class Products:
         return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
 
     def cross_products(self, part: slice) -> Floats:
-        """Cross products of a part of the trials, see `whitening`.
-
-        They are cached where there is only one part; those of several would be three times as large as the columns.
-
-        Parameters
-        ----------
-        part : one of `parts`.
-
-        Returns
-        -------
-        array, shape (n_trials, 3, n_columns, n_columns)
+        """Cross products of a part of the trials, see `whitening`. They are cached where there is only one part; those
+        of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
         """
         return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
 
     def of(self, places: Sequence[int]) -> Products:
-        """The same for some of the trials, which may be repeated.
-
-        Parameters
-        ----------
-        places : indices of the trials, in their new order.
-
-        Returns
-        -------
-        Products
-        """
+        """The same for some of the trials, which may be repeated."""
         columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
         return replace(self, columns=columns, data=data, places=self.places[list(places)])
 
@@ -103,15 +80,7 @@ class Products:
 
 def fit_columns(fit: Fit) -> list[Floats]:
     """Columns of a fit's trial effects, parameters and residual, with the same derivatives as those of the candidates.
-
-    Parameters
-    ----------
-    fit : the fit under test.
-
-    Returns
-    -------
-    list of arrays, shape (n_points, 4 + n_keys + 1)
-        As `Predictor.linearise`, also past the end of growth.
+    Shape (n_points, 4 + n_keys + 1).
     """
     state = fit.solution.state
     try:
@@ -124,21 +93,8 @@ def fit_columns(fit: Fit) -> list[Floats]:
 def products_of(
     fit: Fit, columns: Sequence[Floats], sensitivities: EffectSensitivities, systematics: Systematics
 ) -> Products:
-    """Assemble the columns of a fit, of the candidates and of the systematic errors.
-
-    Afterwards the columns of `sensitivities` are views of those made here, so that no trial's are held twice.
-
-    Parameters
-    ----------
-    fit : the fit under test.
-    columns : its own, from `fit_columns`.
-    sensitivities : of positions to the candidates.
-    systematics : Systematics
-        Shared systematic errors.
-
-    Returns
-    -------
-    Products
+    """Assemble the columns of a fit, of the candidates and of the systematic errors. Afterwards the columns of
+    `sensitivities` are views of those made here, so that no trial's are held twice.
     """
     keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(sensitivities.shapes)
     of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
@@ -151,16 +107,7 @@ def products_of(
 
 def products_without_trial_effects(fit: Fit, products: Products, state: FitState) -> Floats:
     """Cross products of keys, residual, shapes and systematic errors of every trial, its trial effects integrated out.
-
-    Parameters
-    ----------
-    fit : the fit under test.
-    products : from `products_of`.
-    state : noise and between-trial standard deviations.
-
-    Returns
-    -------
-    array, shape (n_trials, n_keys + 1 + n_shapes + n_affecting, the same again)
+    Shape (n_trials, n_keys + 1 + n_shapes + n_affecting, the same again).
     """
     size = products.columns[0].shape[1] - N_TRIAL_EFFECTS
     blocks = np.empty((len(products.columns), size, size))

@@ -25,10 +25,8 @@ from vinetrack.planning.simulated_campaigns import make
 
 @dataclass(frozen=True)
 class SimulatedDiagnosis:
-    """Result of the diagnosis of one simulated campaign.
-
-    `effect` and `value` are those of the true model, blank and NaN where nothing was missing; `failed` is the reason
-    why there is no verdict.
+    """Result of the diagnosis of one simulated campaign. `effect` and `value` are those of the true model, blank and
+    NaN where nothing was missing; `failed` is the reason why there is no verdict.
     """
 
     effect: str
@@ -57,19 +55,7 @@ class SimulatedDiagnosis:
 
 
 def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:
-    """Simulate one campaign of a design and diagnose it in full.
-
-    Parameters
-    ----------
-    design : of the campaign.
-    effect : in the true model but not in the fitted one; blank for none.
-    value : of its first parameter, SI.
-    seed : of the random numbers.
-
-    Returns
-    -------
-    SimulatedDiagnosis
-    """
+    """Simulate one campaign of a design and diagnose it in full."""
     start_s = time.perf_counter()
     try:
         truth = design.with_effect(effect, value) if effect else design
@@ -90,19 +76,7 @@ def simulated_diagnosis(design: CampaignDesign, effect: str, value: float, seed:
 
 
 def rates_of(diagnoses: Sequence[SimulatedDiagnosis], promised: float) -> SimulatedRates:
-    """Count the outcomes of campaigns with the same effect at the same size.
-
-    Parameters
-    ----------
-    diagnoses : at least one.
-    promised : float
-        Probability by linear theory.
-
-    Returns
-    -------
-    SimulatedRates
-        Campaigns without a verdict are counted separately.
-    """
+    """Count the outcomes of campaigns with the same effect at the same size."""
     completed = [diagnosis for diagnosis in diagnoses if not diagnosis.failed]
     named = Counter(diagnosis.named for diagnosis in completed if diagnosis.alarm)
     return SimulatedRates(

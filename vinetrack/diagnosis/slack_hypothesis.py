@@ -26,6 +26,7 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.sensitivity import Predictor
 
+# Stands for the rule in answer sets
 TAIL_SLACK = Effect(
     name="tail_slack",
     kind="physical",
@@ -38,34 +39,17 @@ TAIL_SLACK = Effect(
     worked=(),
     path=Path(__file__).resolve(),
 )
-"""Stands for the rule in answer sets. It is no term of a model: `tail_slack: free` in `experiment.yaml` turns it on."""
 
+# Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried (chosen)
 MIN_PUSH_FRACTION = 0.02
-"""Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried. Chosen: parameters of a fit
-are good to about 1 %; at half of it their errors cause a fit in vain, at twice a push of 4 % of the drive is not
-tried."""
 
+# Rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted without a full fit where
+# trials scatter much (derived)
 REFUTED_DEVIANCE_PER_POINT = 1.0
-"""Rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted without a full fit where
-trials scatter much. Derived: −2 ln L of n points with noise s is n ln s², so the misfit is √e times as large. Measured:
-with hidden effects (tuning seeds 702, 703, 706) it rises by 6,500 to 20,000 in all, more than this per point; for vines
-that went slack with payloads of 15 to 60 g it falls. Not applied where trials scatter little: with 200 g, which trial
-effects cannot absorb, it rose by 0.7 per point in one campaign of two. At half that one would be refuted if its trials
-scattered, at twice hardly any full fit is spared."""
 
 
 def pushes(fit: Fit) -> bool:
-    """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack."""
     return any(_pushes(fit, trial) for trial in fit.trials)
 
 
@@ -92,22 +76,9 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
 
 
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
-    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails.
-
-    Trial effects may have absorbed the misfit until no tail pushes. Where trials scatter much, the rule is therefore
-    also tried from other exponents, without the fitted deviations, on one trial of every condition first. If it fits
-    these far worse (REFUTED_DEVIANCE_PER_POINT), no fit is made to all trials.
-
-    The model is compiled without the candidates: together with tails that may go slack they take the better part of a
-    minute to compile, for a rule that is mostly refuted.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-
-    Returns
-    -------
-    LikelihoodRatio or None
+    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails. Trial effects may have
+    absorbed the misfit until no tail pushes. Where trials scatter much, the rule is therefore also tried from other
+    exponents, without the fitted deviations, on one trial of every condition first.
     """
     taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
     scattered = taut and has_excess_scatter(fit)

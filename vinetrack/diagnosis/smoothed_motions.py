@@ -22,34 +22,17 @@ from vinetrack.diagnosis.force_sensitivities import FittedMotion, with_model_ter
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.sensitivity import ORIGIN, RELEASE
 
+# Splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
 N_SPLINES = 20
-"""Splines of an acceleration, even in the square root of time and so denser where a vine accelerates. Chosen: as many
-as a force along the growth of one condition has."""
 
+# Penalties on second differences, relative to the information from positions (chosen)
 SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
-"""Penalties on second differences, relative to the information from positions. Chosen: from no visible smoothing to a
-straight line."""
 
-LAST_LENGTH_FRACTION = 0.96
-"""Part of the length up to which points are used. Chosen as in `force_refinement`."""
+LAST_LENGTH_FRACTION = 0.96  # Part of the length up to which points are used (chosen)
 
 
 def on_tracks(inversion: LinearInversion, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
-    """Move motions onto their tracks and evaluate the model along them.
-
-    Parameters
-    ----------
-    inversion : holds the trials.
-    trial_effects : array, shape (n_trials, 4)
-        Their releases and origins.
-    motions : sequence of FittedMotion
-        Those of the model, whose grids and trials are kept.
-
-    Returns
-    -------
-    list of FittedMotion
-        `acceleration` is that of the track, not that of the model.
-    """
+    """Move motions onto their tracks and evaluate the model along them. Shapes: trial_effects (n_trials, 4)."""
     return [_on_track(inversion.data[i], trial_effects[i], motion) for i, motion in enumerate(motions)]
 
 

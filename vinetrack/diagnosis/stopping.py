@@ -9,14 +9,6 @@ those before. With m hypotheses, of which "nothing is missing" is one, an effect
 exceeds that of every other by
 
     Z_Y / Z_T ≥ (m − 1)/risk,
-
-so that, whichever hypothesis is true, the risk of naming another is at most `risk`, by Bonferroni's inequality.
-Marginal likelihoods are those of `weighing`, with plausible ranges as priors, tempered by the excess of the scatter of
-trials over the noise model. Parameters shared by all hypotheses are at their optimum in each, so that the bound holds
-for campaigns that determine them, not exactly for the first few trials: a campaign never stops before `FEWEST_TRIALS`.
-
-The bound presumes that the truth is among the hypotheses. The diagnosis checks that: an effect stops a campaign only if
-no misfit is left with it in the model.
 """
 
 from __future__ import annotations
@@ -40,23 +32,17 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 
-FEWEST_TRIALS = 6
-"""Trials before which no campaign stops. Chosen: with fewer, scatter between trials is not estimated
-(`fit_problem.estimable`), and nothing shows whether trials agree."""
+FEWEST_TRIALS = 6  # Trials before which no campaign stops (chosen)
 
-NO_MISSING_EFFECT = "nothing missing"
-"""Name of the hypothesis that the model lacks no effect."""
+NO_MISSING_EFFECT = "nothing missing"  # Name of the hypothesis that the model lacks no effect
 
 STOP, GO_ON = "stop", "go on"
 
 
 @dataclass(frozen=True)
 class CampaignLook:
-    """Result of one look at a campaign.
-
-    `names` are the effects found, in order. `log_ratio` is the log of the smallest ratio of marginal likelihoods of one
-    of them to a rival, and `rival` that rival; `needed` is ln((m − 1)/risk). `decision` is `stop` or `go on`, `why` a
-    sentence.
+    """Result of one look at a campaign. `names` are the effects found, in order. `log_ratio` is the log of the smallest
+    ratio of marginal likelihoods of one of them to a rival, and `rival` that rival; `needed` is ln((m − 1)/risk).
     """
 
     trials: int
@@ -74,16 +60,7 @@ class CampaignLook:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> CampaignLook:
-        """Read what `to_json` wrote.
-
-        Parameters
-        ----------
-        entry : of `looks`.
-
-        Returns
-        -------
-        CampaignLook
-        """
+        """Read what `to_json` wrote."""
         return cls(
             trials=int(entry["trials"]),
             verdict=str(entry["verdict"]),
@@ -97,20 +74,7 @@ class CampaignLook:
 
 
 def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> CampaignLook:
-    """Decide whether a campaign may stop.
-
-    Parameters
-    ----------
-    diagnosis : of all trials so far.
-    trials : int
-        Their number.
-    risk : float
-        Probability, stated before the first look, that the campaign stops with a wrong effect.
-
-    Returns
-    -------
-    CampaignLook
-    """
+    """Decide whether a campaign may stop."""
     testable = [candidate for candidate in diagnosis.ranking if candidate.status != NOT_TESTABLE]
     needed = math.log(max(len(testable), 1) / risk)
     verdict = diagnosis.verdict
@@ -141,16 +105,8 @@ def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> CampaignLook:
 
 
 def trials_to_go(look: CampaignLook) -> int:
-    """Number of further trials of the same kinds that are needed, if the log ratio grows in proportion to the trials.
-
-    Parameters
-    ----------
-    look : the last one.
-
-    Returns
-    -------
-    int
-        At least 1; 0 where that is not known.
+    """Number of further trials of the same kinds that are needed, if the log ratio grows in proportion to
+    the trials.
     """
     if look.decision == STOP or not math.isfinite(look.log_ratio) or look.log_ratio <= 0:
         return 0
@@ -172,11 +128,8 @@ def _least_ratio(diagnosis: Diagnosis) -> tuple[float, str]:
 
 
 def _rivals(step: Round, best: Candidate) -> list[tuple[float, str]]:
-    """ln(Z_best / Z_rival) for all candidates of a round.
-
-    A rival that was not refitted counts with the fall of −2 ln L that its score test predicts, without a penalty for
-    its parameters: the ratio is then no larger than after a refit. One without a prediction was ruled out by the
-    search. One that contains the best as a limit, and is no better, is a richer form of the same effect.
+    """ln(Z_best / Z_rival) for all candidates of a round. A rival that was not refitted counts with the fall of −2 ln L
+    that its score test predicts, without a penalty for its parameters: the ratio is then no larger than after a refit.
     """
     ratios = []
     for rival in step.ranking:

@@ -26,18 +26,13 @@ from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 
-MIN_FRAMES_PER_STRETCH = 2
-"""Least frames of a stretch: a shorter recording is cut into fewer. Derived: one frame has no neighbour to average
-with."""
+MIN_FRAMES_PER_STRETCH = 2  # Least frames of a stretch: a shorter recording is cut into fewer (derived)
 
 
 @dataclass(frozen=True)
 class ResidualCourse:
-    """One trial's residuals, their response to between-trial scatter, and the coordinates along the growth.
-
-    From the first motion on; arrays have shape (n_points,), `scatter_response` (n_points, 2). `noise_variance_m2` is
-    the variance of a frame's position times the number of frames that share an error; `origin_variance_m2` is that of
-    the origin.
+    """One trial's residuals, their response to between-trial scatter, and the coordinates along the growth. From the
+    first motion on; arrays have shape (n_points,), `scatter_response` (n_points, 2).
     """
 
     trial: Trial
@@ -51,22 +46,8 @@ class ResidualCourse:
 
 
 def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ...]]:
-    """Residuals of every trial of a fit, and the trials as predicted with their own release and origin.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    courses : list of ResidualCourse
-    predicted : tuple of TrialFit
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated.
+    """Residuals of every trial of a fit, and the trials as predicted with their own release and origin. Returns
+    courses, predicted.
     """
     predicted = in_sample(fit).trials
     response = scatter_sensitivities(align_trials(fit))
@@ -74,33 +55,13 @@ def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ..
 
 
 def courses_by_condition(courses: Sequence[ResidualCourse]) -> dict[str, list[ResidualCourse]]:
-    """Courses by name of condition, in order.
-
-    Parameters
-    ----------
-    courses : sequence of ResidualCourse
-
-    Returns
-    -------
-    dict of list of ResidualCourse
-    """
+    """Courses by name of condition, in order."""
     names = dict.fromkeys(course.trial.condition for course in courses)
     return {name: [course for course in courses if course.trial.condition == name] for name in names}
 
 
 def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
-    """Estimate the scatter of replicates from stretches of time that all trials of a condition were recorded in.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-    courses : sequence of ResidualCourse
-
-    Returns
-    -------
-    Scatter
-    """
+    """Estimate the scatter of replicates from stretches of time that all trials of a condition were recorded in."""
     groups = courses_by_condition(courses).values()
     return find_scatter(fit, [common_stretches(members, "time_s", common_edges(members)) for members in groups])
 
@@ -122,17 +83,7 @@ def _course(trial: TrialFit, response: Floats, trial_data: FitTrial) -> Residual
 
 
 def common_edges(members: Sequence[ResidualCourse]) -> Floats:
-    """Edges of stretches of time that every replicate was recorded in.
-
-    Parameters
-    ----------
-    members : sequence of ResidualCourse
-        Of one condition.
-
-    Returns
-    -------
-    array, shape (n_stretches + 1,), s
-    """
+    """Edges of stretches of time that every replicate was recorded in. Shape (n_stretches + 1,)."""
     start = max(float(member.time_s[0]) for member in members)
     end = min(float(member.time_s[-1]) for member in members)
     frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
@@ -142,19 +93,7 @@ def common_edges(members: Sequence[ResidualCourse]) -> Floats:
 
 def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
     """Means of [residual, scatter response] in each stretch, NaN where there is no frame, and the numbers of frames.
-
-    Parameters
-    ----------
-    course
-        One trial along its growth.
-    along : str
-        Attribute of the course that the edges belong to.
-    edges : array, shape (n_stretches + 1,)
-
-    Returns
-    -------
-    means : array, shape (n_stretches, 3), m
-    frames : array, shape (n_stretches,)
+    Returns means, frames. Shapes: edges (n_stretches + 1,) → (n_stretches, 3).
     """
     values, at = np.column_stack([course.residual_m, course.scatter_response]), getattr(course, along)
     stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
@@ -166,20 +105,7 @@ def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Fl
 
 
 def common_stretches(members: Sequence[ResidualCourse], along: str, edges: Floats) -> Stretches:
-    """The stretches in which all members have frames.
-
-    Parameters
-    ----------
-    members : sequence of ResidualCourse
-        Of one condition.
-    along : str
-        Attribute of the courses that the edges belong to.
-    edges : array, shape (n_stretches + 1,)
-
-    Returns
-    -------
-    Stretches
-    """
+    """The stretches in which all members have frames. Shapes: edges (n_stretches + 1,)."""
     parts = [stretch_means(member, along, edges) for member in members]
     all_means = np.array([means for means, _ in parts])
     reached = np.isfinite(all_means).all(axis=(0, 2))
@@ -193,21 +119,7 @@ def _noise(course: ResidualCourse, count: Floats) -> Floats:
 
 
 def stretch_variances(course: ResidualCourse, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
-    """Variances of the means of one trial's stretches.
-
-    Parameters
-    ----------
-    course
-        One trial along its growth.
-    part : (means, frames)
-        From `stretch_means`.
-    scatter
-        Scatter of replicates.
-
-    Returns
-    -------
-    array, shape (n_stretches,), m²
-    """
+    """Variances of the means of one trial's stretches. Shape (n_stretches,)."""
     means, count = part
     single = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
     return np.diag(stretch_covariance(scatter, single))

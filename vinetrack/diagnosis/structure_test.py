@@ -21,12 +21,10 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.robust_covariance import cluster_variance
 from vinetrack.inference.systematics import Systematics
 
-BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
-"""Number of probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
+BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4  # Number of probe bumps along growth, speed and time (chosen)
 
+# Smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of freedom (chosen)
 MIN_INFORMATION_SHARE = 1e-4
-"""Smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of freedom. Chosen:
-a hundredth of the amplitude."""
 
 
 def _probe_shapes(fit: Fit) -> list[CandidateShape]:
@@ -54,7 +52,6 @@ def _probe_shapes(fit: Fit) -> list[CandidateShape]:
 @dataclass(frozen=True)
 class Structure:
     """Result of the probes: χ² of their scores for `degrees` of freedom, its p-value `p`, and the same as a `z`.
-
     `smallest_probe_p` is the smallest p-value of single probes, Bonferroni-corrected: a narrow feature shows in one
     probe and is diluted in the sum over all.
     """
@@ -67,21 +64,8 @@ class Structure:
 
 
 def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
-    """Test a fit for misfit that a smooth force could explain.
-
-    The scores of all probes are tested together, with both kinds of error, in the directions that the fitted parameters
-    leave to them.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-    columns : of the fit, from `fit_columns`.
-    systematics : Systematics
-        Shared systematic errors of the trials.
-
-    Returns
-    -------
-    Structure
+    """Test a fit for misfit that a smooth force could explain. The scores of all probes are tested together, with both
+    kinds of error, in the directions that the fitted parameters leave to them.
     """
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
@@ -90,16 +74,7 @@ def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) 
 
 
 def structure_from_scores(scores: Scores) -> Structure:
-    """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`.
-
-    Parameters
-    ----------
-    scores : of the probes.
-
-    Returns
-    -------
-    Structure
-    """
+    """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`."""
     from scipy.stats import f as fisher
     from scipy.stats import norm, t
 

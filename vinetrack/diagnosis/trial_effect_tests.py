@@ -17,46 +17,22 @@ from vinetrack.core.records import Floats
 from vinetrack.inference.fit_problem import variance_floor
 from vinetrack.inference.fit_result import Fit
 
-STRETCH_FRAMES = 8
-"""Frames over which residuals are summed: long compared with the correlation of the noise, short enough for a
-standstill of two dozen frames. Chosen: noise of lag-one correlation 0.6 is independent after eight frames to 2 %."""
+STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
 
-MIN_STRETCHES = 12
-"""Degrees of freedom of the stretches at rest below which the noise test is not made. Chosen: a variance is then known
-to 40 %."""
+MIN_STRETCHES = 12  # Degrees of freedom of the stretches at rest below which the noise test is not made (chosen)
 
-MIN_REPLICATE_DEGREES = 4
-"""Degrees of freedom between replicates from which their scatter is estimated. Chosen: a variance of four degrees of
-freedom is known to 70 %. At half chance scatter decides, at twice most campaigns are not tested."""
+MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)
 
-STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04
-"""Root mean square by which conditions may differ: twice the error of pressure that the sheet states, and 4 % of B.
-Chosen: usual for a gauge and a batch of vines."""
+STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04  # Root mean square by which conditions may differ (chosen)
 
-CAREFUL_PRESSURE_SCATTER = 0.02
-"""Relative standard deviation of pressure that is usual between trials. Chosen: usual for a gauge and a batch of
-vines."""
+CAREFUL_PRESSURE_SCATTER = 0.02  # Relative standard deviation of pressure that is usual between trials (chosen)
 
-REPLICATE_LIKE_P_VALUE = 0.05
-"""p-value from which conditions count as differing no more than their replicates. Chosen: a model whose misfit trial
-effects absorb passes for scatter once in twenty times at most; at half less often, at twice one campaign in ten whose
-trials really scatter is searched entirely for nothing."""
+REPLICATE_LIKE_P_VALUE = 0.05  # p-value from which conditions count as differing no more than their replicates (chosen)
 
 
 def between_conditions_p(fit: Fit) -> float:
-    """p-value that conditions differ in pressure or B no more than replicates do.
-
-    1 where replicates are too few, or where conditions differ by less than is usual in careful work.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    float
-        p-value.
+    """p-value that conditions differ in pressure or B no more than replicates do. 1 where replicates are too few, or
+    where conditions differ by less than is usual in careful work. Returns p-value.
     """
     stated = [
         trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
@@ -72,18 +48,9 @@ def between_conditions_p(fit: Fit) -> float:
 
 
 def has_excess_scatter(fit: Fit) -> bool:
-    """Whether trials scatter more than is usual in careful work, so that their effects may have absorbed a misfit.
-
-    They have not where conditions differ by no more than replicates, or than is usual: deviations that compensate for a
+    """Whether trials scatter more than is usual in careful work, so that their effects may have absorbed a misfit. They
+    have not where conditions differ by no more than replicates, or than is usual: deviations that compensate for a
     model are the same in replicates.
-
-    Parameters
-    ----------
-    fit : the fit of the model.
-
-    Returns
-    -------
-    bool
     """
     allowed = CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER
     return any(
@@ -108,7 +75,6 @@ def _grouping(fit: Fit) -> tuple[list[str], int]:
 
 def _differ_like_replicates(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> bool:
     """Whether groups differ by no more than their members do, or than is allowed; False where too few members tell.
-
     With no more groups than parameters fitted to them, no difference between groups can show.
     """
     inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
@@ -134,20 +100,7 @@ def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 
 def noise_in_motion_p(fit: Fit) -> float:
     """p-value that residuals summed over stretches are no noisier in motion than at rest; 1 where this is unknown.
-
-    Left out are positions read from recordings, because a tracker's slow errors are larger in motion than at rest;
-    trials with a recorded pressure, because the noise of the gauge moves the prediction; and positions more precise
-    than the integrator, such as those of a simulation.
-
-    Parameters
-    ----------
-    fit
-        A fitted model.
-
-    Returns
-    -------
-    float
-        p-value.
+    Returns p-value.
     """
     from scipy.stats import f
 

@@ -25,13 +25,10 @@ from vinetrack.dynamics.trial_inputs import trial_inputs
 from vinetrack.effects import Effect, EffectError, catalogue
 
 NEGLIGIBLE_BEND_RAD = math.radians(30)
-DRAG_SHARE, PRESSURE_SHARE, NEGLIGIBLE_LENGTH_M = 0.05, 0.05, 0.30
-"""Published: the rules by which Alvarez et al. (2025) neglect drag, the fall of the reservoir's pressure, friction
-along the length and bends. They decide which warnings are printed, and no fitted number; at half there are more, at
-twice fewer."""
+DRAG_SHARE, PRESSURE_SHARE, NEGLIGIBLE_LENGTH_M = 0.05, 0.05, 0.30  # Published: the rules by which Alvarez et al.
 
+# The rules that a trial may violate, see `RuleViolation`
 DRAG_RULE, LENGTH_RULE, BEND_RULE, RESERVOIR_RULE, TENSION_RULE = "drag", "length", "bends", "reservoir", "tension"
-"""The rules that a trial may violate, see `RuleViolation`."""
 
 TENSION = "tail_tension"
 COLUMNS = (
@@ -52,9 +49,8 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class AuditedMotion:
-    """Motion of one trial since release, measured or simulated; arrays of shape (n,), SI.
-
-    `pressure_Pa` is the gauge pressure measured along with it, where there is one.
+    """Motion of one trial since release, measured or simulated; arrays of shape (n,), SI. `pressure_Pa` is the gauge
+    pressure measured along with it, where there is one.
     """
 
     trial: Trial
@@ -64,17 +60,7 @@ class AuditedMotion:
     pressure_Pa: Floats | None = None
 
     def thinned(self, most: int = 200) -> AuditedMotion:
-        """The same motion at fewer points.
-
-        Parameters
-        ----------
-        most : largest number of points.
-
-        Returns
-        -------
-        AuditedMotion
-            Every k-th point.
-        """
+        """The same motion at fewer points."""
         every = slice(None, None, max(1, math.ceil(self.time_s.size / most)))
         pressure = None if self.pressure_Pa is None else self.pressure_Pa[every]
         return AuditedMotion(
@@ -98,12 +84,8 @@ class RuleViolation:
 
 @dataclass(frozen=True)
 class Audit:
-    """Result of an audit: a table of neglected terms and tensions by trial, and warnings.
-
-    `table`, columns `COLUMNS`, has a row per trial for each neglected term and one for the tension. `force_N` is the
-    force on the tail where it is largest relative to the drive (negative: it opposes growth), with time and place;
-    `shift_m` is the displacement that the camera would see. The row `tail_tension` has the least tension, and the time
-    at which it first was negative. `violations` are the rules that trials violate, `warnings` the same in sentences.
+    """Result of an audit: a table of neglected terms and tensions by trial, and warnings. `table`, columns `COLUMNS`,
+    has a row per trial for each neglected term and one for the tension.
     """
 
     table: pd.DataFrame
@@ -118,19 +100,7 @@ class Audit:
 def measured_motion(
     trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
 ) -> AuditedMotion:
-    """Motion of a trial as recorded, from its release on.
-
-    Parameters
-    ----------
-    trial, kinematics : the trial and its measured motion.
-    release_s : time of release on the clock of `kinematics`, s.
-    trace : times since release, s, and gauge pressures measured there, Pa.
-
-    Returns
-    -------
-    AuditedMotion
-        Position and velocity not below zero.
-    """
+    """Motion of a trial as recorded, from its release on."""
     k = kinematics
     moving = (k.time_s >= release_s) & np.isfinite(k.lead_position_m) & np.isfinite(k.lead_velocity_m_s)
     origin_m = np.interp(release_s, k.time_s, k.lead_position_m)
@@ -141,23 +111,7 @@ def measured_motion(
 
 
 def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effect] | None = None) -> Audit:
-    """Compute what `model` neglects along each motion.
-
-    Parameters
-    ----------
-    model : the model whose omissions are audited.
-    motions : one motion per trial, from `measured_motion` or a simulation.
-    effects : the effects considered, at default sizes; by default the physical effects of the catalogue.
-
-    Returns
-    -------
-    Audit
-
-    Raises
-    ------
-    EffectError
-        If a trial lacks a value that an effect *of the model* needs; for a neglected effect its row says so.
-    """
+    """Compute what `model` neglects along each motion."""
     candidates = list(catalogue().values()) if effects is None else list(effects)
     rows: list[dict[str, Any]] = []
     violations: list[RuleViolation] = []

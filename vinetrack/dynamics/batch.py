@@ -17,26 +17,20 @@ from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted
 from vinetrack.effects import State, TrialInputs
 
-RELATIVE_TOLERANCE = 1e-4
-"""Local tolerance on the speed. Hairer's error estimate is of order 3, the method of order 5: positions are accurate to
-10⁻⁶ of the travel on every trial of the paper's protocol (measured by `benchmarks/integrator.py`)."""
+RELATIVE_TOLERANCE = 1e-4  # Local tolerance on the speed
 
 _NOTHING = State(*(math.nan,) * len(State._fields))
 
-SMALLEST_SHARE = 64
-"""Trials below which another thread costs more than it saves. Chosen: a millisecond of work; no result changes."""
+SMALLEST_SHARE = 64  # Trials below which another thread costs more than it saves (chosen)
 
-Trace = tuple[Floats, Floats]
-"""Times since release, s, and gauge pressures, Pa, measured at them."""
+Trace = tuple[Floats, Floats]  # Times since release, s, and gauge pressures, Pa, measured at them
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Trials laid out for the compiled kernel: prepared once, run as often as needed.
-
-    Trial i has rows `starts[i]:starts[i + 1]` of the result; `stamps`, shape (n_times,), are its times since release on
-    the camera's clock, `times` the true ones. `thetas`, shape (n_trials, n_parameters), may be replaced between runs as
-    long as no effect is switched on or off.
+    """Trials laid out for the compiled kernel: prepared once, run as often as needed. Trial i has rows
+    `starts[i]:starts[i + 1]` of the result; `stamps`, shape (n_times,), are its times since release on the camera's
+    clock, `times` the true ones.
     """
 
     integrate_many: Callable[..., None]
@@ -55,19 +49,7 @@ class Batch:
     stops: Floats
 
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
-        """Integrate every trial.
-
-        Parameters
-        ----------
-        relative_tolerance : of the integrator, relative to the speed that a motion reaches.
-        threads : number of threads, by default one for every 64 trials and at most the number of cores, as the kernel
-            releases the interpreter's lock.
-
-        Returns
-        -------
-        out : array, shape (n_times, 4): x, v, a of the tail, position of the leading edge as the camera reports it
-        ends : array, shape (n_trials, 5): status, end time, end speed, number of steps, first slack
-        """
+        """Integrate every trial. Returns out, ends. Shape (n_times, 4)."""
         count = self.starts.size - 1
         out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
         threads = threads or max(1, min(available_cores(), count // SMALLEST_SHARE))
@@ -117,19 +99,8 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """As `simulate.prepare`, for trials whose inputs are numbers already.
-
-    Parameters
-    ----------
-    model, traces, parameters, host : as those of `simulate_many`
-    inputs : shape (n_trials, n_fields of `TrialInputs`), SI
-    bends : by trial, as `bends_of` returns them
-    stamps : shape (n_times,), times of all trials, concatenated, s
-    starts : shape (n_trials + 1,), start of each trial's times, from `starts_of`
-
-    Returns
-    -------
-    Batch
+    """As `simulate.prepare`, for trials whose inputs are numbers already. Shapes: inputs (n_trials, n_fields of
+    `TrialInputs`); stamps (n_times,); starts (n_trials + 1,).
     """
     count = len(inputs)
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
@@ -165,16 +136,7 @@ def lay_out(
 
 
 def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
-    """Start of each part in their concatenation, and the end of the last.
-
-    Parameters
-    ----------
-    parts : sequence of sized
-
-    Returns
-    -------
-    array of int, shape (n_parts + 1,)
-    """
+    """Start of each part in their concatenation, and the end of the last. Shape (n_parts + 1,)."""
     starts = np.zeros(len(parts) + 1, dtype=np.int64)
     np.cumsum([len(part) for part in parts], out=starts[1:])
     return starts
@@ -188,7 +150,6 @@ def _limits(
     bends: Sequence[Sequence[tuple[float, float, float]]],
 ) -> tuple[Floats, Floats]:
     """Tail travel at the breakpoints of the forces, increasing, and at the end of growth, m; infinite if there is none.
-
     Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
     bends begin and end, and where effects declare them.
     """

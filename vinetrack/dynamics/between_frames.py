@@ -16,17 +16,7 @@ def _point(times, out, k):
 
 @compiled
 def motion_at(times, out, ratio, end, k, read):
-    """Position, m, and speed, m/s, of the tail at a time, and the camera's offset of the lead position, m.
-
-    Parameters
-    ----------
-    times : array (n_times,), s since release, increasing.
-    out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m.
-    ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite if it does not.
-    k : index of a nearby time, from which to search.
-    read : the time, s since release.
-    """
+    """Position, m, and speed, m/s, of the tail at a time, and the camera's offset of the lead position, m."""
     last = times.size - 1
     while k < last and times[k + 1] <= read:
         k += 1

@@ -15,6 +15,7 @@ from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.effects import Effect, catalogue
 
+# The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long
 REFERENCE = Trial(
     name="reference",
     vine="reference",
@@ -27,35 +28,22 @@ REFERENCE = Trial(
     chamber_m3=3.7e-3,
     inlet_m=6e-3,
 )
-"""The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long."""
 
 REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
 
-BENDS = (Bend(0.1, 0.1, 0.1),)
-"""One radian after 10 cm, for effects of bends."""
+BENDS = (Bend(0.1, 0.1, 0.1),)  # One radian after 10 cm, for effects of bends
 
+# A pressure that rises and falls through the threshold, for effects that act on a vine at rest
 SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3]))
-"""A pressure that rises and falls through the threshold, for effects that act on a vine at rest."""
 
 
+# A pressure that is recorded while a valve opens, for effects on the record of the pressure
 OPENED: Trace = (np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3]))
-"""A pressure that is recorded while a valve opens, for effects on the record of the pressure."""
 
 
 def effect_motion(effect: Effect) -> pd.DataFrame:
-    """Motion of the reference vine with an effect at its default size and without it.
-
-    An effect of the base model is removed from it, any other is added.
-
-    Parameters
-    ----------
-    effect : of the catalogue, or a user's own.
-
-    Returns
-    -------
-    table
-        `time_s, without_position_m, with_position_m, without_velocity_m_s, with_velocity_m_s, difference_m`; positions
-        of the leading edge as the camera reports them, up to the end of growth of whichever ends first.
+    """Motion of the reference vine with an effect at its default size and without it. An effect of the base model is
+    removed from it, any other is added.
     """
     with_it, without = _models(effect)
     trial = replace(REFERENCE, bends=BENDS) if effect.name == "capstan_friction" else REFERENCE
@@ -78,16 +66,7 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
 
 
 def reference_words(effect: Effect) -> str:
-    """Describe the vine and trial of `effect_motion`, for the caption of a picture.
-
-    Parameters
-    ----------
-    effect : it decides the trial: a bend, a rising pressure, or the plain one.
-
-    Returns
-    -------
-    half a sentence.
-    """
+    """Describe the vine and trial of `effect_motion`, for the caption of a picture."""
     vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
     if _acts_at_rest(effect):
         return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
@@ -98,16 +77,7 @@ def reference_words(effect: Effect) -> str:
 
 
 def size_words(effect: Effect) -> str:
-    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`.
-
-    Parameters
-    ----------
-    effect : of the catalogue, or a user's own.
-
-    Returns
-    -------
-    the list; blank where it has no parameters.
-    """
+    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`."""
     values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
     return ", ".join(
         f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
@@ -120,9 +90,8 @@ def _acts_at_rest(effect: Effect) -> bool:
 
 
 def _models(effect: Effect) -> tuple[Model, Model]:
-    """The base model with an effect and without.
-
-    Both are the whole catalogue with all other effects at size zero, so that one compiled model serves all figures.
+    """The base model with an effect and without. Both are the whole catalogue with all other effects at size zero, so
+    that one compiled model serves all figures.
     """
     if effect.kind == "base" and not effect.parameters:
         base = base_model().with_values(REFERENCE_VALUES)

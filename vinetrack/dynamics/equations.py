@@ -24,22 +24,8 @@ _FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, 
 
 compiled: Any = njit(**_FLAGS, forceinline=False)
 inlined: Any = njit(**_FLAGS, forceinline=True)
+# Options with which every function of the integrator is compiled (measured)
 merged: Any = njit(**_FLAGS, inline="always")
-"""Options with which every function of the integrator is compiled: it releases the interpreter's lock, divides by zero
-as NumPy does, and does not count references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two
-together make it three times as fast; in return no function may allocate an array. Python cannot call these functions,
-since only `integrate_many` of `vinetrack.dynamics.kernel` has a wrapper for it: wrappers took a quarter of the time to
-compile a model.
-
-`inlined` is for the model and the steps of the integrator, so that splitting them into functions costs no time: without
-it, a trajectory takes 1.8 times as long on 36 trials, for the base model as for a catalogue of 36 effects. Either
-option is stated for every function: otherwise numba takes it from whichever caller it compiles first, and the same
-model was up to twice as slow in a process that had called its rates alone.
-
-`merged` is for a large function with a single caller: numba copies it into the caller before it infers types. Otherwise
-all that it calls is optimised for the function and once more for its caller, which takes a seventh of the time to
-compile the whole catalogue. Trajectories are the same to the last bit.
-"""
 
 
 class TrialArrays(NamedTuple):
@@ -55,11 +41,9 @@ class TrialArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The compiled functions of one model, called with `(time, x, v, chamber, trial)` unless stated.
-
-    x, v are position and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa.
-
-    The last five are for tails that may go slack; otherwise they are the placeholders at the end of this file.
+    """The compiled functions of one model, called with `(time, x, v, chamber, trial)` unless stated. x, v are position
+    and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa. The last five are for tails
+    that may go slack; otherwise they are the placeholders at the end of this file.
     """
 
     name: str  #: of the model, unique in a process: it distinguishes numba's types
@@ -78,9 +62,8 @@ class Equations:
 
 
 class EquationsType(types.Opaque):
-    """Numba's type for the `Equations` of one model: no data at run time; its attributes are compiled functions.
-
-    A tuple of functions would work too, but numba passes its functions by their memory addresses, and then cannot cache
+    """Numba's type for the `Equations` of one model: no data at run time; its attributes are compiled functions. A
+    tuple of functions would work too, but numba passes its functions by their memory addresses, and then cannot cache
     the compiled form for the next process.
     """
 
@@ -125,25 +108,12 @@ class Point(NamedTuple):
     chamber: float
 
 
-RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4
-"""Status of a trajectory (the first four index `vinetrack.dynamics.simulate.STATUS`); a convention of this package.
-TAUT: a slack tail has become taut and the integrator continues."""
+RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
 
 
 @inlined
 def trace_at(time, trial):
-    """The measured pressure: linear between its samples, constant before the first and after the last.
-
-    Parameters
-    ----------
-    time : since release, s.
-    trial : the `TrialArrays` of a trial with a measured pressure.
-
-    Returns
-    -------
-    float
-        Gauge pressure, Pa.
-    """
+    """The measured pressure: linear between its samples, constant before the first and after the last."""
     last = trial.trace_time.size - 1
     if time <= trial.trace_time[0]:
         return trial.trace_pressure[0]
@@ -156,20 +126,8 @@ def trace_at(time, trial):
 
 @inlined
 def next_slope_change(k, time, trial):
-    """Index of the first sample of the measured pressure after `time`, from index k on, at which its slope changes.
-
-    No step of the integrator is accurate across such a sample.
-
-    Parameters
-    ----------
-    k : index from which to search.
-    time : since release, s.
-    trial : the `TrialArrays` of the trial.
-
-    Returns
-    -------
-    int
-        The index; the number of samples where there is none.
+    """Index of the first sample of the measured pressure after `time`, from index k on, at which its slope changes. No
+    step of the integrator is accurate across such a sample.
     """
     trace_time, trace_pressure = trial.trace_time, trial.trace_pressure
     last = trace_time.size - 1
@@ -188,18 +146,7 @@ def next_slope_change(k, time, trial):
 
 @inlined
 def angle_passed(y, trial):
-    """Total angle of the bends that the tip has passed.
-
-    Parameters
-    ----------
-    y : position of the leading edge, m.
-    trial : the `TrialArrays` of the trial.
-
-    Returns
-    -------
-    float
-        Sum of the angles, rad.
-    """
+    """Total angle of the bends that the tip has passed."""
     angle = 0.0
     for k in range(trial.bends.shape[0]):
         angle += min(max(y - trial.bends[k, 0], 0.0), trial.bends[k, 1]) / trial.bends[k, 2]
@@ -220,106 +167,41 @@ def without_chamber():
 
 @inlined
 def not_averaged(trial):  # noqa: ARG001
-    """Placeholder for `averaged_over` if positions are not averaged in time.
-
-    Parameters
-    ----------
-    trial : unused.
-
-    Returns
-    -------
-    0 s².
-    """
+    """Placeholder for `averaged_over` if positions are not averaged in time."""
     return 0.0
 
 
 @inlined
 def no_row_delay(trial):  # noqa: ARG001
-    """Placeholder for `row_delay` if all rows of a picture are read at once.
-
-    Parameters
-    ----------
-    trial : unused.
-
-    Returns
-    -------
-    0 s/m.
-    """
+    """Placeholder for `row_delay` if all rows of a picture are read at once."""
     return 0.0
 
 
 @inlined
 def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
-    """Placeholder for `tip_tension` if no tail may go slack.
-
-    Parameters
-    ----------
-    time, x, v, chamber, resting, trial : as of `tip_tension`, unused.
-
-    Returns
-    -------
-    (tension, chamber_rate)
-        0 N and 0 Pa/s; never used.
-    """
+    """Placeholder for `tip_tension` if no tail may go slack."""
     return 0.0, 0.0
 
 
 @inlined
 def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
-    """Placeholder for `free_fall` if no tail may go slack.
-
-    Parameters
-    ----------
-    time, y, ydot, x, v, chamber, trial : as of `free_fall`, unused.
-
-    Returns
-    -------
-    zero.
-    """
+    """Placeholder for `free_fall` if no tail may go slack."""
     return 0.0
 
 
 @inlined
 def never_slack(equations, trial, h, start, end):  # noqa: ARG001
-    """Placeholder for `slack_fraction` if no tail may go slack: beyond the end of every step.
-
-    Parameters
-    ----------
-    equations, trial, h, start, end : as of `slack_fraction`, unused.
-
-    Returns
-    -------
-    2, in steps.
-    """
+    """Placeholder for `slack_fraction` if no tail may go slack: beyond the end of every step."""
     return 2.0
 
 
 @inlined
 def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
-    """Placeholder for `slack_at_rest` if no tail may go slack.
-
-    Parameters
-    ----------
-    equations, trial, time, x, chamber : as of `slack_at_rest`, unused.
-
-    Returns
-    -------
-    False.
-    """
+    """Placeholder for `slack_at_rest` if no tail may go slack."""
     return False
 
 
 @inlined
 def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
-    """Placeholder for `follow_slack` if no tail may go slack.
-
-    Parameters
-    ----------
-    equations, trial, times, row, start, stop, rtol, out, work : as of `follow_slack`; `row` and `start` are returned.
-
-    Returns
-    -------
-    (status, row, point, tip_speed)
-        TAUT, `row` and `start` unchanged, and a tip speed r·ẏ of 0 m/s, as `follow_slack` returns them.
-    """
+    """Placeholder for `follow_slack` if no tail may go slack."""
     return TAUT, row, start, 0.0

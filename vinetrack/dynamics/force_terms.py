@@ -20,12 +20,8 @@ from vinetrack.effects import Effect, State, TrialInputs
 
 @dataclass(frozen=True)
 class Terms:
-    """Everything that the model computes along a motion; arrays of the motion's shape, SI.
-
-    `tip_N` and `tail_N` are the forces by effect: those at the tip act on the tail by 1/r, those on the tail in full.
-    `tension_N` is the tension that the tip leaves for the tail, T₁; where it is negative the model predicts compression
-    in the tail, which is impossible. `mass_kg` moves and has weight; `inertia_kg` includes mass that effects add.
-    `state` is the argument of the effects.
+    """Everything that the model computes along a motion; arrays of the motion's shape, SI. `tip_N` and `tail_N` are the
+    forces by effect: those at the tip act on the tail by 1/r, those on the tail in full.
     """
 
     pressure_Pa: Floats
@@ -48,24 +44,8 @@ def evaluate(
     *,
     measured_Pa: Floats | None = None,
 ) -> Terms:
-    """Evaluate every effect of the model along a motion since release.
-
-    Parameters
-    ----------
-    model : the effects and their values.
-    trial : its inputs.
-    time_s, lead_position_m, lead_velocity_m_s : since release and from rest, shape (n,).
-    measured_Pa : gauge pressure measured along with it, in place of the set pressure, shape (n,).
-
-    Returns
-    -------
-    Terms
-        Forces, pressure, area, mass and acceleration along the motion.
-
-    Raises
-    ------
-    EffectError
-        If the trial lacks what an effect needs.
+    """Evaluate every effect of the model along a motion since release. Shapes: time_s, lead_position_m,
+    lead_velocity_m_s, measured_Pa (n,).
     """
     check_needs(model, trial)
     rig = trial_inputs(trial)
@@ -99,22 +79,9 @@ def evaluate(
 
 
 def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Floats:
-    """Everything that moves with the tail.
-
-    The floor of the film's mass is that of fold and gas: mass that effects add to the tail counts towards it. Mass that
-    they remove is that of the payload, not film, which goes to zero during growth; fold and gas remain.
-
-    Parameters
-    ----------
-    film_mass : array, shape (n,), kg
-        Of the film that has not everted.
-    added_mass : array, shape (n,), kg
-        Added by effects; negative if they remove mass.
-    rig : TrialInputs
-
-    Returns
-    -------
-    array, shape (n,), kg
+    """Everything that moves with the tail. The floor of the film's mass is that of fold and gas: mass that effects add
+    to the tail counts towards it. Mass that they remove is that of the payload, not film, which goes to zero during
+    growth; fold and gas remain. Shapes: film_mass, added_mass (n,) → (n,).
     """
     tail = np.maximum(film_mass + np.maximum(added_mass, 0.0), rig.least_mass)
     return np.asarray(np.maximum(tail + np.minimum(added_mass, 0.0) + rig.payload_mass, rig.least_mass))
@@ -214,10 +181,8 @@ def _with_consistent_area(hooks: _HookCaller, state: State, rig: TrialInputs) ->
 
 
 def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any:
-    """Pressure of a chamber with an equation of its own.
-
-    Exponential integration from point to point with the motion frozen half-way, exact to first order in the pressure:
-    it is stable for a supply that is faster than the steps.
+    """Pressure of a chamber with an equation of its own. Exponential integration from point to point with the motion
+    frozen half-way, exact to first order in the pressure: it is stable for a supply that is faster than the steps.
     """
     shape = np.shape(state.time)
     fields = [np.broadcast_to(np.asarray(value, dtype=float), shape) for value in state]
@@ -242,14 +207,5 @@ def _chamber_pressure(hooks: _HookCaller, state: State, rig: TrialInputs) -> Any
 def pressure_along(
     model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats
 ) -> Floats:
-    """Gauge pressure that drove a measured motion according to a model.
-
-    Parameters
-    ----------
-    model, trial, time_s, lead_position_m, lead_velocity_m_s : as those of `evaluate`.
-
-    Returns
-    -------
-    array, shape (n,), Pa
-    """
+    """Gauge pressure that drove a measured motion according to a model. Shape (n,)."""
     return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa

@@ -25,39 +25,16 @@ def probe() -> Effect:
 
 
 def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
-    """Return one model of the catalogue, the probe force, a model and further effects.
-
-    Parameters
-    ----------
-    model
-        The model to simulate; its effects outside the catalogue are included.
-    candidates : iterable of Effect
-        Further effects, such as a user's own.
-
-    Returns
-    -------
-    Model
-    """
+    """Return one model of the catalogue, the probe force, a model and further effects."""
     held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
     return Model(tuple(held[name] for name in held))
 
 
 @lru_cache(maxsize=256)
 def shared_host(effects: tuple[Effect, ...]) -> Model | None:
-    """Return the host for a model of which none is stated.
-
-    It is worth 3 s to compile a further model, while a trajectory takes 1.4 times as long by the host
-    (`benchmarks/catalogue_speed.py`): 15 µs more each, less than the 3 s for 200 000 of them, which is twenty fits.
-
-    Parameters
-    ----------
-    effects : of the model.
-
-    Returns
-    -------
-    Model or None
-        None if the model is compiled by itself: one of base effects only, which most need, or with an effect of a
-        user's own.
+    """Return the host for a model of which none is stated. It is worth 3 s to compile a further model, while a
+    trajectory takes 1.4 times as long by the host (`benchmarks/catalogue_speed.py`): 15 µs more each, less than the 3 s
+    for 200 000 of them, which is twenty fits.
     """
     known = all(catalogue().get(effect.name) == effect for effect in effects)
     return host_for(Model(())) if known and not {effect.name for effect in effects} <= set(BASE_EFFECTS) else None

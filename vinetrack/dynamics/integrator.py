@@ -7,12 +7,9 @@ exceeds what holds it. An implicit L-stable method with error-controlled steps c
 
 `_integrate` follows one trajectory as a state machine. A vine is at rest (`_wait_for_drive`, `_start_from_rest`),
 moving (`_cut_at_breakpoint`, `radau_step`, `_judge_step`, `_next_step_size`) or has a slack tail
-(`vinetrack.dynamics.slack_tail`). The code uses only numbers, tuples and arrays, so that numba can compile it. The
-first argument of most functions, `equations`, holds the compiled functions of one model, and `trial` the arrays of one
-trial: see `vinetrack.dynamics.equations`.
+(`vinetrack.dynamics.slack_tail`). The code uses only numbers, tuples and arrays, so that numba can compile it.
 
-Source of the method: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections
-IV.5 and IV.8.
+Source of the method: E.
 """
 
 import numpy as np
@@ -35,55 +32,28 @@ from vinetrack.dynamics.row_readout import read_by_rows
 from vinetrack.dynamics.time_average import average_over
 from vinetrack.effects import TrialInputs
 
-TRAVEL_RATIO = TrialInputs._fields.index("travel_ratio")
-"""Convention: index of the travel ratio in a row of inputs."""
+TRAVEL_RATIO = TrialInputs._fields.index("travel_ratio")  # Convention: index of the travel ratio in a row of inputs
 
-MOST_STEPS = 20_000
-"""Maximum number of steps of a trajectory, chosen: trajectories of the catalogue take 20 to 600. Half and twice only
-change how long a trajectory that fails takes, about 20 ms at 1 µs a step."""
+MOST_STEPS = 20_000  # Maximum number of steps of a trajectory, chosen: trajectories of the catalogue take 20 to 600
 
+# Error of a step that was cut short, in tolerances, below which the next step takes the size proposed before the cut
 SMALL_ERROR = 0.1
-"""Error of a step that was cut short, in tolerances, below which the next step takes the size proposed before the cut;
-chosen: the error grows with the fourth power of the step, so that at 0.1 a step 1.8 times as long would just be
-accepted. At half that size is taken less often, at twice more of such steps are rejected."""
 
+# Arguments of `integrate_trials` after the equations, in order
 BATCH = (
     "starts", "times", "on", "inputs", "thetas", "trace_starts", "trace_time", "trace_pressure", "bend_starts", "bends",
     "breakpoints", "stops", "rtol", "out", "ends", "work",
     "means",
 )  # fmt: skip
-"""Arguments of `integrate_trials` after the equations, in order."""
 
-MOVING, AT_REST, SLACK = 0, 1, 2
-"""Phases of a trajectory; a convention of this file."""
+MOVING, AT_REST, SLACK = 0, 1, 2  # Phases of a trajectory; a convention of this file
 
-ACCEPTED, REFUSED, STOPPED = 0, 1, 2
-"""Outcomes of a step (`_judge_step`); a convention of this file."""
+ACCEPTED, REFUSED, STOPPED = 0, 1, 2  # Outcomes of a step (`_judge_step`); a convention of this file
 
 
 @merged
 def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
-    """Follow one trajectory from rest at time 0.
-
-    Parameters
-    ----------
-    times : array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it
-        stays at `stop`, with zero speed and acceleration.
-    breakpoints : array, increasing, padded with infinity: values of x at which the slope of a force changes abruptly,
-        such as where the film's mass reaches its floor, m. A step ends at each, since no step is accurate across it.
-    stop : tail travel at the end of growth, m; infinite for a body that moves as a whole.
-    rtol : local tolerance on the speed, relative.
-    out : array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
-        reports; while a tail is slack, r times those of the leading edge.
-    work : array (7, 4) for `follow_slack`.
-
-    Returns
-    -------
-    (status, end_time, end_speed, n_steps, slack_time)
-        `end_time` is the time at which growth ended, the vine last stalled, or the integration of a TOO_HARD trajectory
-        was given up, NaN otherwise; `slack_time` is the time at which the tail first went slack, NaN if it did not or
-        may not.
-    """
+    """Follow one trajectory from rest at time 0."""
     count = times.size
     point = Point(0.0, 0.0, 0.0, 0.0, equations.first_chamber(trial))
     row = _write_at_rest(equations, trial, times, 0, 0.0, point, out)
@@ -195,23 +165,7 @@ def integrate_trials(
     work,
     means,
 ):
-    """Integrate many trials, and apply the readout of the camera: `_integrate`, `read_by_rows`, `average_over`.
-
-    Parameters
-    ----------
-    equations : the compiled functions of the model.
-    starts, times : trial i has times[starts[i]:starts[i + 1]], s since release; shapes (n_trials + 1,) and (n_times,).
-    on, inputs, thetas : which effects act, fields of `TrialInputs` and parameters: one row per trial.
-    trace_starts, trace_time, trace_pressure : measured pressures, s and Pa, concatenated like the times.
-    bend_starts, bends : bends, concatenated: rows of start, arc and radius, m.
-    breakpoints, stops : as those of `_integrate`, m: shapes (n_trials, n_breakpoints), padded with infinity, and
-        (n_trials,).
-    rtol : local tolerance on the speed, relative.
-    out, ends : filled, shapes (n_times, 4) and (n_trials, 5): the latter status, end time, end speed, number of steps,
-        time of slack.
-    work : array (7, 4), overwritten.
-    means : array, overwritten, as long as the longest trial.
-    """
+    """Integrate many trials, and apply the readout of the camera: `_integrate`, `read_by_rows`, `average_over`."""
     for i in range(starts.size - 1):
         trace = slice(trace_starts[i], trace_starts[i + 1])
         trial = TrialArrays(
@@ -242,9 +196,8 @@ def integrate_trials(
 
 @compiled
 def _rates(equations, time, x, v, chamber, trial):
-    """`equations.rates` for callers outside the steps, compiled once instead of into each of them.
-
-    With `_rest_acceleration` this saves a tenth of the time to compile the whole catalogue.
+    """`equations.rates` for callers outside the steps, compiled once instead of into each of them. With
+    `_rest_acceleration` this saves a tenth of the time to compile the whole catalogue.
     """
     return equations.rates(time, x, v, chamber, trial)
 
@@ -329,9 +282,8 @@ def _cut_at_sample(h, time, sample, trial):
 
 @inlined
 def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale):
-    """Accept or reject a step, with the factor on its size for the next attempt.
-
-    STOPPED: the vine stops within the step, which by now is so short that the time is known.
+    """Accept or reject a step, with the factor on its size for the next attempt. STOPPED: the vine stops within the
+    step, which by now is so short that the time is known.
     """
     h = stages.h
     if not converged:
@@ -401,9 +353,8 @@ def _chamber_after(equations, trial, time, x, chamber, step):
 
 @compiled
 def _wait_for_drive(equations, trial, point, until):
-    """First time at which the drive moves a vine that rests at `point`, and the chamber pressure at that time.
-
-    The time is later than `until` if there is none. The chamber continues to fill meanwhile.
+    """First time at which the drive moves a vine that rests at `point`, and the chamber pressure at that time. The time
+    is later than `until` if there is none. The chamber continues to fill meanwhile.
     """
     time, x, _v, _acceleration, chamber = point
     steps = max(256, 2 * trial.trace_time.size)
@@ -429,7 +380,6 @@ def _wait_for_drive(equations, trial, point, until):
 @compiled
 def _resolvable_start(equations, trial, time, until, x, chamber, delay):
     """Time at which a drive that rises from zero at `time` starts a resolvable motion, and the chamber pressure then.
-
     That is a displacement by 10⁻⁹ of the travel. Before, the drive is a difference of large forces below their rounding
     error, and the vine is practically at rest.
     """

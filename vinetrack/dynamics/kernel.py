@@ -23,12 +23,11 @@ from vinetrack.core import constants
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
 
+# Files of the integrator, which are part of the compiled form of a model
 PARTS = (
     *("equations.py", "radau.py", "slack_tail.py", "between_frames.py", "row_readout.py", "time_average.py"),
     "integrator.py",
 )
-"""Files of the integrator, which are part of the compiled form of a model: a change in one of them requires
-recompilation."""
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
@@ -170,19 +169,8 @@ def _modules(effect: Effect) -> list[str]:
 
 
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
-    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
-
-    Mass that effects add moves with the tail but has no weight of its own, so it is added after the forces.
-
-    Parameters
-    ----------
-    effects : effects of the model, in its order.
-    tail_free : whether tails may go slack.
-
-    Returns
-    -------
-    str
-        The source; `kernel` writes it to a file and imports it, with the effects as `EFFECTS`. It contains no paths.
+    """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects. Mass that effects
+    add moves with the tail but has no weight of its own, so it is added after the forces.
     """
     writer = _Writer(effects)
     common_terms = [*writer.mass(), *writer.pressure(), *writer.forces()]
@@ -261,30 +249,12 @@ def _cache_folder() -> Path:
     raise OSError("No writable folder was found for the compiled model; set VINETRACK_CACHE to one.")
 
 
-_LOADED: dict[str, ModuleType] = {}
-"""Kernels of this process by their hash: effects with the same source at two places share one."""
+_LOADED: dict[str, ModuleType] = {}  # Kernels of this process by their hash
 
 
 @lru_cache(maxsize=64)
 def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
-    """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`.
-
-    Parameters
-    ----------
-    effects : effects of the model, in its order.
-    tail_free : whether tails may go slack; only then `vinetrack.dynamics.slack_tail` is compiled, which takes longer.
-
-    Returns
-    -------
-    module
-        With `integrate_many`, whose arguments are those of `vinetrack.dynamics.integrator.integrate_trials` after the
-        equations, and the functions of the model.
-
-    Raises
-    ------
-    OSError
-        If no folder is writable.
-    """
+    """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`."""
     import numba
 
     source = sum_source(effects, tail_free)

@@ -15,21 +15,11 @@ from vinetrack.core.notebook import html_table
 from vinetrack.core.records import Floats, Trial
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 
-Value = float | Mapping[str, float]
-"""A parameter's value: one number, or one for each vine or each day by name."""
+Value = float | Mapping[str, float]  # A parameter's value: one number, or one for each vine or each day by name
 
 
 def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]:
-    """Values as `Model.with_values` takes them: those of single vines become a mapping.
-
-    Parameters
-    ----------
-    numbers : key (`effect.parameter`), vine or day (blank for all) and value, SI, of each.
-
-    Returns
-    -------
-    dict
-    """
+    """Values as `Model.with_values` takes them: those of single vines become a mapping."""
     values: dict[str, Any] = {}
     for key, vine, value in numbers:
         if vine:
@@ -134,16 +124,7 @@ class Model:
         return replace(self, effects=(*self.effects, effect))
 
     def with_effects(self, effects: Iterable[Effect]) -> Model:
-        """The model with these effects added one after the other.
-
-        Parameters
-        ----------
-        effects : iterable of Effect
-
-        Returns
-        -------
-        Model
-        """
+        """The model with these effects added one after the other."""
         return replace(self, effects=(*self.effects, *effects))
 
     def __sub__(self, other: Effect | str) -> Model:
@@ -160,37 +141,12 @@ class Model:
         return iter(self.effects)
 
     def with_values(self, values: Mapping[str, Value]) -> Model:
-        """The same sum of effects with other parameter values.
-
-        Parameters
-        ----------
-        values : by `effect.parameter`, SI; parameters that are not named keep their values.
-
-        Returns
-        -------
-        Model
-            A new model.
-        """
+        """The same sum of effects with other parameter values."""
         return replace(self, values={**self.values, **values})
 
     def parameters_for(self, vine: str, day: str = "") -> Floats:
-        """Values of all parameters for the trials of one vine, and of one day.
-
-        Parameters
-        ----------
-        vine : name of the vine, for values that are given per vine.
-        day : name of the day, from `Trial.group`, for values that are given per day; without a value for this day the
-            parameter is at its `zero`.
-
-        Returns
-        -------
-        array, shape (n_parameters,)
-            SI, in the order of `parameter_names`.
-
-        Raises
-        ------
-        EffectError
-            If a value is given per vine and this vine is not among them.
+        """Values of all parameters for the trials of one vine, and of one day. Returns SI, in the order of
+        `parameter_names`. Shape (n_parameters,).
         """
         numbers = []
         for effect in self.effects:
@@ -206,22 +162,7 @@ class Model:
         return np.array(numbers)
 
     def parameters_of(self, trial: Trial) -> Floats:
-        """Values of all parameters for one trial: those of its vine and of its day.
-
-        Parameters
-        ----------
-        trial : Trial
-
-        Returns
-        -------
-        array, shape (n_parameters,)
-            As of `parameters_for`.
-
-        Raises
-        ------
-        EffectError
-            If a value is given per vine and that of the trial is not among them.
-        """
+        """Values of all parameters for one trial: those of its vine and of its day. Shape (n_parameters,)."""
         return self.parameters_for(trial.vine, trial.group("day"))
 
     def __repr__(self) -> str:
@@ -246,20 +187,9 @@ class Model:
 
 
 def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
-    """Which effects act.
-
-    An effect of size zero (every parameter at its `zero`) does not act, nor does one that an acting effect replaces: so
-    one compiled model serves all smaller models that it contains.
-
-    Parameters
-    ----------
-    model : the sum of effects.
-    parameters : shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`.
-
-    Returns
-    -------
-    array of bool, shape (n_trials, n_effects)
-        In the order of the effects.
+    """Which effects act. An effect of size zero (every parameter at its `zero`) does not act, nor does one that an
+    acting effect replaces: so one compiled model serves all smaller models that it contains. Shapes: parameters
+    (n_trials, n_parameters) → (n_trials, n_effects).
     """
     on = np.ones((len(parameters), len(model.effects)), dtype=bool)
     sized, begins = model.sized_effects
@@ -272,23 +202,9 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
-    """Parameters of a model, as parameters of a larger one that contains it.
-
-    Parameters
-    ----------
-    host : the larger model.
-    model : the smaller one.
-    parameters : shape (n_trials, n_parameters of the model), SI.
-
-    Returns
-    -------
-    array, shape (n_trials, n_parameters of the host)
-        Parameters that the model lacks are at their `zero`.
-
-    Raises
-    ------
-    EffectError
-        If the host lacks an effect of the model.
+    """Parameters of a model, as parameters of a larger one that contains it. Returns parameters that the model lacks
+    are at their `zero`. Shapes: parameters (n_trials, n_parameters of the model) → (n_trials, n_parameters of the
+    host).
     """
     lacking = [name for name in model.names if name not in host]
     if lacking:
@@ -299,18 +215,7 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
 
 
 def hook_functions(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
-    """The functions of a hook, in the order in which they are called.
-
-    Parameters
-    ----------
-    model : the sum of effects.
-    hook : one of `vinetrack.effects.HOOKS`.
-
-    Returns
-    -------
-    list of (int, callable, slice)
-        Index of the effect, its function, and where its parameters stand among those of the model.
-    """
+    """The functions of a hook, in the order in which they are called."""
     return model.hooks.get(hook, [])
 
 

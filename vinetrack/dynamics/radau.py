@@ -12,39 +12,27 @@ from typing import NamedTuple
 
 from vinetrack.dynamics.equations import Point, inlined
 
-SQRT6 = 6.0**0.5
-"""Derived: √6, which appears in the nodes."""
+SQRT6 = 6.0**0.5  # Derived: √6, which appears in the nodes
 
 C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
 A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
 A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
-A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9
-"""Nodes c and matrix A of the method; the third node is 1. Source: Hairer & Wanner, table IV.5.6."""
+A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9  # Nodes c and matrix A of the method; the third node is 1
 
-S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))
-"""Derivative at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of
-its Lagrange polynomials at 1. It avoids the cancellation that f(v) suffers from in stiff problems."""
+S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))  # Derivative at the end of a step of the cubic through (0, 0), (C1, z1),
 S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
-S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)
-"""Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of its
-Lagrange polynomials at 1. It is free of the cancellation that f(v) suffers when stiff."""
+S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)  # Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2),
 
 MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)  # source: below
+# The real eigenvalue of A⁻¹ and the weights of the estimate of the local error
 E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
-"""The real eigenvalue of A⁻¹ and the weights of the estimate of the local error. Source: Hairer & Wanner, IV.8."""
 
-MOST_NEWTON_ITERATIONS = 9
-"""Newton iterations before a step is given up; chosen near the 7 of RADAU5. At half, more steps are cut to a quarter
-and repeated; at twice, steps that fail cost twice as much. The result depends on neither: a step counts only once it
-has converged."""
+MOST_NEWTON_ITERATIONS = 9  # Newton iterations before a step is given up; chosen near the 7 of RADAU5
 
-NEWTON_TOLERANCE = 1e-2
-"""Change of the speeds at which the iterations stop, relative to the tolerance of a step; chosen as in RADAU5 (κ
-between 10⁻¹ and 10⁻²), so that the remaining iteration error is small compared with the error of the method."""
+NEWTON_TOLERANCE = 1e-2  # Change of the speeds at which the iterations stop, relative to the tolerance of a step
 
+# Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen
 FAST_CONTRACTION = 0.1
-"""Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen; RADAU5 keeps it from
-step to step below 10⁻³. At half it is evaluated more often, at twice the iterations converge more slowly."""
 
 
 class Stages(NamedTuple):
@@ -56,8 +44,7 @@ class Stages(NamedTuple):
     z3: float
 
 
-NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)
-"""For a step without a previous one: after a start and after a rejected step."""
+NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)  # For a step without a previous one: after a start and after a rejected step
 
 
 @inlined
@@ -83,21 +70,9 @@ def _speed_derivative(equations, trial, time, x, v, chamber, acceleration, scale
 
 @inlined
 def starting_values(point, h, previous):
-    """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated.
-
-    Without a previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the
-    speed at the start.
-
-    Parameters
-    ----------
-    point : the `Point` from which the step starts.
-    h : size of the step, s.
-    previous : the `Stages` of the last accepted step, or `NO_STAGES`.
-
-    Returns
-    -------
-    Stages
-        Size of the step and increments of speed at its three stages, m/s.
+    """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated. Without a
+    previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the speed at
+    the start.
     """
     lowest = -0.9 * point.v
     if previous.h > 0:
@@ -150,21 +125,7 @@ def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
 
 @inlined
 def radau_step(equations, trial, point, stages, scale, rtol):
-    """One step from `point`, with the size and the starting values in `stages`.
-
-    Parameters
-    ----------
-    equations, trial : the model, and the `TrialArrays` of the trial.
-    point : where the step begins.
-    stages : size of the step, s, and starting values of the three increments of speed, m/s.
-    scale : speed that the motion reaches, m/s; with `rtol` it sets the tolerance.
-    rtol : tolerance relative to that speed.
-
-    Returns
-    -------
-    (converged, error, end, stages)
-        `error` in units of the tolerance, `end` the `Point` at the end of the step, `stages` the increments of speed.
-    """
+    """One step from `point`, with the size and the starting values in `stages`."""
     time, x, v, _acceleration, chamber = point
     h, z1, z2, z3 = stages
     j1 = j2 = j3 = 0.0
@@ -224,9 +185,8 @@ def radau_step(equations, trial, point, stages, scale, rtol):
 
 @inlined
 def _local_error(point, stages, scale, rtol):
-    """Hairer's estimate of the local error of the speed, in units of the tolerance.
-
-    Hairer filters it with (μ/h − J)⁻¹. This is omitted: the filter hides the error of a long stiff step at its far end.
+    """Hairer's estimate of the local error of the speed, in units of the tolerance. Hairer filters it with (μ/h − J)⁻¹.
+    This is omitted: the filter hides the error of a long stiff step at its far end.
     """
     h, z1, z2, z3 = stages
     raw = (h * point.acceleration + E1 * z1 + E2 * z2 + E3 * z3) / MU
@@ -246,19 +206,7 @@ def _end_of_step(point, stages, chamber):
 
 @inlined
 def quintic(s, h, start, end):
-    """Motion within a step: the Hermite polynomial of degree 5 through position, speed and acceleration.
-
-    Parameters
-    ----------
-    s : fraction of the step.
-    h : size of the step, s.
-    start, end : the `Point` at either end.
-
-    Returns
-    -------
-    (x, v, a)
-        Position, speed and acceleration of the tail, SI.
-    """
+    """Motion within a step: the Hermite polynomial of degree 5 through position, speed and acceleration."""
     d = end.x - start.x - h * start.v - 0.5 * h * h * start.acceleration
     e = h * (end.v - start.v - h * start.acceleration)
     f = h * h * (end.acceleration - start.acceleration)

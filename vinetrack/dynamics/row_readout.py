@@ -7,30 +7,16 @@ growth s·y is negligible, and rows are read at their stamps.
 from vinetrack.dynamics.between_frames import motion_at
 from vinetrack.dynamics.equations import compiled
 
-STEEPEST = 0.1
-"""Least 1 − s·ẏ by which Newton's method divides. Chosen: an edge that keeps up with the readout within 10 % is smeared
-over the picture and gives no track; between 0.05 and 0.2 only the number of iterations changes."""
+STEEPEST = 0.1  # Least 1 − s·ẏ by which Newton's method divides (chosen)
 
-TURNS = 8
-"""Maximum number of Newton iterations. Derived: the error is squared by each; from 10 % four reach rounding, and a
-first guess before the release costs two or three more."""
+TURNS = 8  # Maximum number of Newton iterations (derived)
 
-SETTLED_S = 1e-10
-"""Step that ends the iterations, s. Derived: at 100 m/s it is 10 nm."""
+SETTLED_S = 1e-10  # Step that ends the iterations, s (derived)
 
 
 @compiled
 def read_by_rows(times, out, ratio, end, delay):
-    """Replace the positions recorded by an instantaneous shutter by those recorded row by row.
-
-    Parameters
-    ----------
-    times : array (n_times,), s since release, increasing.
-    out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m, which is replaced.
-    ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite if it does not.
-    delay : s, s/m, not 0.
-    """
+    """Replace the positions recorded by an instantaneous shutter by those recorded row by row."""
     # Positions that are still needed must not be replaced yet: later ones at a positive delay, else earlier ones.
     count = times.size
     for step in range(count):

@@ -22,12 +22,8 @@ ENDED, TOO_HARD = STATUS.index("ended"), STATUS.index("too hard")
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Motion of one trial since release; arrays have shape (n_times,), SI.
-
-    `observed_position_m` is the lead position as the camera reports it, which differs if the model has measurement
-    effects. `status`: `ended` (all film everted before the last requested time), `stalled` permanently before,
-    `running`. `end_time_s` is the time at which growth ended (or last stalled), NaN if it did not; `slack_from_s` the
-    time at which the tail of a trial with `tail_slack: free` first went slack.
+    """Motion of one trial since release; arrays have shape (n_times,), SI. `observed_position_m` is the lead position
+    as the camera reports it, which differs if the model has measurement effects.
     """
 
     time_s: Floats
@@ -100,19 +96,8 @@ def simulate_many(
     host: Model | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> list[Trajectory]:
-    """Simulate many trials in one call of the compiled kernel, see `simulate`.
-
-    Parameters
-    ----------
-    model, trials, times_s, traces, relative_tolerance : as those of `simulate`, lists with an entry for each trial
-    parameters : shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`: values by trial in place
-        of those of the model.
-    host : a larger model whose compiled form serves this one; its other effects do not act
-
-    Returns
-    -------
-    list of Trajectory
-        One for each trial.
+    """Simulate many trials in one call of the compiled kernel, see `simulate`. Shapes: parameters (n_trials,
+    n_parameters).
     """
     batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
     out, ends = batch.run(relative_tolerance)
@@ -121,19 +106,7 @@ def simulate_many(
 
 
 def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float]) -> list[Trajectory]:
-    """The trajectories of a batch that was run.
-
-    Parameters
-    ----------
-    batch : as `prepare` or `lay_out` return it
-    out, ends : as `Batch.run` returns them
-    ratios : travel ratio of each trial
-
-    Returns
-    -------
-    list of Trajectory
-        One per trial.
-    """
+    """The trajectories of a batch that was run."""
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
     return [
@@ -143,19 +116,7 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
 
 
 def check_completed(ends: Floats, names: Sequence[str]) -> None:
-    """Raise an error for a trial that the integrator could not complete.
-
-    Parameters
-    ----------
-    ends : array, shape (n_trials, 5)
-        As `Batch.run` returns them.
-    names : of the trials.
-
-    Raises
-    ------
-    SimulationError
-        For the first of them.
-    """
+    """Raise an error for a trial that the integrator could not complete. Shapes: ends (n_trials, 5)."""
     failed = np.flatnonzero(ends[:, 0] == TOO_HARD)
     if failed.size:
         end_s = float(ends[failed[0], 1])
@@ -171,22 +132,7 @@ def prepare(
     parameters: Floats | None = None,
     host: Model | None = None,
 ) -> Batch:
-    """Lay out trials for the compiled kernel.
-
-    Parameters
-    ----------
-    model, trials, times_s, traces, parameters, host : as those of `simulate_many`
-
-    Returns
-    -------
-    Batch
-        Ready to be run, as often as needed.
-
-    Raises
-    ------
-    EffectError
-        If a trial lacks a value that an effect needs, or the host does not contain the model.
-    """
+    """Lay out trials for the compiled kernel."""
     check_needs(model, *trials)
     inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
         len(trials), len(TrialInputs._fields)
@@ -202,17 +148,7 @@ def prepare(
 
 
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
-    """The bends of a trial as numbers.
-
-    Parameters
-    ----------
-    trial : the vine and its settings
-
-    Returns
-    -------
-    list of (start, arc, radius)
-        m, one for each bend.
-    """
+    """The bends of a trial as numbers."""
     return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
 
 

@@ -15,12 +15,10 @@ from vinetrack.dynamics.equations import ENDED, RUNNING, TAUT, TOO_HARD, Point, 
 from vinetrack.dynamics.radau import quintic
 from vinetrack.effects import TrialInputs
 
-MOST_STEPS = 20_000
-"""Maximum number of steps of a slack phase, chosen as in `vinetrack.dynamics.integrator`; half and twice only change
-the time that a failing one takes."""
+MOST_STEPS = 20_000  # Maximum number of steps of a slack phase, chosen as in `vinetrack.dynamics.integrator`
 
+# Indices in the inputs of a trial: derived from the order of the fields
 FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")
-"""Indices in the inputs of a trial: derived from the order of the fields."""
 
 # Source: Dormand & Prince, as below.
 NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
@@ -34,11 +32,11 @@ WEIGHTS = (
 )
 # Source: the same.
 ERROR_WEIGHTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+# The method of Dormand & Prince
 DENSE_WEIGHTS = (
     -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
     701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
 )  # fmt: skip
-"""The method of Dormand & Prince. Source: as above; the dense output is that of the program DOPRI5 given there."""
 
 
 class SlackState(NamedTuple):
@@ -58,18 +56,7 @@ def _tip_tension(equations, time, x, v, chamber, resting, trial):
 
 @compiled
 def slack_at_rest(equations, trial, time, x, chamber):
-    """Whether the tail of a vine at rest would be under compression.
-
-    Parameters
-    ----------
-    equations, trial : the compiled functions of the model, and the arrays of the trial.
-    time, x, chamber : time since release, s; position of the tail, m; gauge pressure of the chamber, Pa.
-
-    Returns
-    -------
-    bool
-        False for every trial whose tail may not go slack.
-    """
+    """Whether the tail of a vine at rest would be under compression."""
     if trial.inputs[FREE] <= 0:
         return False
     tension, _rate = _tip_tension(equations, time, x, 0.0, chamber, True, trial)
@@ -78,19 +65,7 @@ def slack_at_rest(equations, trial, time, x, chamber):
 
 @compiled
 def slack_fraction(equations, trial, h, start, end):
-    """Fraction of a step at which the tail's tension falls to zero, by bisection.
-
-    Parameters
-    ----------
-    equations, trial : the compiled functions of the model, and the arrays of the trial.
-    h : size of the step, s.
-    start, end : the `Point` at either end.
-
-    Returns
-    -------
-    float
-        2 where the tail is taut at the end.
-    """
+    """Fraction of a step at which the tail's tension falls to zero, by bisection."""
     if trial.inputs[FREE] <= 0:
         return 2.0
     tension, _rate = _tip_tension(equations, end.time, end.x, end.v, end.chamber, False, trial)
@@ -244,23 +219,7 @@ def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, 
 
 @compiled
 def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
-    """Integrate a slack phase until the tail is taut again, growth ends or the last time is reached.
-
-    Parameters
-    ----------
-    equations, trial : the compiled functions of the model, and the arrays of the trial.
-    times, row, out : as those of the integrator; rows of `out` are filled from `row` on with r·y, r·ẏ and r·ÿ of the
-        tip.
-    start : the `Point` at which the tail goes slack.
-    stop : tail travel r·L at the end of growth, m.
-    rtol : local tolerance, relative.
-    k : array (7, 4) for the rates at the stages of a step.
-
-    Returns
-    -------
-    (status, row, point, tip_speed)
-        `status` TAUT, RUNNING (all times filled), ENDED or TOO_HARD; `tip_speed` is r·ẏ there, m/s.
-    """
+    """Integrate a slack phase until the tail is taut again, growth ends or the last time is reached."""
     time, until = start.time, times[times.size - 1]
     r = trial.inputs[RATIO]
     s = SlackState(start.x, start.v, start.x / r, start.chamber)

@@ -5,24 +5,13 @@ import math
 from vinetrack.dynamics.between_frames import motion_at
 from vinetrack.dynamics.equations import compiled
 
+# Gauss–Legendre quadrature with three nodes, and its weights (derived)
 NODE, WEIGHT, MIDDLE_WEIGHT = math.sqrt(0.6), 5 / 18, 4 / 9
-"""Gauss–Legendre quadrature with three nodes, and its weights. Derived: exact for polynomials of degree 5, which the
-motion between two frames is."""
 
 
 @compiled
 def average_over(times, out, means, ratio, end, square):
-    """Replace instantaneous positions by their means over the time around each.
-
-    Parameters
-    ----------
-    times : array (n_times,), s since release, increasing.
-    out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m, which is replaced.
-    means : array (n_times,), overwritten.
-    ratio : travel ratio r, x = r·y.
-    end : the `Point` at which growth ends; its time is infinite if it does not.
-    square : T², s², above 0.
-    """
+    """Replace instantaneous positions by their means over the time around each."""
     half = 0.5 * math.sqrt(square)
     for i in range(times.size):
         first, last = times[i] - half, times[i] + half

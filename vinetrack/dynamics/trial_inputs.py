@@ -14,17 +14,7 @@ from vinetrack.experiment.schema import COLUMNS
 
 
 def trial_inputs(trial: Trial) -> TrialInputs:
-    """The inputs of effects for a trial.
-
-    Parameters
-    ----------
-    trial : the vine and its settings; for a body that moves as a whole, blanks count as zero.
-
-    Returns
-    -------
-    TrialInputs
-        SI; NaN where the sheet is blank.
-    """
+    """The inputs of effects for a trial."""
     whole_body = trial.travel_ratio == 1
     length = trial.length_m if math.isfinite(trial.length_m) else 0.0
     area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
@@ -59,17 +49,8 @@ def trial_inputs(trial: Trial) -> TrialInputs:
 
 
 def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
-    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly.
-
-    Parameters
-    ----------
-    inputs : rows of `TrialInputs`, shape (n_trials, n_fields), SI.
-    set_pressure_Pa, yield_pressure_Pa : shape (n_trials,); NaN keeps the yield pressure of the row.
-
-    Returns
-    -------
-    array, shape (n_trials, n_fields)
-        A changed copy.
+    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly. Returns A changed copy.
+    Shapes: inputs (n_trials, n_fields); set_pressure_Pa, yield_pressure_Pa (n_trials,) → (n_trials, n_fields).
     """
     place = {name: k for k, name in enumerate(TrialInputs._fields)}
     changed = inputs.copy()
@@ -88,35 +69,13 @@ def _of_trial(column: str, trial: Trial) -> object:
 
 
 def stated(column: str, trial: Trial) -> bool:
-    """Whether the sheet gives a trial a value other than zero in this column.
-
-    Parameters
-    ----------
-    column : name of a column of the sheet.
-    trial : the trial as read from it.
-
-    Returns
-    -------
-    bool
-        True also if the column holds something other than a number.
-    """
+    """Whether the sheet gives a trial a value other than zero in this column."""
     value = _of_trial(column, trial)
     return not isinstance(value, float) or (math.isfinite(value) and value != 0)
 
 
 def check_needs(model: Model, *trials: Trial) -> None:
-    """Raise an error for a trial without a value that an effect of the model needs.
-
-    Parameters
-    ----------
-    model : the sum of effects.
-    *trials : trials it is to be used on.
-
-    Raises
-    ------
-    EffectError
-        Naming the effect, the column and the trial.
-    """
+    """Raise an error for a trial without a value that an effect of the model needs."""
     needs = [(effect, column) for effect in model for column in effect.needs]
     for trial in trials:
         for effect, column in needs:

@@ -1,7 +1,7 @@
 """The catalogue of physical and measurement effects, one file each.
 
-`vinetrack.effects.gravity` is the effect of that name; `catalogue()` all of them; `load_effect(path)` one of
-a user's own, `own_effects(paths)` all of them, tried out.
+`vinetrack.effects.gravity` is the effect of that name; `catalogue()` all of them; `load_effect(path)` one of a user's
+own, `own_effects(paths)` all of them, tried out.
 """
 
 from __future__ import annotations

@@ -32,24 +32,16 @@ class EffectError(UserError, ValueError):
     """A file that is not a valid effect, or a name that is not in the catalogue; the message gives the remedy."""
 
 
+# Executed effect files, by path and module name, so that each path keeps its own functions
 _MODULES: dict[tuple[Path, str], ModuleType] = {}
-"""Executed effect files, by path and module name, so that each path keeps its own functions."""
 
+# Modules that an effect may import without depending on the location of its file
 _PLAIN_MODULES = frozenset(("__future__", "math", "numpy", "vinetrack"))
-"""Modules that an effect may import without depending on the location of its file."""
 
 
 def _load_module(path: Path) -> ModuleType:
-    """Execute one effect file and return it as a module.
-
-    It is registered in `sys.modules`, where the compiled form of a model looks for it, under a name derived from its
-    text, and from its path where it may depend on that. Files of the same text share compiled code, as do copies of the
-    package.
-
-    Raises
-    ------
-    EffectError
-        If the file cannot be run.
+    """Execute one effect file and return it as a module. It is registered in `sys.modules`, where the compiled form of
+    a model looks for it, under a name derived from its text, and from its path where it may depend on that.
     """
     whole, text, package = path.resolve(), path.read_bytes(), Path(__file__).resolve().parents[1]
     if whole.is_relative_to(package):
@@ -92,27 +84,7 @@ def _is_independent_of_path(text: bytes) -> bool:
 
 
 def load_effect(path: Path | str) -> Effect:
-    """Read one effect from its file; its name is the file's.
-
-    Parameters
-    ----------
-    path : a Python file like those of the catalogue.
-
-    Returns
-    -------
-    the effect.
-
-    Raises
-    ------
-    EffectError
-        If the file does not follow the contract of `Effect`; the message names what is missing.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
-    'air_drag'
-    """
+    """Read one effect from its file; its name is the file's."""
     path = Path(path)
     try:
         file_size(path)
@@ -159,9 +131,8 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
 
 
 def _breakpoints(module: ModuleType) -> Any:
-    """The function `breakpoints` of rig and parameters in an effect's file, also under its former name `corners`.
-
-    A function of the rig alone does not depend on parameters.
+    """The function `breakpoints` of rig and parameters in an effect's file, also under its former name `corners`. A
+    function of the rig alone does not depend on parameters.
     """
     if hasattr(module, "corners") and not hasattr(module, "breakpoints"):
         warnings.warn(f"{module.__file__}: `corners` is now called `breakpoints`", FutureWarning, stacklevel=3)
@@ -214,43 +185,14 @@ def _is_range(pair: Any) -> bool:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Return every effect of vinetrack by name: base effects first, then alphabetical.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.catalogue()["air_drag"].kind
-    'physical'
-    """
+    """Return every effect of vinetrack by name: base effects first, then alphabetical."""
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
 
 
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
-    """Return the effect of this name, from the user's own effects or else from the catalogue.
-
-    Parameters
-    ----------
-    name : of an effect.
-    user_effects : effects by name, from `own_effects`.
-
-    Returns
-    -------
-    the effect.
-
-    Raises
-    ------
-    EffectError
-        If there is none; the message suggests the nearest name.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.effects.find_effect("air_drg")
-    Traceback (most recent call last):
-    vinetrack.effects._catalogue.EffectError: ...
-    """
+    """Return the effect of this name, from the user's own effects or else from the catalogue."""
     known = {**catalogue(), **(user_effects or {})}
     if name in known:
         return known[name]
@@ -263,17 +205,7 @@ _HEAD = ("name", "kind", "parameters")
 
 
 def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None = None) -> list[str]:
-    """Return lines with name, kind and parameters of each effect, and its formula below; base effects first.
-
-    Parameters
-    ----------
-    effects : those to be listed.
-    user_effects : by name; those among `effects` are marked as own.
-
-    Returns
-    -------
-    lines for the terminal.
-    """
+    """Return lines with name, kind and parameters of each effect, and its formula below; base effects first."""
     of_user = set((user_effects or {}).values())
     effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
     entries = []
@@ -288,15 +220,8 @@ def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None
 
 
 def explanation(effect: Effect) -> list[str]:
-    """Return lines that describe one effect: the text of its file, its parameters and its relations to other effects.
-
-    Parameters
-    ----------
-    effect : of the catalogue, or a user's own.
-
-    Returns
-    -------
-    lines for the terminal.
+    """Return lines that describe one effect: the text of its file, its parameters and its relations to
+    other effects.
     """
     lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
     if effect.parameters:
@@ -314,30 +239,12 @@ def explanation(effect: Effect) -> list[str]:
 
 
 def remedy(effect: Effect) -> str:
-    """Return how to reduce or measure an effect, as stated in its file, in one line; blank where it is not stated.
-
-    Parameters
-    ----------
-    effect : of the catalogue, or a user's own.
-
-    Returns
-    -------
-    one line, or blank.
-    """
+    """Return how to reduce or measure an effect, as stated in its file, in one line; blank where it is not stated."""
     return _paragraph(effect, ("Reduce it", "It cannot be reduced", "Measure it"))
 
 
 def told_apart(effect: Effect) -> str:
-    """Return which effects it is easily taken for and how to distinguish them, as stated in its file; blank if not.
-
-    Parameters
-    ----------
-    effect : of the catalogue, or a user's own.
-
-    Returns
-    -------
-    one line, or blank.
-    """
+    """Return which effects it is easily taken for and how to distinguish them, as stated in its file; blank if not."""
     return _paragraph(effect, ("Easily taken for",))
 
 

@@ -9,34 +9,19 @@ import os
 import sys
 from pathlib import Path
 
-CATALOGUE = Path(__file__).resolve().parents[1]
-"""Files below this folder belong to the package and are not announced."""
+CATALOGUE = Path(__file__).resolve().parents[1]  # Files below this folder belong to the package and are not announced
+# Environment variable; with the value `known`, own effects that never ran here are refused
 POLICY = "VINETRACK_OWN_EFFECTS"
-"""Environment variable; with the value `known`, own effects that never ran here are refused."""
 
 
 def memory_file() -> Path:
-    """Return the file that lists the user's effects that have run.
-
-    Returns
-    -------
-    path, in the folder of the system for the state of programs.
-    """
+    """Return the file that lists the user's effects that have run."""
     state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(state) / "vinetrack" / "own_effects.json"
 
 
 def first_run(path: Path) -> str:
-    """Announce an own effect that has not run before on standard error, and remember it.
-
-    Parameters
-    ----------
-    path : of the effect's file.
-
-    Returns
-    -------
-    why it must not run; blank where it may.
-    """
+    """Announce an own effect that has not run before on standard error, and remember it."""
     path = path.resolve()
     if path.is_relative_to(CATALOGUE) or not path.is_file():
         return ""
@@ -52,12 +37,7 @@ def first_run(path: Path) -> str:
 
 
 def remember(path: Path) -> None:
-    """Remember an own effect as known, because it was announced or written by this program.
-
-    Parameters
-    ----------
-    path : of the effect's file.
-    """
+    """Remember an own effect as known, because it was announced or written by this program."""
     from vinetrack.core.tables import write_json
 
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

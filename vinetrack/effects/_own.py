@@ -51,6 +51,7 @@ _RIG = TrialInputs(
     tail_free=0.0,
 )
 
+# Values that functions must return in the state above where their effect vanishes
 UNCHANGED = {
     "true_time": _STATE.time,
     "trace_time": _STATE.time,
@@ -69,31 +70,10 @@ UNCHANGED = {
     "row_delay": 0.0,
     "averaged_over": 0.0,
 }
-"""Values that functions must return in the state above where their effect vanishes."""
 
 
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
-    """Read and check a user's effects.
-
-    Parameters
-    ----------
-    paths : files, one for each effect.
-
-    Returns
-    -------
-    effects by name.
-
-    Raises
-    ------
-    EffectError
-        If a file is not an effect, two have the same name, or one fails its checks; one sentence.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> dict(vt.effects.own_effects([]))
-    {}
-    """
+    """Read and check a user's effects."""
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):
         effect = load_effect(path)
@@ -107,17 +87,8 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
 
 
 def behaviour_faults(effect: Effect) -> Iterator[str]:
-    """Check an effect against its file: compilation, worked numbers, and that it vanishes at `zero`.
-
-    Functions are evaluated in motion, where every effect can act.
-
-    Parameters
-    ----------
-    effect : read from its file.
-
-    Yields
-    ------
-    one sentence for each fault, without full stop.
+    """Check an effect against its file: compilation, worked numbers, and that it vanishes at `zero`. Functions are
+    evaluated in motion, where every effect can act.
     """
     for hook in effect.functions:
         yield from _compile_faults(effect, hook)
@@ -132,13 +103,7 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
 
 
 def _worked_value(effect: Effect, worked: Worked) -> float:
-    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN.
-
-    Raises
-    ------
-    KeyError
-        If the worked number names no function of the effect, or lacks one of its parameters.
-    """
+    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN."""
     state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
     rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
     arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
@@ -155,8 +120,8 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
         yield f"{worked.hook} gives {value:.6g} where worked out by hand it is {worked.expected:.6g} ({worked.how})"
 
 
+# Faults found in compiling a function in this process, by the text of its file and its name
 _COMPILED: dict[tuple[bytes, str], tuple[str, ...]] = {}
-"""Faults found in compiling a function in this process, by the text of its file and its name."""
 
 
 def _compile_faults(effect: Effect, hook: str) -> tuple[str, ...]:

@@ -17,14 +17,8 @@ from vinetrack.experiment.column import Column
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 
-SHORTEST_AXIS_PX = 10
-"""Chosen: the direction of a shorter axis is too uncertain. An error of half a pixel at each end, as of points picked
-by hand, turns an axis of this length by 4 degrees; at half the length by 8, at twice by 2, but growth over 15 px would
-then be refused."""
-SMALLEST_POINT_SPACING_PX = 2
-"""Smallest distance between neighbouring points of a curved path. Chosen: points picked by hand are off by half a
-pixel, so that closer ones do not define a direction. At half, a double click makes a kink; at twice, densely sampled
-curves from other programs are refused."""
+SHORTEST_AXIS_PX = 10  # Chosen: the direction of a shorter axis is too uncertain
+SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points of a curved path (chosen)
 
 TRUTH_WORDS = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
@@ -38,34 +32,7 @@ class CellError(ValueError):
 
 
 def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
-    """Return the value of a non-blank cell, in the unit of its column.
-
-    Parameters
-    ----------
-    column : declaration of the column.
-    text : the cell, stripped.
-    decimal : decimal mark of the file.
-
-    Returns
-    -------
-    a number, a pair, bends in metres, a truth value or text, depending on the kind of the column.
-
-    Raises
-    ------
-    CellError
-        If the column does not allow it.
-
-    Examples
-    --------
-    >>> from vinetrack.experiment.schema import COLUMNS
-    >>> read_cell(COLUMNS["pressure_kPa"], "28"), read_cell(COLUMNS["steady"], "0.05:0.2")
-    (28.0, (0.05, 0.2))
-    >>> try:
-    ...     read_cell(COLUMNS["pressure_kPa"], "24000")
-    ... except CellError as error:
-    ...     print(error.message, "|", error.remedy)
-    is above 1000 kPa | looks like Pa: 24000 Pa is 24 kPa
-    """
+    """Return the value of a non-blank cell, in the unit of its column."""
     if column.kind == "yes_no":
         if text.lower() not in TRUTH_WORDS:
             raise CellError("is neither yes nor no", "yes or no")
@@ -84,21 +51,8 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
 
 
 def read_range(column: Column, value: Any) -> tuple[float, float]:
-    """Read the two ends of a range, `low:high` or two numbers, each checked like a cell of the column.
-
-    Parameters
-    ----------
-    column : declaration of the column that the range limits.
-    value : as the settings state it.
-
-    Returns
-    -------
-    low and high, in the unit of the column.
-
-    Raises
-    ------
-    ValueError
-        If it is not a range, or the column does not allow an end of it.
+    """Read the two ends of a range, `low:high` or two numbers, each checked like a cell of the column. Returns low and
+    high, in the unit of the column.
     """
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
@@ -110,59 +64,20 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
 
 
 def interior_values(low: float, high: float) -> list[float]:
-    """Return three values between two others, in geometric steps where `low` is positive, else in equal steps.
-
-    Parameters
-    ----------
-    low, high : in the same unit.
-
-    Returns
-    -------
-    three values, in that unit.
-    """
+    """Return three values between two others, in geometric steps where `low` is positive, else in equal steps."""
     parts = (0.25, 0.5, 0.75)
     return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
 
 
 def read_limit(column: Column, value: Any) -> float:
-    """Read one number of `limits`, checked like a cell of the column.
-
-    Parameters
-    ----------
-    column : declaration of the column that the value limits.
-    value : as the settings state it.
-
-    Returns
-    -------
-    the number, in the unit of the column.
-
-    Raises
-    ------
-    ValueError
-        If it is not a number, or the column does not allow it.
-    """
+    """Read one number of `limits`, checked like a cell of the column."""
     if isinstance(value, bool | list | tuple | dict):
         raise ValueError("holds something that is not a number: write numbers only")
     return float(str(read_value(column, value)))
 
 
 def read_value(column: Column, value: Any) -> Any:
-    """Read a value of the settings like a cell of the sheet's column of the same name.
-
-    Parameters
-    ----------
-    column : declaration of the column.
-    value : as the settings state it.
-
-    Returns
-    -------
-    the value, in the unit of the column.
-
-    Raises
-    ------
-    ValueError
-        If the column does not allow it; the remedy follows a colon.
-    """
+    """Read a value of the settings like a cell of the sheet's column of the same name."""
     try:
         return read_cell(column, str(value).strip())
     except CellError as error:
@@ -184,17 +99,7 @@ def _check_number(column: Column, value: float) -> float:
 
 
 def unusual_value_hint(column: Column, value: float) -> str:
-    """Return the column's hint if an allowed value lies outside the usual range; zero is deliberate, hence usual.
-
-    Parameters
-    ----------
-    column : declaration of the column.
-    value : in the unit of the column.
-
-    Returns
-    -------
-    the hint, or blank.
-    """
+    """Return the column's hint if an allowed value lies outside the usual range; zero is deliberate, hence usual."""
     return "" if value == 0 or column.usual[0] <= value <= column.usual[1] else column.unusual_hint
 
 

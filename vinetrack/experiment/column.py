@@ -17,17 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of the trial sheet.
-
-    `field` is the field of `Trial` that holds the value, in SI where it is a number; `meaning` describes it, `measured`
-    says how to measure it, `default` what a blank cell stands for. `low` and `high` bound the value (`above_low`
-    excludes `low` itself). `slips` are units that users write by mistake. An allowed value outside `usual` gets the
-    warning `unusual_hint`. `unit_key` is given where the name does not end in the unit. `shared` columns may be set in
-    `experiment.yaml` for all trials. `limit` is the form in which `limits` of `experiment.yaml` constrains the column
-    in further trials: `range` or `choice`, blank where it cannot. `condition_part` is given for a column that defines a
-    condition: the form in which the condition's name contains the value where it differs within the experiment, such as
-    `inlet{}mm`. Trials that differ only in columns without it are replicates (sizes, pressure, yield pressure and
-    payload apart, which `vinetrack.experiment.naming` always compares).
+    """A column of the trial sheet. `field` is the field of `Trial` that holds the value, in SI where it is a number;
+    `meaning` describes it, `measured` says how to measure it, `default` what a blank cell stands for.
     """
 
     name: str
@@ -66,43 +57,16 @@ class Column:
         return f"{'above ' if self.above_low else ''}{self.low:g} to {self.high:g}{unit}"
 
     def in_words(self, value: float) -> str:
-        """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`.
-
-        Parameters
-        ----------
-        value : in the unit of the column.
-
-        Returns
-        -------
-        article, quantity, number and unit.
-        """
+        """Return a value as a phrase for a sentence: `a chamber of 3.7 litres`."""
         quantity = split_unit(self.name)[0].replace("_", " ")
         article = "an" if quantity[0] in "aeiou" else "a"
         return f"{article} {quantity} of {value:.3g} {self.unit}".rstrip()
 
     def to_si(self, value: float) -> float:
-        """Convert a value of this column to SI.
-
-        Parameters
-        ----------
-        value : in the unit of the column.
-
-        Returns
-        -------
-        the value in SI.
-        """
+        """Convert a value of this column to SI."""
         return self.scale.to_si(value) if self.scale else value
 
     def of_trial(self, trial: Trial) -> float:
-        """Return a trial's value of this column.
-
-        Parameters
-        ----------
-        trial : a trial, in SI.
-
-        Returns
-        -------
-        the value in the unit of the column; NaN if it has none.
-        """
+        """Return a trial's value of this column."""
         value = float(getattr(trial, self.field))
         return self.scale.from_si(value) if self.scale else value

@@ -22,15 +22,8 @@ CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
 
 
 def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
-    """Read the corrections of an experiment.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-
-    Returns
-    -------
-    corrections, problems : by name of trial, and what is wrong with the file; both empty if there is no file.
+    """Read the corrections of an experiment. Returns corrections, problems : by name of trial, and what is wrong with
+    the file; both empty if there is no file.
     """
     path = folder / CORRECTIONS_FILE
     if not os.path.lexists(path):
@@ -97,18 +90,7 @@ def _problem(table: Table, index: int, column: str, message: str, remedy: str) -
 def unmatched_corrections(
     corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]
 ) -> list[Problem]:
-    """Warn of corrections of a trial that is not in the sheet, or is not a recording.
-
-    Parameters
-    ----------
-    corrections : by name of trial.
-    names : names of all trials of the sheet.
-    filmed : names of the trials that are recordings.
-
-    Returns
-    -------
-    problems : warnings.
-    """
+    """Warn of corrections of a trial that is not in the sheet, or is not a recording."""
     in_sheet, recordings = set(names), set(filmed)
     return [
         Problem(
@@ -126,16 +108,7 @@ def unmatched_corrections(
 
 
 def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
-    """Return the content of `corrections.csv` for these corrections.
-
-    Parameters
-    ----------
-    corrections : by name of trial.
-
-    Returns
-    -------
-    CSV text, header first.
-    """
+    """Return the content of `corrections.csv` for these corrections."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CORRECTION_COLUMNS)

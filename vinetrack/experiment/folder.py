@@ -49,13 +49,8 @@ EXPECTED_FOLDER = (
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment: its settings and trials.
-
-    `trials` are the trials to analyse, in the order of the sheet; `failed` maps the name of every faulty trial to the
-    reason, and `left_out` that of every excluded one (`use: no`). `names` lists all three in the order of the sheet,
-    `lines` gives their lines in it. `problems` are all errors and warnings. `angle_blank` names the trials of vines
-    whose growth angle is not stated and is taken as straight down. `columns` are the columns of the sheet; a value of
-    any other column comes from the settings.
+    """An experiment: its settings and trials. `trials` are the trials to analyse, in the order of the sheet; `failed`
+    maps the name of every faulty trial to the reason, and `left_out` that of every excluded one (`use: no`).
     """
 
     name: str
@@ -84,21 +79,7 @@ class Experiment:
         return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
 
     def trial(self, name: str) -> Trial:
-        """Return the trial with this name.
-
-        Parameters
-        ----------
-        name : name of one of `trials`.
-
-        Returns
-        -------
-        the trial.
-
-        Raises
-        ------
-        KeyError
-            If there is no such trial.
-        """
+        """Return the trial with this name."""
         return {trial.name: trial for trial in self.trials}[name]
 
 
@@ -332,18 +313,7 @@ OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
 
 def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = None) -> list[Problem]:
-    """Find all problems of sheet, settings and tracks, and missing videos; this takes seconds.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-    open_videos : called with the experiment and its existing recordings, returns the problems of recordings and
-        calibration (see `vinetrack.video.survey`); None leaves recordings unopened.
-
-    Returns
-    -------
-    problems : those of the sheet first, in the order of its rows.
-    """
+    """Find all problems of sheet, settings and tracks, and missing videos; this takes seconds."""
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError as error:

@@ -16,19 +16,9 @@ from vinetrack.experiment.schema import COLUMNS
 
 
 def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """Return the trials with `vine` and `condition` filled in.
-
-    The name of a condition always contains pressure and payload, and other physical settings only if they differ within
-    the experiment (the yield pressure only if it differs within one vine). Settings that agree to six digits count as
-    equal.
-
-    Parameters
-    ----------
-    trials : all trials of an experiment.
-
-    Returns
-    -------
-    the trials, in the same order.
+    """Return the trials with `vine` and `condition` filled in. The name of a condition always contains pressure and
+    payload, and other physical settings only if they differ within the experiment (the yield pressure only if it
+    differs within one vine). Returns the trials, in the same order.
     """
     shown = [column for column in _OPTIONAL_PARTS if len({_part(column, trial) for trial in trials}) > 1]
     yields: dict[str, set[str]] = {}
@@ -75,7 +65,7 @@ def _part(column: Column, trial: Trial) -> str:
     return column.condition_part.format(value) if value else ""
 
 
+# Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last
 _OPTIONAL_PARTS = sorted(
     (column for column in COLUMNS.values() if column.condition_part), key=lambda column: column.kind == "bends"
 )
-"""Columns that a condition's name shows only if they differ within the experiment; bends, the longest part, last."""

@@ -15,19 +15,8 @@ from vinetrack.experiment.schema import COLUMNS, column_in_other_unit
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Convert columns in other units to the columns of the sheet.
-
-    Parameters
-    ----------
-    table : the sheet as written.
-    file : its name, for messages.
-
-    Returns
-    -------
-    table, problems
-        The table with those columns renamed and their numbers converted, and a warning for each. Cells that are not
-        numbers are left unchanged and refused when cells are read. If the sheet states a quantity in two units, the
-        column in the other unit is left unchanged and thereby ignored.
+    """Convert columns in other units to the columns of the sheet. Returns table, problems: The table with those columns
+    renamed and their numbers converted, and a warning for each.
     """
     problems: list[Problem] = []
     renamed: dict[str, tuple[Column, str]] = {}
@@ -66,18 +55,8 @@ def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
 
 
 def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[Problem]]:
-    """Convert keys in other units, such as `pressure_psi`, to the keys of the settings.
-
-    Parameters
-    ----------
-    document : `experiment.yaml` as written.
-    file : its name, for messages.
-
-    Returns
-    -------
-    document, problems
-        The document with those keys renamed and their numbers converted, and a warning for each. A value that is not a
-        number, and a quantity stated in two units, are left unchanged and refused when the settings are validated.
+    """Convert keys in other units, such as `pressure_psi`, to the keys of the settings. Returns document, problems: The
+    document with those keys renamed and their numbers converted, and a warning for each.
     """
     problems: list[Problem] = []
     if not isinstance(document.content, dict):
@@ -100,16 +79,7 @@ def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[
 
 
 def keys_in_other_units(path: Path) -> list[Problem]:
-    """Return the warnings of `in_key_units` for a settings file.
-
-    Parameters
-    ----------
-    path : `experiment.yaml`, which must be readable.
-
-    Returns
-    -------
-    warnings; none if there is no such file.
-    """
+    """Return the warnings of `in_key_units` for a settings file."""
     return in_key_units(read_yaml(path), path.name)[1] if path.exists() else []
 
 

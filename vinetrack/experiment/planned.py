@@ -28,11 +28,11 @@ from vinetrack.experiment.sheet import (
     unknown_columns,
 )
 
+# Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior
 REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
-"""Columns that a prediction needs; an unknown yield pressure is taken from the scaling prior."""
 
+# Columns about recordings: optional for a planned trial, and ignored
 _RECORDING_COLUMNS = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
-"""Columns about recordings: optional for a planned trial, and ignored."""
 
 Relocate = Callable[[Problem], Problem]
 
@@ -88,23 +88,8 @@ def planned_trial(
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
-    """Read the conditions of an experiment folder or of a single sheet, filmed or not.
-
-    Rows with the same nominal settings form one condition, represented by the first; rows with `use: no` are skipped.
-
-    Parameters
-    ----------
-    path : an experiment folder, or a sheet.
-    every_row : keep replicates: one trial per row.
-
-    Returns
-    -------
-    planned : one trial per condition, or per row, and warnings.
-
-    Raises
-    ------
-    ExperimentError
-        With every problem of the sheet.
+    """Read the conditions of an experiment folder or of a single sheet, filmed or not. Rows with the same nominal
+    settings form one condition, represented by the first; rows with `use: no` are skipped.
     """
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
@@ -127,13 +112,7 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
 
 
 def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
-    """Return warnings about unknown columns.
-
-    Raises
-    ------
-    ExperimentError
-        If neither sheet nor settings have a required column: reported once, not for every row.
-    """
+    """Return warnings about unknown columns."""
     unknown = unknown_columns(table, file)
     absent = [
         name

@@ -11,8 +11,7 @@ from typing import Any
 
 import vinetrack
 
-PROVENANCE = "provenance.json"
-"""Its presence marks a results folder."""
+PROVENANCE = "provenance.json"  # Its presence marks a results folder
 
 LIBRARIES = (
     "numpy",
@@ -30,18 +29,8 @@ LIBRARIES = (
 def describe_run(
     experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
 ) -> dict[str, Any]:
-    """Return the content of `provenance.json`.
-
-    Parameters
-    ----------
-    experiment : the experiment's folder.
-    inputs : every file that was read; files in the folder are listed by their relative path.
-    settings : settings of the run.
-    model : names of the effects in use.
-
-    Returns
-    -------
-    mapping of JSON types: versions, platform, SHA-256 of every input, model and settings.
+    """Return the content of `provenance.json`. Returns mapping of JSON types: versions, platform, SHA-256 of every
+    input, model and settings.
     """
     return {
         "vinetrack": vinetrack.__version__,

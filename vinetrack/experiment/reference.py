@@ -28,6 +28,7 @@ from vinetrack.experiment.settings import (
 
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
+# Allowed values of columns that are not bounded numbers, by kind
 _KIND_ALLOWED = {
     "text": "letters, digits, _ and -",
     "path": "a path inside the folder",
@@ -38,9 +39,9 @@ _KIND_ALLOWED = {
     "yes_no": "yes, no",
     "choice": "1, 2",
 }
-"""Allowed values of columns that are not bounded numbers, by kind."""
 
 
+# Groups of keys about the picture: key of the group, its kind, and the model that validates it
 _PICTURE_MODELS = (
     ("calibration", "charuco", Charuco),
     ("calibration", "checkerboard", Checkerboard),
@@ -48,8 +49,8 @@ _PICTURE_MODELS = (
     ("calibration", "mm_per_px", MmPerPx),
     ("axis", "", AxisSettings),
 )
-"""Groups of keys about the picture: key of the group, its kind, and the model that validates it."""
 
+# Meaning of each of those keys, and how to measure it
 _PICTURE_MEANINGS = {
     "image": ("Picture or clip of the target, in the plane of growth.", "Film it with the settings of the trials."),
     "squares": ("Squares across and down.", "Count them."),
@@ -66,11 +67,10 @@ _PICTURE_MEANINGS = {
     "mm_per_px": ("Scale of the picture.", "Length of a ruler in the plane of growth over its pixels."),
     "width_mm": ("Width of the strip along the axis that is tracked.", "About the diameter of the vine."),
 }
-"""Meaning of each of those keys, and how to measure it."""
 
-_PICTURE_DEFAULTS = {"via_px": "none: a straight line"}
-"""Defaults of optional keys; the others are found from the motion."""
+_PICTURE_DEFAULTS = {"via_px": "none: a straight line"}  # Defaults of optional keys
 
+# Introduction of the page
 _PAGE_HEAD = """# Every column and key
 
 Generated from the declarations that validate them: `vinetrack settings` prints the same, `vinetrack settings --json -`
@@ -79,7 +79,6 @@ prints it for a program, and `vinetrack settings --page docs/settings.md` writes
 `vinetrack check` reports the conversion. A blank cell means the default; a blank `growth_angle_deg` means straight
 down.
 """
-"""Introduction of the page."""
 
 
 @dataclass(frozen=True)
@@ -110,17 +109,7 @@ def column_entries() -> list[Entry]:
 
 
 def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]:
-    """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`.
-
-    Parameters
-    ----------
-    model : a settings model of `vinetrack.experiment.settings`.
-    prefix : prefix of the keys of a group, such as "limits.".
-
-    Yields
-    ------
-    one entry per key.
-    """
+    """Yield the entries of all keys of a settings model that are not columns; keys of a group as `group.key`."""
     columns = SHARED if model is ExperimentSettings else ()
     for name, field in model.model_fields.items():
         if name in columns:

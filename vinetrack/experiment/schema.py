@@ -17,6 +17,7 @@ from vinetrack.experiment.column import Column
 
 _BAR = "looks like bar: 1 bar is 100 kPa"
 
+# Every column of `trials.csv`, in the order of the documentation
 COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
@@ -326,29 +327,18 @@ COLUMNS: dict[str, Column] = {
         ),
     )
 }
-"""Every column of `trials.csv`, in the order of the documentation."""
 
+# Columns that `experiment.yaml` may set for all trials
 SHARED = tuple(name for name, column in COLUMNS.items() if column.shared)
-"""Columns that `experiment.yaml` may set for all trials."""
 
+# Columns that `limits` of `experiment.yaml` may constrain for further trials, by the form of the constraint
 LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) for kind in ("range", "choice")}
-"""Columns that `limits` of `experiment.yaml` may constrain for further trials, by the form of the constraint."""
 
 
 def column_in_other_unit(name: str) -> tuple[Column, str] | None:
-    """Return the column of the same quantity as a name in another unit, and that unit; None if there is none.
-
-    Parameters
-    ----------
-    name : name of an unknown column, such as `pressure_psi`.
-
-    Returns
-    -------
-    column, unit : the unit as a key of `UNITS`; or None.
-
-    >>> column, unit = column_in_other_unit("pressure_psi")
-    >>> column.name, unit
-    ('pressure_kPa', 'psi')
+    """Return the column of the same quantity as a name in another unit, and that unit; None if there is none. Returns
+    column, unit, >>> column, unit = column_in_other_unit("pressure_psi"), >>> column.name, unit, ('pressure_kPa',
+    'psi').
     """
     quantity, unit = split_unit(name)
     for column in COLUMNS.values():
@@ -359,17 +349,5 @@ def column_in_other_unit(name: str) -> tuple[Column, str] | None:
 
 
 def option(column: str) -> str:
-    """Return the command-line option for a column of the sheet.
-
-    Parameters
-    ----------
-    column : name of the column.
-
-    Returns
-    -------
-    the option, with its dashes.
-
-    >>> option("pressure_kPa")
-    '--pressure-kPa'
-    """
+    """Return the command-line option for a column of the sheet."""
     return "--" + column.replace("_", "-")

@@ -137,7 +137,6 @@ _LimitedColumns: Any = _optional_fields(
 
 class Limits(_LimitedColumns):
     """Constraints on further trials, for the design of the next experiment; None: the range of the trials so far.
-
     Pressure and payload are ranges (`7:40` or two numbers); the others are sets of values to choose from: one value, a
     list, or a range, of which five values are considered.
     """
@@ -170,6 +169,7 @@ class Limits(_LimitedColumns):
         return value if value is None else (read_limit(column, value),)
 
 
+# Type of the value of each kind of column
 _TYPES: dict[str, Any] = {
     "number": float,
     "choice": float,
@@ -179,15 +179,13 @@ _TYPES: dict[str, Any] = {
     "window": tuple[float, float],
     "yes_no": bool,
 }
-"""Type of the value of each kind of column."""
 
 _SharedColumns: Any = _optional_fields({name: _TYPES[COLUMNS[name].kind] for name in SHARED})
 
 
 class ExperimentSettings(_SharedColumns):
-    """Settings shared by all trials of an experiment, in the unit of their name; None where not given.
-
-    The columns that are declared `shared` may be set here for all trials; a cell of the sheet overrides them.
+    """Settings shared by all trials of an experiment, in the unit of their name; None where not given. The columns that
+    are declared `shared` may be set here for all trials; a cell of the sheet overrides them.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
@@ -337,21 +335,7 @@ class RunSettings(_Strict):
 
 
 def read_experiment_settings(path: Path) -> ExperimentSettings:
-    """Read `experiment.yaml`; return the defaults if there is no such file.
-
-    Parameters
-    ----------
-    path : path of `experiment.yaml`.
-
-    Returns
-    -------
-    the settings.
-
-    Raises
-    ------
-    ExperimentError
-        With every problem of the file.
-    """
+    """Read `experiment.yaml`; return the defaults if there is no such file."""
     # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
         return ExperimentSettings()
@@ -359,24 +343,7 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
-    """Validate settings of a run given as a mapping, such as Snakemake's `config`.
-
-    Parameters
-    ----------
-    values : content of `config/config.yaml`, with any overrides.
-
-    Returns
-    -------
-    the settings.
-
-    Raises
-    ------
-    ExperimentError
-        With every problem of the mapping.
-
-    >>> run_settings({"damping": {"seed": 7}}).damping.seed
-    7
-    """
+    """Validate settings of a run given as a mapping, such as Snakemake's `config`."""
     return _validate(RunSettings, YamlDocument(values, {}), "config.yaml")
 
 

@@ -20,20 +20,14 @@ from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
-MAX_NAME_LENGTH = 100
-"""Longest trial name; files are named after it. Chosen: of the 255 bytes of a file name, 155 remain for prefix and
-suffix; at twice the length 55 remain, at half names that people use are refused."""
+MAX_NAME_LENGTH = 100  # Longest trial name; files are named after it (chosen)
 
+# Columns that a trial of an everting vine requires; a body that moves as a whole requires the diameter only
 REQUIRED_COLUMNS = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
-"""Columns that a trial of an everting vine requires; a body that moves as a whole requires the diameter only."""
 
-PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
-"""Default standard errors: 1 % of the pressure, and 0.2 kPa for the yield pressure. Chosen: a usual gauge is of class
-1, and the yield pressure is read from a slowly rising one. At half or twice, the errors of forces near the yield
-pressure halve or double in experiments that state none."""
+PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2  # Default standard errors (chosen)
 
-SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})
-"""Suffixes of files that may carry the capture rate."""
+SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})  # Suffixes of files that may carry the capture rate
 
 RATE_REMEDY = "write the capture rate; the rate stored in the file is that of playback"
 
@@ -63,32 +57,13 @@ class Row:
         return float(self.values.get("travel_ratio", 2.0))
 
     def add(self, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
-        """Record a problem of this row.
-
-        Parameters
-        ----------
-        message : what is wrong.
-        column : column of the cell; blank for the row as a whole.
-        severity : "error" or "warning".
-        **details : further fields of `Problem`.
-        """
+        """Record a problem of this row."""
         place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
         self.problems.append(Problem(message=message, column=column, severity=severity, **place, **details))
 
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
-    """Read and check the cells of one row; shared settings fill blank cells.
-
-    Parameters
-    ----------
-    table : the sheet, in the units of its columns.
-    index : index of the row.
-    settings : settings shared by all trials.
-
-    Returns
-    -------
-    row : values in the unit of each column, and problems.
-    """
+    """Read and check the cells of one row; shared settings fill blank cells."""
     cells, line = table.rows[index], table.lines[index]
     row = Row(cells.get("trial", f"line-{line}"), line)
     _check_name(row)
@@ -114,17 +89,7 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
 
 
 def unknown_columns(table: Table, file: str) -> list[Problem]:
-    """Warn of every unknown column, with the most similar known names.
-
-    Parameters
-    ----------
-    table : the sheet.
-    file : its name, for messages.
-
-    Returns
-    -------
-    problems : warnings, one per column.
-    """
+    """Warn of every unknown column, with the most similar known names."""
     problems = []
     for name in table.columns:
         if name not in COLUMNS:
@@ -152,13 +117,7 @@ def _check_name(row: Row) -> None:
 
 
 def check_row(row: Row, folder: Path) -> None:
-    """Check a row as a whole: its paths, and values that contradict each other.
-
-    Parameters
-    ----------
-    row : row to check; receives the problems.
-    folder : experiment folder, which paths must not leave.
-    """
+    """Check a row as a whole: its paths, and values that contradict each other."""
     _check_paths(row, folder)
     check_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
@@ -173,19 +132,8 @@ def check_row(row: Row, folder: Path) -> None:
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Report required cells that are blank, and return required columns that neither sheet nor settings have.
-
-    The latter are a fault of the sheet, which the caller reports once.
-
-    Parameters
-    ----------
-    row : row to check, shared settings filled in; receives the problems.
-    folder : experiment folder.
-    columns : columns of the sheet.
-
-    Returns
-    -------
-    required columns that are absent; empty if the travel ratio, which decides what is required, is itself faulty.
+    """Report required cells that are blank, and return required columns that neither sheet nor settings have. The
+    latter are a fault of the sheet, which the caller reports once.
     """
     faulty = {problem.column for problem in row.problems if problem.severity == "error"}
     absent: set[str] = set()
@@ -239,12 +187,7 @@ def _may_state_rate(folder: Path, video: str) -> bool:
 
 
 def check_wall(row: Row) -> None:
-    """Report a wall thickness above a quarter of the diameter, which no tube can have.
-
-    Parameters
-    ----------
-    row : row to check; receives the problems.
-    """
+    """Report a wall thickness above a quarter of the diameter, which no tube can have."""
     diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
     if thickness / 1000 > diameter / 4:
         message = f"is more than a quarter of the diameter ({diameter:g} mm)"
@@ -253,12 +196,7 @@ def check_wall(row: Row) -> None:
 
 
 def check_pressures(row: Row) -> None:
-    """Warn of pressures that are allowed but implausible.
-
-    Parameters
-    ----------
-    row : row to check; receives the problems.
-    """
+    """Warn of pressures that are allowed but implausible."""
     pressure = row.values.get("pressure_kPa", math.nan)
     yield_pressure = row.values.get("yield_pressure_kPa", math.nan)
     if row.travel_ratio == 2 and yield_pressure >= pressure:
@@ -279,18 +217,7 @@ def check_pressures(row: Row) -> None:
 
 
 def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
-    """Make the trial of a row without errors, in SI units, with the documented defaults.
-
-    Parameters
-    ----------
-    row : row without errors.
-    folder : experiment folder, to which paths are relative.
-    settings : settings shared by all trials.
-
-    Returns
-    -------
-    trial : SI units; NaN for a blank cell without default.
-    """
+    """Make the trial of a row without errors, in SI units, with the documented defaults."""
     values: dict[str, Any] = dict(row.values)
     pressure_kPa = values.setdefault("pressure_kPa", 0.0)
     values.setdefault("pressure_sigma_kPa", PRESSURE_REL_SIGMA * pressure_kPa)
@@ -316,9 +243,8 @@ def _in_si(column: Column, value: Any, folder: Path) -> Any:
 
 
 def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any]) -> float:
-    """Standard deviation of smooth position errors, m: as stated, else by whether lens distortion was corrected.
-
-    A target with many corners reveals the distortion, hence 0. Two points, a scale, a scale of the trial's own and
+    """Standard deviation of smooth position errors, m: as stated, else by whether lens distortion was corrected. A
+    target with many corners reveals the distortion, hence 0. Two points, a scale, a scale of the trial's own and
     positions measured elsewhere do not show whether it was corrected, hence the default. NaN for a planned trial.
     """
     if settings.position_systematic_mm is not None:
@@ -330,17 +256,7 @@ def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any])
 
 
 def expected_systematic_m(settings: ExperimentSettings) -> float:
-    """Standard deviation of smooth position errors, m, of trials that are still to be filmed.
-
-    Parameters
-    ----------
-    settings : of the experiment.
-
-    Returns
-    -------
-    float
-        As stated; else 0 where the calibration is a target with many corners, and the default where it is not.
-    """
+    """Standard deviation of smooth position errors, m, of trials that are still to be filmed."""
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3
     return 0.0 if isinstance(settings.calibration, (Charuco, Checkerboard)) else POSITION_SYSTEMATIC_M

@@ -15,28 +15,16 @@ import numpy as np
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import Floats, Trial
 
-CONFOUNDING_CORRELATION = 0.7
-"""Rank correlation above which order and pressure count as confounded. Derived: when a drift is fitted together with an
-effect of pressure, its variance is inflated by 1/(1 − r²), and 1/(1 − 0.7²) = 2: half of the information is lost."""
+CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
 
-FEWEST_TRIALS = 8
-"""Fewest trials for which the correlation is computed. Derived: for 8 trials in random order, |r| exceeds 0.7 with a
-probability of 5 %."""
+FEWEST_TRIALS = 8  # Fewest trials for which the correlation is computed (derived)
 
 REMEDY = "run the trials in random order, or repeat six of them in random order, and number them under order"
 
 
 def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
     """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
-
-    Parameters
-    ----------
-    trials : in the order of the sheet.
-
-    Returns
-    -------
-    ranks, stated
-        Ranks from 0, shape (n_trials,). If `order` is blank for any trial, or not unique, the row order is used.
+    Returns ranks, stated: Ranks from 0, shape (n_trials,).
     """
     order = np.array([trial.order for trial in trials], dtype=float)
     stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
@@ -45,16 +33,8 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
 
 
 def order_pressure_correlation(trials: Sequence[Trial]) -> float:
-    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines.
-
-    Parameters
-    ----------
-    trials : in the order of the sheet.
-
-    Returns
-    -------
-    float
-        −1 to 1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
+    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines. Returns −1 to
+    1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
     """
     from scipy.stats import rankdata
 
@@ -73,17 +53,7 @@ def order_pressure_correlation(trials: Sequence[Trial]) -> float:
 
 
 def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
-    """Warn of confounding: order with pressure, and specimen or day with condition.
-
-    Parameters
-    ----------
-    trials : in the order of the sheet.
-    file : name of the sheet.
-
-    Yields
-    ------
-    warnings.
-    """
+    """Warn of confounding: order with pressure, and specimen or day with condition."""
     correlation = order_pressure_correlation(trials)
     _, stated = trial_order(trials)
     if abs(correlation) >= CONFOUNDING_CORRELATION and stated:

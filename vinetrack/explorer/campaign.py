@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class ExplorerTrial:
     """One trial with its release and origin, which align it with the common clock and ruler of all trials.
-
     `origin_known` tells whether the vine was filmed at rest; if not, the origin is fitted with a model.
     """
 
@@ -67,15 +66,8 @@ class ExplorerTrial:
         return self.data.lead_position_m - self.origin_m
 
     def first_counted_frame(self, release_s: float) -> int:
-        """Return the first frame that counts for errors: where model or measurement moves, since rest dilutes an error.
-
-        Parameters
-        ----------
-        release_s : of the model, on the clock of the track.
-
-        Returns
-        -------
-        int, index among the frames of the trial
+        """Return the first frame that counts for errors: where model or measurement moves, since rest
+        dilutes an error.
         """
         released = int(np.searchsorted(self.data.time_s, release_s))
         return min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
@@ -92,11 +84,9 @@ class ReplicateBand:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A results folder with its experiment, read by `read_campaign`.
-
-    `numbers` are the estimates of the fit in `fit.json`, by name, SI; empty if the fit was refused, with the reason in
-    `refused`. `log_likelihood` is that of the same fit, NaN if it was refused. `floors_m` is the replicate scatter by
-    condition, NaN with one trial. `unusable` maps effects that cannot be simulated for these trials to the reason.
+    """A results folder with its experiment, read by `read_campaign`. `numbers` are the estimates of the fit in
+    `fit.json`, by name, SI; empty if the fit was refused, with the reason in `refused`. `log_likelihood` is that of the
+    same fit, NaN if it was refused.
     """
 
     name: str
@@ -133,17 +123,7 @@ class Campaign:
         return self.groups("vine")
 
     def groups(self, shared: str) -> tuple[str, ...]:
-        """Return the groups of trials with a parameter value of their own, in the order of the sheet.
-
-        Parameters
-        ----------
-        shared : `all`, `vine` or `day`.
-
-        Returns
-        -------
-        tuple of str
-            One blank name if the value applies to all trials.
-        """
+        """Return the groups of trials with a parameter value of their own, in the order of the sheet."""
         return tuple(group_names([aligned.data.trial for aligned in self.trials], shared))
 
     @cached_property
@@ -159,65 +139,22 @@ class Campaign:
         return host_for(Model(()), self.effects.values())
 
     def own_files(self, names: Sequence[str]) -> list[str]:
-        """Return the files of user effects in the experiment's folder, of those named.
-
-        Parameters
-        ----------
-        names : effects of a model.
-
-        Returns
-        -------
-        list of str
-        """
+        """Return the files of user effects in the experiment's folder, of those named."""
         folder = self.experiment.folder.resolve()
         paths = [self.effects[name].path for name in names]
         return [path.name for path in paths if path.resolve().parent == folder]
 
     def indices_of_condition(self, condition: str) -> list[int]:
-        """Return the indices of the trials of a condition in `trials`.
-
-        Parameters
-        ----------
-        condition : its name.
-
-        Returns
-        -------
-        list of int
-        """
+        """Return the indices of the trials of a condition in `trials`."""
         return [i for i, aligned in enumerate(self.trials) if aligned.condition == condition]
 
     def trial(self, name: str) -> ExplorerTrial:
-        """Return the trial of that name; KeyError if there is none.
-
-        Parameters
-        ----------
-        name : of the trial.
-
-        Returns
-        -------
-        ExplorerTrial
-        """
+        """Return the trial of that name; KeyError if there is none."""
         return {aligned.name: aligned for aligned in self.trials}[name]
 
 
 def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
-    """Read the results folder of an experiment.
-
-    Parameters
-    ----------
-    folder : of the results.
-    experiment : from which the results were made.
-    user_effects : the user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
-
-    Returns
-    -------
-    Campaign
-
-    Raises
-    ------
-    ResultsError
-        If the model stage or one before it has not run, or no trial has a usable track.
-    """
+    """Read the results folder of an experiment."""
     results = Results(folder)
     pairs, kinematics = measured_trials(experiment, results)
     data, left_out = prepare(pairs)
@@ -302,20 +239,7 @@ def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
 
 
 def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
-    """Return a label for each condition, from the settings in which the trials of the experiment differ.
-
-    Parameters
-    ----------
-    conditions : one trial of each condition, by its name.
-
-    Returns
-    -------
-    dict, the label by the name of the condition
-
-    >>> a, b = Trial(name="a", diameter_m=0.012, pressure_Pa=24e3), Trial(name="b", diameter_m=0.012, pressure_Pa=30e3)
-    >>> condition_labels({"one": a, "two": b})
-    {'one': '24 kPa', 'two': '30 kPa'}
-    """
+    """Return a label for each condition, from the settings in which the trials of the experiment differ."""
     written = {name: _settings(trial) for name, trial in conditions.items()}
     keys = list(dict.fromkeys(key for settings in written.values() for key in settings))
     varying = [key for key in keys if len({settings.get(key, "") for settings in written.values()}) > 1]

@@ -48,7 +48,6 @@ class SizeControl:
 @dataclass(frozen=True)
 class ModelChoice:
     """Effects in the model, in the order they were added, and the value of every parameter, in the model or not.
-
     `numbers` also holds the fitted yield pressures by vine, which have no slider.
     """
 
@@ -59,48 +58,19 @@ class ModelChoice:
         return effect in self.effects
 
     def with_effect(self, effect: str, wanted: bool = True) -> ModelChoice:
-        """Return the choice with an effect added (at the end) or removed; its sizes are kept for when it returns.
-
-        Parameters
-        ----------
-        effect : its name.
-        wanted : False removes it.
-
-        Returns
-        -------
-        ModelChoice
-        """
+        """Return the choice with an effect added (at the end) or removed; its sizes are kept for when it returns."""
         if wanted == (effect in self.effects):
             return self
         kept = tuple(name for name in self.effects if name != effect)
         return replace(self, effects=(*kept, effect) if wanted else kept)
 
     def with_size(self, name: str, value: float) -> ModelChoice:
-        """Return the choice with another value of one parameter.
-
-        Parameters
-        ----------
-        name : `effect.parameter`, with `[vine]` where each vine has its own.
-        value : SI.
-
-        Returns
-        -------
-        ModelChoice
-        """
+        """Return the choice with another value of one parameter."""
         return replace(self, numbers={**self.numbers, name: value})
 
 
 def choice_in_use(campaign: Campaign) -> ModelChoice:
-    """Return the model in use with its fitted values, and all other parameters at their defaults.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-
-    Returns
-    -------
-    ModelChoice
-    """
+    """Return the model in use with its fitted values, and all other parameters at their defaults."""
     numbers = {
         size.name: size.parameter.default
         for effect in campaign.effects.values()
@@ -110,19 +80,8 @@ def choice_in_use(campaign: Campaign) -> ModelChoice:
 
 
 def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
-    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value.
-
-    Their ranges include the present value.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    effect : whose parameters are listed.
-    numbers : present values by name, SI.
-
-    Returns
-    -------
-    list of SizeControl
+    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value. Their
+    ranges include the present value.
     """
     sizes = []
     for parameter in effect.parameters:
@@ -135,19 +94,8 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
 
 def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
     """Return the range of a slider: the plausible range, extended to the size without effect and the present value.
-
-    Parameters
-    ----------
-    key : `effect.parameter`.
-    value : present value, SI.
-    parameter : its default, bounds and plausible range, SI.
-
-    Returns
-    -------
-    low, high : float, SI
-
-    >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)), 5.0)
-    (0.0, 6.25)
+    Returns low, high, >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)),
+    5.0), (0.0, 6.25).
     """
     low, high = parameter.plausible or parameter.bounds
     if key == DAMPING or not (math.isfinite(low) and math.isfinite(high)):
@@ -160,17 +108,7 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
 
 
 def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
-    """Return the chosen model with its sizes, ready to be simulated.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-
-    Returns
-    -------
-    SizedModel
-    """
+    """Return the chosen model with its sizes, ready to be simulated."""
     effects = tuple(campaign.effects[name] for name in choice.effects)
     values: dict[str, Value] = {}
     for effect in effects:
@@ -186,30 +124,13 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
 
 
 def is_removable(effect: str) -> bool:
-    """Return whether an effect may be removed: the base effects may not, since all others are added to them.
-
-    Parameters
-    ----------
-    effect : its name.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether an effect may be removed: the base effects may not, since all others are added to them."""
     return effect not in BASE_EFFECTS
 
 
 def added_and_dropped(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
-    """Return the effects added to the model in use, and those removed from it.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-
-    Returns
-    -------
-    added, dropped : list of str, relative to the model in use
+    """Return the effects added to the model in use, and those removed from it. Returns added, dropped : list of str,
+    relative to the model in use.
     """
     added = [name for name in choice.effects if name not in campaign.in_use]
     dropped = [name for name in campaign.in_use if name not in choice.effects]
@@ -219,24 +140,7 @@ def added_and_dropped(campaign: Campaign, choice: ModelChoice) -> tuple[list[str
 def choice_from_options(
     campaign: Campaign, start: ModelChoice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
 ) -> ModelChoice:
-    """Return the choice described by options of the command line.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    start : the choice that is modified.
-    add, drop : names of effects.
-    sizes : `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is added.
-
-    Returns
-    -------
-    ModelChoice
-
-    Raises
-    ------
-    ChoiceError
-        If there is no such effect or parameter, the trials cannot test it, or it is a base effect to be removed.
-    """
+    """Return the choice described by options of the command line."""
     choice = start
     for name in add:
         choice = choice.with_effect(_testable_effect(campaign, name))

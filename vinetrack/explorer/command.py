@@ -35,24 +35,7 @@ class ExploreOptions:
 
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
-    """Open a results folder and its experiment.
-
-    Parameters
-    ----------
-    folder : the results.
-    experiment : its folder, if it has moved.
-
-    Returns
-    -------
-    Campaign
-
-    Raises
-    ------
-    ResultsError
-        If it is not a results folder, or its experiment has moved.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Open a results folder and its experiment."""
     from vinetrack.explorer.campaign import read_campaign
     from vinetrack.pipeline.effects_stage import effects_of
     from vinetrack.pipeline.source_experiment import read_source_experiment
@@ -62,20 +45,7 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
 
 
 def explore(folder: Path, experiment: Path | None, options: ExploreOptions, say: Callable[[str], None]) -> None:
-    """Serve the page, or carry out the options and print the results.
-
-    Parameters
-    ----------
-    folder : the results.
-    experiment : its folder, if it has moved.
-    options : of the command.
-    say : prints a line.
-
-    Raises
-    ------
-    ResultsError, ExperimentError, ChoiceError, PageError, FitError, EffectError, SimulationError
-        In one sentence each.
-    """
+    """Serve the page, or carry out the options and print the results."""
     from vinetrack.core.terminal import waiting
     from vinetrack.explorer.choice import choice_from_options, choice_in_use
 
@@ -126,18 +96,7 @@ def _run_without_page(
 
 
 def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], before: dict[str, float]) -> list[str]:
-    """Return a table of the error of every condition before and now, with the replicate scatter.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    now, before : errors by condition, m.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return a table of the error of every condition before and now, with the replicate scatter."""
     from vinetrack.core.terminal import table
     from vinetrack.explorer.curves import overall_m
     from vinetrack.explorer.export import model_text

@@ -34,8 +34,7 @@ from vinetrack.pipeline.source_experiment import save_model
 if TYPE_CHECKING:
     from vinetrack.explorer.page import Page
 
-STEPS = 400
-"""Steps of a slider; chosen: about one per pixel."""
+STEPS = 400  # Steps of a slider; chosen: about one per pixel
 HEADING = """
 :host { margin-top: .5rem; }
 .bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
@@ -72,16 +71,7 @@ class EffectRow:
         )
 
     def value(self, k: int) -> float:
-        """Return the value of a slider in SI units.
-
-        Parameters
-        ----------
-        k : index of the slider.
-
-        Returns
-        -------
-        float, SI
-        """
+        """Return the value of a slider in SI units."""
         return float(self.sliders[k].value) / self.sizes[k].shown[1]
 
 
@@ -174,14 +164,7 @@ class EffectPanel:
         return on_change
 
     def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
-        """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider.
-
-        Parameters
-        ----------
-        choice : effects and sizes.
-        fitted : the fit whose estimates are shown; None for none.
-        sliders : whether the sliders are set too.
-        """
+        """Set tick boxes and, optionally, sliders to a choice; show the fitted value at each slider."""
         self._updating = True
         try:
             for name, row in self.rows.items():
@@ -286,12 +269,7 @@ class TrialSelector:
         self._conditions.active = []
 
     def toggle(self, condition: str) -> None:
-        """Select this condition alone; if it is alone already, select all.
-
-        Parameters
-        ----------
-        condition : its name.
-        """
+        """Select this condition alone; if it is alone already, select all."""
         index = self.campaign.conditions.index(condition)
         is_alone = self._conditions.active == [index]
         self._conditions.active = list(range(len(self.campaign.conditions))) if is_alone else [index]

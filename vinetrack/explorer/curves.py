@@ -22,21 +22,15 @@ from vinetrack.explorer.campaign import Campaign, ExplorerTrial
 from vinetrack.inference.left_out import LEAST_EIGENVALUE, scaled_least_squares
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
-GRID_POINTS = 500
-"""Points of the simulation grid. Derived: the error of linear interpolation is h²·x″/8; with h = T/500 and x″ of order
-8·L/T² that is 4·10⁻⁶ of the length; with half the points 1.6·10⁻⁵."""
+GRID_POINTS = 500  # Points of the simulation grid (derived)
 
-MARGIN_FRAMES = 25
-"""Frames by which the grid extends beyond the recording; derived: five of the largest steps of the alignment."""
+MARGIN_FRAMES = 25  # Frames by which the grid extends beyond the recording
 
-MAX_NEWTON_STEPS = 12
-"""Newton steps of the alignment at most; chosen: starting from the comparison, two or three suffice."""
+MAX_NEWTON_STEPS = 12  # Newton steps of the alignment at most
 
-MAX_STEP_FRAMES = 5.0
-"""Largest step, in frames; chosen: keeps the release within the data even from a poor start."""
+MAX_STEP_FRAMES = 5.0  # Largest step, in frames; chosen: keeps the release within the data even from a poor start
 
-CONVERGED_STEP_FRAMES = 1e-3
-"""Step, in frames, below which the alignment has converged. Chosen: at 1 m/s and 1000 frames per second, 1 µm."""
+CONVERGED_STEP_FRAMES = 1e-3  # Step, in frames, below which the alignment has converged (chosen)
 
 
 @dataclass(frozen=True)
@@ -49,11 +43,9 @@ class SizedModel:
 
 @dataclass(frozen=True)
 class ModelCurves:
-    """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames.
-
-    `release_s` and `origin_m` are in the coordinates of the track. `growth_m` is the position that the camera would
-    report, from the origin of the page (`ExplorerTrial.origin_m`), `residual_m` is measurement minus model. `path_m`,
-    shape (GRID_POINTS,), is the whole motion at `path_s` since that release, from the model's own origin.
+    """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames. `release_s` and
+    `origin_m` are in the coordinates of the track. `growth_m` is the position that the camera would report, from the
+    origin of the page (`ExplorerTrial.origin_m`), `residual_m` is measurement minus model.
     """
 
     release_s: float
@@ -70,42 +62,16 @@ class ModelCurves:
         return math.sqrt(self.mean_square_m2)
 
     def lead_position_m(self, time_s: Floats) -> Floats:
-        """Return positions at times, both in the coordinates of the track; NaN beyond the simulation.
-
-        Parameters
-        ----------
-        time_s : times, any shape.
-
-        Returns
-        -------
-        array of the same shape, m
-        """
+        """Return positions at times, both in the coordinates of the track; NaN beyond the simulation."""
         since_release = time_s - self.release_s
         return self.origin_m + np.interp(since_release, self.path_s, self.path_m, right=math.nan)
 
 
-Curves = tuple[ModelCurves, ...]
-"""The predicted motion of every trial of a campaign, in its order."""
+Curves = tuple[ModelCurves, ...]  # The predicted motion of every trial of a campaign, in its order
 
 
 def simulate_curves(campaign: Campaign, sized_model: SizedModel, before: Curves | None = None) -> Curves:
-    """Simulate every trial and align it with its measurement.
-
-    Parameters
-    ----------
-    before : curves whose releases the alignment starts from; by default those of the comparison.
-    campaign : the trials.
-    sized_model : model, sizes and yield pressures.
-
-    Returns
-    -------
-    tuple of ModelCurves, one per trial
-
-    Raises
-    ------
-    SimulationError
-        If the model cannot be simulated with these sizes.
-    """
+    """Simulate every trial and align it with its measurement."""
     trials = campaign.trials
     starts = [trial.release_s for trial in trials]
     if before is not None:
@@ -125,17 +91,7 @@ def simulate_curves(campaign: Campaign, sized_model: SizedModel, before: Curves 
 
 
 def with_yield_pressure(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
-    """Return the trial with the fitted yield pressure of its vine, if there is one.
-
-    Parameters
-    ----------
-    trial : as the sheet has it.
-    yield_Pa : fitted yield pressures by name of trial.
-
-    Returns
-    -------
-    Trial
-    """
+    """Return the trial with the fitted yield pressure of its vine, if there is one."""
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
@@ -189,17 +145,7 @@ def _step(slope: Floats, residual: Floats, *, free_origin: bool) -> tuple[float,
 
 
 def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
-    """Return the root mean square position error by condition, m; all trials have the same weight.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    curves : of the model.
-
-    Returns
-    -------
-    dict, m by condition
-    """
+    """Return the root mean square position error by condition, m; all trials have the same weight."""
     return {
         condition: math.sqrt(
             float(np.mean([curves[i].mean_square_m2 for i in campaign.indices_of_condition(condition)]))
@@ -209,33 +155,13 @@ def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
-    """Return the root mean square over conditions with a known error, m; NaN if there are none.
-
-    Parameters
-    ----------
-    errors : m by condition; NaN where unknown.
-    conditions : over which to average.
-
-    Returns
-    -------
-    float, m
-    """
+    """Return the root mean square over conditions with a known error, m; NaN if there are none."""
     known = [errors[name] for name in conditions if math.isfinite(errors.get(name, math.nan))]
     return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
 def fitted_yield_pressures(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
-    """Return fitted yield pressures by trial, from those by vine (and stated value, if a vine has several).
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    numbers : values by name, SI.
-
-    Returns
-    -------
-    dict, Pa by name of trial
-    """
+    """Return fitted yield pressures by trial, from those by vine (and stated value, if a vine has several)."""
     yields_Pa = {}
     for aligned in campaign.trials:
         trial = aligned.data.trial

@@ -34,19 +34,7 @@ CURVE_COLUMNS = (
 
 
 def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
-    """Return measurement and model at every frame used, since release and from the origin.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    curves : of that model.
-    shown : indices of the trials to write.
-
-    Returns
-    -------
-    table with the columns `CURVE_COLUMNS`
-    """
+    """Return measurement and model at every frame used, since release and from the origin."""
     import pandas as pd
 
     parts = []
@@ -63,25 +51,7 @@ def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: 
 
 
 def export_bytes(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
-    """Return the curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    curves : of that model.
-    shown : indices of the trials to draw.
-    form : one of `FORMATS`.
-
-    Returns
-    -------
-    bytes of the file
-
-    Raises
-    ------
-    ChoiceError
-        If it is none of these.
-    """
+    """Return the curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`."""
     if form not in FORMATS:
         raise ChoiceError(f"{form!r} is no export format: use one of {', '.join(FORMATS)}.")
     table = curve_table(campaign, choice, curves, shown)
@@ -116,20 +86,7 @@ def _compared(
 
 
 def write_export(campaign: Campaign, choice: ModelChoice, curves: Curves, path: Path) -> None:
-    """Write all trials to a file, atomically; its suffix gives the format.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    curves : of that model.
-    path : of the file.
-
-    Raises
-    ------
-    ChoiceError
-        If the suffix is none of `FORMATS`.
-    """
+    """Write all trials to a file, atomically; its suffix gives the format."""
     from vinetrack.core.tables import write_bytes
 
     form = path.suffix.lower().removeprefix(".")
@@ -139,20 +96,7 @@ def write_export(campaign: Campaign, choice: ModelChoice, curves: Curves, path: 
 def commands(
     campaign: Campaign, start: ModelChoice, choice: ModelChoice, *, fitted: bool, save: bool = False
 ) -> list[str]:
-    """Return the commands that reproduce the choice without the page.
-
-    Parameters
-    ----------
-    start : the choice with which the page opened.
-    fitted : whether the sizes are those of a fit; otherwise each is given explicitly.
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    save : whether the model is to be saved.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the commands that reproduce the choice without the page."""
     folder = shlex.quote(campaign.folder.as_posix())
     added, dropped = added_and_dropped(campaign, choice)
     if not added and not dropped and (fitted or not _changed_sizes(campaign, start, choice)):
@@ -186,16 +130,7 @@ def _changed_sizes(campaign: Campaign, start: ModelChoice, choice: ModelChoice) 
 
 
 def model_text(names: Sequence[str]) -> str:
-    """Return a model as text, with one name for the base effects together.
-
-    Parameters
-    ----------
-    names : of the effects.
-
-    Returns
-    -------
-    str
-    """
+    """Return a model as text, with one name for the base effects together."""
     others = [name.replace("_", " ") for name in names if name not in BASE_EFFECTS]
     missing_base = [name for name in BASE_EFFECTS if name not in names]
     base = "base model" if not missing_base else " + ".join(name for name in names if name in BASE_EFFECTS)

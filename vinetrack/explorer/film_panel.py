@@ -27,8 +27,7 @@ from vinetrack.explorer.look import (
 from vinetrack.explorer.recording import DecodedRecording, RecordingView, recording_view
 from vinetrack.results.folder_layout import Results
 
-PLAY_MS = 70
-"""Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent."""
+PLAY_MS = 70  # Interval of frames while playing; chosen: 14 per second, as fast as pictures of 960 pixels are sent
 NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
 
 
@@ -105,22 +104,12 @@ class FilmPanel:
         return fig
 
     def set_curves(self, curves: Curves | None, reference: Curves | None) -> None:
-        """Set the curves of the current model and of the model for comparison.
-
-        Parameters
-        ----------
-        curves, reference : of the current model and of the model for comparison; None if not yet known.
-        """
+        """Set the curves of the current model and of the model for comparison."""
         self._curves, self._reference = curves, reference
         self._draw_edges()
 
     def show_trial(self, name: str) -> None:
-        """Show another trial: decode its recording, or show why there is none.
-
-        Parameters
-        ----------
-        name : of the trial.
-        """
+        """Show another trial: decode its recording, or show why there is none."""
         self._stop()
         if self._film is not None:
             self._film.cancel()

@@ -29,12 +29,11 @@ from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 log = logging.getLogger(__name__)
 
 FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE for the traceback."
+# Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other parameter
+# known
 STRONG_CORRELATION = 0.9
-"""Chosen: with this correlation each standard error is 1/√(1 − 0.9²) = 2.3 times its value with the other
-parameter known."""
 
-CLEARLY_WORSE = 0.5
-"""Decrease in ln L. Chosen: 0.5 corresponds to one standard error; two fits within it agree."""
+CLEARLY_WORSE = 0.5  # Decrease in ln L (chosen)
 
 
 class FitCancelled(Exception):  # noqa: N818 - nothing went wrong
@@ -53,38 +52,13 @@ class Fitted:
     seconds: float
 
     def number(self, name: str) -> Number | None:
-        """Return the estimate of a parameter, None if it was not fitted.
-
-        Parameters
-        ----------
-        name : `effect.parameter`, with `[vine]` where each vine has its own.
-
-        Returns
-        -------
-        Number or None
-        """
+        """Return the estimate of a parameter, None if it was not fitted."""
         return next((number for number in self.fit.numbers if number.name == name), None)
 
 
 def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
-    """Fit the model in use, as the model stage of the workflow does.
-
-    The likelihood to be reached is in `fit.json`: if the first start reaches it, no others are tried.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : the model in use.
-    watch : called after every step.
-
-    Returns
-    -------
-    Fitted
-
-    Raises
-    ------
-    FitError, EffectError, SimulationError
-        If it cannot be fitted.
+    """Fit the model in use, as the model stage of the workflow does. The likelihood to be reached is in `fit.json`: if
+    the first start reaches it, no others are tried.
     """
     started = time.perf_counter()
     model = sized_model(campaign, choice).model
@@ -100,25 +74,8 @@ def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = Non
 
 @in_one_blas_thread
 def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
-    """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects.
-
-    If the result is worse than without the new effects, or has not converged, it is refitted from their defaults.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    before : the fit to start from.
-    choice : effects and sizes.
-    watch : called after every step.
-
-    Returns
-    -------
-    Fitted
-
-    Raises
-    ------
-    FitError, EffectError, SimulationError
-        If it cannot be fitted.
+    """Fit the chosen model, starting from an earlier fit, with the chosen sizes of new effects. If the result is worse
+    than without the new effects, or has not converged, it is refitted from their defaults.
     """
     started = time.perf_counter()
     model = replace(sized_model(campaign, choice).model, values={})
@@ -145,31 +102,12 @@ def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: fl
 
 
 def with_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
-    """Return the same effects with these sizes.
-
-    Parameters
-    ----------
-    choice : effects and sizes.
-    numbers : SI, by name.
-
-    Returns
-    -------
-    ModelChoice
-    """
+    """Return the same effects with these sizes."""
     return replace(choice, numbers={**choice.numbers, **numbers})
 
 
 def likelihood_change_text(before: Fit, after: Fit) -> str:
-    """Return how −2 ln L changed with a larger or smaller model, as a sentence.
-
-    Parameters
-    ----------
-    before, after : fits of two models to the same trials.
-
-    Returns
-    -------
-    str
-    """
+    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     more = len(after.numbers) - len(before.numbers)
     numbers = f"{abs(more)} parameter{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
@@ -179,16 +117,7 @@ def likelihood_change_text(before: Fit, after: Fit) -> str:
 
 
 def correlated_pairs_text(result: Fit) -> list[str]:
-    """Return the pairs of strongly correlated estimates, largest correlation first, as text.
-
-    Parameters
-    ----------
-    result : a fit with its covariance.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the pairs of strongly correlated estimates, largest correlation first, as text."""
     pairs = []
     for i, number in enumerate(result.numbers):
         for k in range(i):
@@ -230,12 +159,7 @@ class FitJob(Generic[Progress, Outcome]):
         self._cancelled.set()
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Wait until it has ended.
-
-        Parameters
-        ----------
-        timeout_s : None for no limit.
-        """
+        """Wait until it has ended."""
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
@@ -263,9 +187,8 @@ class FitJob(Generic[Progress, Outcome]):
 
 
 class BackgroundFit:
-    """Computes in a thread `curves` and `errors_m` of the model in use, then its fit.
-
-    `failure` is the reason if it failed, else blank. Listeners are called from that thread.
+    """Computes in a thread `curves` and `errors_m` of the model in use, then its fit. `failure` is the reason if it
+    failed, else blank. Listeners are called from that thread.
     """
 
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
@@ -286,30 +209,15 @@ class BackgroundFit:
         return self
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Wait until it has finished or failed.
-
-        Parameters
-        ----------
-        timeout_s : None for no limit.
-        """
+        """Wait until it has finished or failed."""
         self._thread.join(timeout_s)
 
     def add_listener(self, listener: Callable[[], None]) -> None:
-        """Call `listener` whenever there is a new result or step.
-
-        Parameters
-        ----------
-        listener : takes no argument.
-        """
+        """Call `listener` whenever there is a new result or step."""
         self._listeners.append(listener)
 
     def remove_listener(self, listener: Callable[[], None]) -> None:
-        """Remove a listener.
-
-        Parameters
-        ----------
-        listener : as given to `add_listener`.
-        """
+        """Remove a listener."""
         if listener in self._listeners:
             self._listeners.remove(listener)
 
@@ -340,15 +248,13 @@ class BackgroundFit:
             listener()
 
 
-_INITIAL_FRACTION = 0.04
-"""Fraction of the progress bar filled at the start; chosen: visible at a width of 200 pixels."""
+_INITIAL_FRACTION = 0.04  # Fraction of the progress bar filled at the start; chosen: visible at a width of 200 pixels
 
 
 class FitProgress:
-    """Progress of a fit, as a fraction and as text; `message` is shown when no fit runs.
-
-    The number of steps is unknown. Progress is measured on the logarithm of the predicted decrease of −2 ln L by the
-    next step, from its largest value down to `CONVERGED_DECREASE`, where a fit stops.
+    """Progress of a fit, as a fraction and as text; `message` is shown when no fit runs. The number of steps is
+    unknown. Progress is measured on the logarithm of the predicted decrease of −2 ln L by the next step, from its
+    largest value down to `CONVERGED_DECREASE`, where a fit stops.
     """
 
     def __init__(self) -> None:
@@ -359,21 +265,11 @@ class FitProgress:
         self._step: Step | None = None
 
     def begin(self, now: float) -> None:
-        """Start the clock of a new fit.
-
-        Parameters
-        ----------
-        now : monotonic clock, s.
-        """
+        """Start the clock of a new fit."""
         self._started, self._largest, self._fraction, self._step, self.message = now, 0.0, _INITIAL_FRACTION, None, ""
 
     def update(self, step: Step) -> None:
-        """Take the latest step of the fit into account.
-
-        Parameters
-        ----------
-        step : the last one of the fit.
-        """
+        """Take the latest step of the fit into account."""
         self._step = step
         if math.isfinite(step.predicted_decrease) and step.predicted_decrease > 0:
             self._largest = max(self._largest, step.predicted_decrease)
@@ -384,19 +280,7 @@ class FitProgress:
             self._fraction = max(self._fraction, min(done / whole, 0.97))
 
     def state(self, now: float, task: str, other: Step | None = None) -> tuple[float, str]:
-        """Return the fraction done and the text of the status line.
-
-        Parameters
-        ----------
-        now : monotonic clock, s.
-        task : what is done.
-        other : the latest step of a fit that has to finish first; None for none.
-
-        Returns
-        -------
-        fraction : float, 0 to 1
-        text : str
-        """
+        """Return the fraction done and the text of the status line. Returns fraction, text."""
         step = other or self._step
         where = f" · step {step.iteration}" if step is not None else ""
         promise = ""
@@ -409,19 +293,9 @@ class FitProgress:
         return self._fraction, f"{task}{where}{promise} · {now - self._started:.1f} s"
 
     def end(self, message: str) -> None:
-        """Show why a fit ended.
-
-        Parameters
-        ----------
-        message : blank if the fit succeeded.
-        """
+        """Show why a fit ended."""
         self.message = message
 
     def set_message(self, message: str) -> None:
-        """Show a message without ending the fit.
-
-        Parameters
-        ----------
-        message : the text.
-        """
+        """Show a message without ending the fit."""
         self.message = message

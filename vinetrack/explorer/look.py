@@ -16,8 +16,8 @@ from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS
 
 TEMPLATES = Path(__file__).with_name("templates")
 SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+# Colours over a grey picture: the tracked edge, the edge of the model for comparison, and of the current model
 MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
-"""Colours over a grey picture: the tracked edge, the edge of the model for comparison, and of the current model."""
 
 _AXIS = {
     "axis_label_text_font": SANS,
@@ -57,16 +57,7 @@ def page_style() -> str:
 
 
 def screen_script(figures: Sequence[figure]) -> CustomJS:
-    """Return a script that adapts figures to a light or dark colour scheme.
-
-    Parameters
-    ----------
-    figures : whose colours are adapted.
-
-    Returns
-    -------
-    CustomJS
-    """
+    """Return a script that adapts figures to a light or dark colour scheme."""
     code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
     return CustomJS(args={"plots": list(figures), "tokens": TOKENS}, code=code)
 
@@ -78,48 +69,17 @@ def vine_colour() -> dict[str, Any]:
 
 
 def stylesheet(more: str = "") -> InlineStyleSheet:
-    """Return CSS inside a widget, which the CSS of the page does not reach.
-
-    Parameters
-    ----------
-    more : CSS added to `widgets.css`.
-
-    Returns
-    -------
-    InlineStyleSheet
-    """
+    """Return CSS inside a widget, which the CSS of the page does not reach."""
     return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
 
 
 def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
-    """Return a piece of HTML as a widget.
-
-    Parameters
-    ----------
-    text : HTML.
-    name : name of the widget in the document.
-    keywords : of `bokeh.models.Div`.
-
-    Returns
-    -------
-    Div
-    """
+    """Return a piece of HTML as a widget."""
     return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
-    """Return an empty figure as wide as its card.
-
-    Parameters
-    ----------
-    height : pixels.
-    x_label, y_label : with units.
-    keywords : of `bokeh.plotting.figure`.
-
-    Returns
-    -------
-    figure
-    """
+    """Return an empty figure as wide as its card."""
     fig = figure(
         height=height,
         sizing_mode="stretch_width",
@@ -140,32 +100,12 @@ def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
 
 
 def escaped(text: object) -> str:
-    """Return text escaped for HTML.
-
-    Parameters
-    ----------
-    text : converted by `str`.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return text escaped for HTML."""
     return html.escape(str(text))
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
-    """Return a table in HTML; cells are escaped, columns `numeric` are right-aligned.
-
-    Parameters
-    ----------
-    rows : cells of each row.
-    header : names of the columns.
-    numeric : indices of right-aligned columns.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return a table in HTML; cells are escaped, columns `numeric` are right-aligned."""
     kinds = [' class="n"' if k in numeric else "" for k in range(len(header))]
     head = "".join(f"<th{kind}>{escaped(cell)}</th>" for kind, cell in zip(kinds, header, strict=True))
     body = "".join(
@@ -176,32 +116,13 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequ
 
 
 def progress_bar(share: float, text: str) -> str:
-    """Return a bar filled to a fraction, with text below it.
-
-    Parameters
-    ----------
-    share : 0 to 1.
-    text : below the bar.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return a bar filled to a fraction, with text below it."""
     percent = 100 * min(max(share, 0.02), 1.0)
     return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escaped(text)}</small>'
 
 
 def command_block(lines: Sequence[str]) -> str:
-    """Return commands to copy, as HTML.
-
-    Parameters
-    ----------
-    lines : one per command.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return commands to copy, as HTML."""
     return f"<pre><code>{escaped(chr(10).join(lines))}</code></pre>"
 
 

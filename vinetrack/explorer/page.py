@@ -45,24 +45,22 @@ from vinetrack.explorer.text_panels import (
 from vinetrack.figures.page_tokens import follows_screen
 from vinetrack.inference.optimiser import Step
 
+# Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
 REDRAW_DELAY_MS = 4
-"""Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw."""
 
+# Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again
 TEXT_DELAY_MS = 150
-"""Chosen: text follows a slider at reading speed, because each change makes the browser lay out the page again."""
 
-DIAGNOSIS_POLL_MS = 2000
-"""Chosen: interval at which the page looks for a new diagnosis."""
+DIAGNOSIS_POLL_MS = 2000  # Chosen: interval at which the page looks for a new diagnosis
 
-STATUS_INTERVAL_MS = 200
-"""Chosen: the status line shows tenths of a second."""
+STATUS_INTERVAL_MS = 200  # Chosen: the status line shows tenths of a second
 
+# A swipe over a figure scrolls the page, as it does elsewhere
 LET_SCROLL = """
 for (const plot of plots) {
   Bokeh.index.find_one(plot)?.canvas_view?.events_el?.style.setProperty("touch-action", "pan-y");
 }
 """
-"""A swipe over a figure scrolls the page, as it does elsewhere."""
 
 
 class Page:

@@ -21,11 +21,9 @@ from vinetrack.explorer.series import (
     symmetric_range,
 )
 
-ROW_PX = 25
-"""Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height."""
+ROW_PX = 25  # Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height
 
-MAX_BANDS = 4
-"""Chosen: bands of more conditions overlap and hide the curves."""
+MAX_BANDS = 4  # Chosen: bands of more conditions overlap and hide the curves
 
 
 class Plots:
@@ -119,13 +117,7 @@ class Plots:
         self._on_condition_click(names[new[0]])
 
     def set_shown(self, shown: Sequence[int], reference: Curves | None) -> None:
-        """Select the trials to draw, and the reference curves of their conditions.
-
-        Parameters
-        ----------
-        shown : indices of the trials to draw.
-        reference : curves of the model for comparison; None if they are the current ones.
-        """
+        """Select the trials to draw, and the reference curves of their conditions."""
         lines = measured_lines(self.campaign, shown)
         (left, right), (bottom, top) = axis_ranges(lines)
         self.motion.x_range.update(start=left, end=right)
@@ -137,13 +129,7 @@ class Plots:
         self._band.data = replicate_bands(self.campaign, shown if few else [])
 
     def set_reference(self, reference: Curves | None, shown: Sequence[int]) -> None:
-        """Set the curves for comparison.
-
-        Parameters
-        ----------
-        reference : curves of the model for comparison; None if they are the current ones.
-        shown : indices of the trials to draw.
-        """
+        """Set the curves for comparison."""
         key = (id(reference), tuple(shown))
         if key != self._reference_drawn:
             self._reference_drawn = key
@@ -152,22 +138,11 @@ class Plots:
             )
 
     def set_instant(self, since_s: float | None) -> None:
-        """Mark a time since release, or none.
-
-        Parameters
-        ----------
-        since_s : None for no mark.
-        """
+        """Mark a time since release, or none."""
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
     def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
-        """Set the curves of the current model; for lines already drawn only their ordinates are sent.
-
-        Parameters
-        ----------
-        curves : of the current model.
-        shown : indices of the trials to draw.
-        """
+        """Set the curves of the current model; for lines already drawn only their ordinates are sent."""
         lines, residual = model_lines(self.campaign, curves, shown), residual_lines(self.campaign, curves, shown)
         low, high = symmetric_range(residual)
         if high != self.residual.y_range.end:
@@ -186,13 +161,7 @@ class Plots:
         floors_m: Mapping[str, float],
         conditions: Sequence[str],
     ) -> None:
-        """Set the error of every condition; those not in `conditions` are drawn faint.
-
-        Parameters
-        ----------
-        now_m, before_m, floors_m : m by condition.
-        conditions : names.
-        """
+        """Set the error of every condition; those not in `conditions` are drawn faint."""
         rows = error_bars(self.campaign, now_m, before_m, floors_m, conditions)
         known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
         end = round_up(1.04 * max(known, default=1.0))
@@ -204,19 +173,7 @@ class Plots:
 
 
 def round_up(value: float) -> float:
-    """Return the next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis rarely changes.
-
-    Parameters
-    ----------
-    value : largest value of an axis.
-
-    Returns
-    -------
-    float
-
-    >>> round_up(0.42), round_up(7.1)
-    (0.5, 8.0)
-    """
+    """Return the next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis rarely changes."""
     if not value > 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -21,8 +21,7 @@ from vinetrack.pipeline.proposed_effects import WrittenProposal, propose_effect
 if TYPE_CHECKING:
     from vinetrack.explorer.page import Page
 
-Reopen = Callable[[BackgroundFit], None]
-"""Makes pages opened from now on show another campaign."""
+Reopen = Callable[[BackgroundFit], None]  # Makes pages opened from now on show another campaign
 
 PROPOSE = "Propose an effect"
 INTRODUCTION = (
@@ -30,9 +29,8 @@ INTRODUCTION = (
     " as an effect file of your own, beside the experiment. It takes minutes."
 )
 RELOAD = "location.reload()"
+# Fraction of the progress bar at the start, and the time in which it is two thirds full (chosen)
 INITIAL_FRACTION, TYPICAL_DURATION_S = 0.04, 150.0
-"""Fraction of the progress bar at the start, and the time in which it is two thirds full. Chosen: half of the proposals
-timed took less; the remaining time is unknown."""
 
 
 @dataclass(frozen=True)
@@ -44,23 +42,7 @@ class ReadProposal:
 
 
 def propose_and_read(campaign: Campaign, on_progress: Callable[[str], None]) -> ReadProposal:
-    """Propose an effect, write it to the experiment's folder, and read the campaign with it.
-
-    Parameters
-    ----------
-    campaign : whose diagnosis ended as `unexplained`.
-    on_progress : callable
-        Called with a sentence at each step; an exception that it raises ends the search.
-
-    Returns
-    -------
-    ReadProposal
-
-    Raises
-    ------
-    UserError
-        If there is no such diagnosis, the simulation fails, or the file exists already.
-    """
+    """Propose an effect, write it to the experiment's folder, and read the campaign with it."""
     written = propose_effect(campaign.experiment, campaign.folder, None, on_progress)
     effects = {effect.name: effect for effect in map(load_effect, written.files)}
     known = {name: effect for name, effect in campaign.effects.items() if name not in effects}

@@ -25,23 +25,18 @@ if TYPE_CHECKING:
 
     from vinetrack.video.axis import Axis
 
-MAX_WIDTH_PX = 960
-"""Chosen: as wide as the page shows a recording."""
+MAX_WIDTH_PX = 960  # Chosen: as wide as the page shows a recording
 
-JPEG_QUALITY = 88
-"""JPEG quality, 0 to 100; chosen: at 88 an edge shows no blocks, and 1000 frames take some tens of megabytes."""
+JPEG_QUALITY = 88  # JPEG quality, 0 to 100
 
-PROGRESS_EVERY_FRAMES = 10
-"""Frames between two reports of progress; chosen: several reports a second."""
+PROGRESS_EVERY_FRAMES = 10  # Frames between two reports of progress; chosen: several reports a second
 
 
 @dataclass(frozen=True)
 class RecordingView:
-    """Mapping of positions along the growth axis to the picture of one recording, px of the recording.
-
-    `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
-    `lead_position_m` are those of the track. `shake_px`, shape (n_frames,), is the shift of each picture along the axis
-    by camera shake; `by_hand`, shape (n_frames,), marks points corrected by hand.
+    """Mapping of positions along the growth axis to the picture of one recording, px of the recording. `edge_px`, shape
+    (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and `lead_position_m` are those of
+    the track.
     """
 
     trial: str
@@ -55,17 +50,8 @@ class RecordingView:
     by_hand: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def along_px(self, lead_position_m: Floats) -> Floats:
-        """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track.
-
-        NaN if the track has fewer than two points.
-
-        Parameters
-        ----------
-        lead_position_m : any shape.
-
-        Returns
-        -------
-        array of the same shape, px
+        """Return the pixels along the axis of positions of the track; linearly extrapolated beyond the track. NaN if
+        the track has fewer than two points.
         """
         known = np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m)
         if np.count_nonzero(known) < 2:
@@ -80,15 +66,7 @@ class RecordingView:
 
     def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the ends of a line across the vine at a position along the axis; with `frame`, in that picture.
-
-        Parameters
-        ----------
-        along_px : position along the axis.
-        frame : number of the picture; None for the steady picture.
-
-        Returns
-        -------
-        xs, ys : of both ends, px
+        Returns xs, ys : of both ends, px.
         """
         if frame is not None and frame < self.shake_px.size:
             along_px += float(self.shake_px[frame])
@@ -98,17 +76,7 @@ class RecordingView:
 
 
 def recording_view(results: Results, trial: Trial) -> RecordingView | str:
-    """Return the view of a trial, or the reason why there is none.
-
-    Parameters
-    ----------
-    results : the folder.
-    trial : of the experiment.
-
-    Returns
-    -------
-    RecordingView, or str with the reason
-    """
+    """Return the view of a trial, or the reason why there is none."""
     if trial.video is None:
         name = trial.track.name if trial.track is not None else "a table"
         return f"{trial.name} came as a track ({name}): there is no recording to show, only the positions of its edge."
@@ -145,9 +113,8 @@ def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingV
 
 @dataclass
 class DecodedRecording:
-    """Frames of one recording, decoded in the background. `shape` is the height and width of the pictures, px.
-
-    `scale` is the number of their pixels per pixel of the recording; `error` is blank unless decoding failed.
+    """Frames of one recording, decoded in the background. `shape` is the height and width of the pictures, px. `scale`
+    is the number of their pixels per pixel of the recording; `error` is blank unless decoding failed.
     """
 
     path: Path
@@ -161,32 +128,14 @@ class DecodedRecording:
     _cancelled: bool = False
 
     def picture(self, frame: int) -> NDArray[np.uint8]:
-        """Return the grey levels of one frame.
-
-        Parameters
-        ----------
-        frame : its number.
-
-        Returns
-        -------
-        array, uint8, shape `shape`
-        """
+        """Return the grey levels of one frame."""
         import cv2
 
         data = np.frombuffer(self._frames[frame], dtype=np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
     def decode(self, on_progress: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
-        """Decode every frame.
-
-        Parameters
-        ----------
-        on_progress : called every `PROGRESS_EVERY_FRAMES` frames and at the end.
-
-        Returns
-        -------
-        DecodedRecording, itself
-        """
+        """Decode every frame."""
         from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
         try:
@@ -206,12 +155,7 @@ class DecodedRecording:
         return self
 
     def start_decoding(self, on_progress: Callable[[DecodedRecording], None]) -> None:
-        """Run `decode` in a thread, from which `on_progress` is called.
-
-        Parameters
-        ----------
-        on_progress : as of `decode`.
-        """
+        """Run `decode` in a thread, from which `on_progress` is called."""
         threading.Thread(target=self.decode, args=(on_progress,), daemon=True, name=f"{THREAD_PREFIX}film").start()
 
     def cancel(self) -> None:

@@ -14,38 +14,19 @@ from vinetrack.explorer.campaign import Campaign, ExplorerTrial, condition_label
 from vinetrack.explorer.curves import Curves
 from vinetrack.figures.style import vine_styles
 
-MAX_POINTS = 250
-"""Points of a line on the page; chosen: one per three or four pixels; more take longer to send than to compute."""
+MAX_POINTS = 250  # Points of a line on the page; chosen: one per three or four pixels
 
 Columns = dict[str, list[Any]]
 
 
 def colours(campaign: Campaign) -> dict[str, str]:
-    """Return the colour of each condition: that of its vine, as in every figure.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-
-    Returns
-    -------
-    dict, hexadecimal code by condition
-    """
+    """Return the colour of each condition: that of its vine, as in every figure."""
     styles = vine_styles(campaign.vines)
     return {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
 
 
 def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return a distinguishing label and the colour of each vine.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-
-    Returns
-    -------
-    list of (label, hexadecimal code)
-    """
+    """Return a distinguishing label and the colour of each vine."""
     styles = vine_styles(campaign.vines)
     first = {aligned.data.trial.vine: aligned.data.trial for aligned in reversed(campaign.trials)}
     bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
@@ -54,32 +35,14 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def plotted_rows(count: int, first: int) -> slice:
-    """Return the rows of a track to draw: from a little before the motion, at most `MAX_POINTS`.
-
-    Parameters
-    ----------
-    count : points of the track.
-    first : the first that moves.
-
-    Returns
-    -------
-    slice
-    """
+    """Return the rows of a track to draw: from a little before the motion, at most `MAX_POINTS`."""
     begin = max(first - max((count - first) // 20, 2), 0)
     return slice(begin, None, max(math.ceil((count - begin) / MAX_POINTS), 1))
 
 
 def measured_lines(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Return lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    shown : indices of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
+    """Return lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`,
+    `condition`.
     """
     trials = [campaign.trials[i] for i in shown]
     return _lines_by_trial(campaign, [(aligned, aligned.time_s, aligned.growth_m) for aligned in trials])
@@ -108,17 +71,7 @@ def _with_gaps(aligned: ExplorerTrial, rows: slice, values: Floats) -> Floats:
 
 
 def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Return outlines of one standard deviation of the replicates around their mean, ms and mm.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    shown : indices of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
+    """Return outlines of one standard deviation of the replicates around their mean, ms and mm."""
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": []}
     for condition in _conditions(campaign, shown):
@@ -134,18 +87,7 @@ def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
 
 
 def model_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    curves : of the model.
-    shown : indices of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
+    """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
     columns: Columns = {"xs": [], "ys": []}
     for condition in _conditions(campaign, shown):
         members = [i for i in shown if campaign.trials[i].condition == condition]
@@ -158,18 +100,7 @@ def model_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Col
 
 
 def residual_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    curves : of the model.
-    shown : indices of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
+    """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm."""
     trials = [(campaign.trials[i], curves[i]) for i in shown]
     return _lines_by_trial(campaign, [(aligned, aligned.growth_m, motion.residual_m) for aligned, motion in trials])
 
@@ -181,17 +112,8 @@ def error_bars(
     floors_m: Mapping[str, float],
     shown: Sequence[str],
 ) -> Columns:
-    """Return one row per condition, the first at the bottom: `label`, `now`, `before`, `floor` (mm), `colour`, `alpha`.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    now_m, before_m, floors_m : errors of the current model and the one for comparison, and replicate scatter, m.
-    shown : conditions that are not drawn faint.
-
-    Returns
-    -------
-    dict, lists by column
+    """Return one row per condition, the first at the bottom: `label`, `now`, `before`, `floor` (mm),
+    `colour`, `alpha`.
     """
     colour = colours(campaign)
     names = list(reversed(campaign.conditions))
@@ -207,17 +129,7 @@ def error_bars(
 
 
 def axis_ranges(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return ranges that contain all lines with a margin.
-
-    Parameters
-    ----------
-    columns : lines, `xs` and `ys`.
-    share : margin, as a fraction of the range.
-
-    Returns
-    -------
-    (left, right), (bottom, top)
-    """
+    """Return ranges that contain all lines with a margin. Returns (left, right), (bottom, top)."""
     if not columns["xs"]:
         return (0.0, 1.0), (0.0, 1.0)
     ranges = []
@@ -230,16 +142,8 @@ def axis_ranges(columns: Columns, share: float = 0.05) -> tuple[tuple[float, flo
 
 
 def symmetric_range(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
-    """Return a symmetric range for residuals, rounded so that it rarely changes while a slider moves.
-
-    Parameters
-    ----------
-    columns : lines, `ys` in mm.
-    least_mm : smallest half of the range.
-
-    Returns
-    -------
-    low, high : float, mm
+    """Return a symmetric range for residuals, rounded so that it rarely changes while a slider moves. Returns low, high
+    : float, mm.
     """
     parts: list[Floats] = columns["ys"]
     largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)

@@ -20,24 +20,13 @@ from vinetrack.core.local_page import LOOPBACK, allowed_hosts, secret_path, serv
 from vinetrack.explorer.fitting import BackgroundFit
 
 SILENCED_LOGGERS = ("bokeh", "tornado")
-THREAD_SWITCH_S = 1e-3
-"""Thread switch interval; chosen: with Python's default of 5 ms each slider move waits that long while a fit runs."""
+THREAD_SWITCH_S = 1e-3  # Thread switch interval
 
-KEEP_ALIVE_MS = 20_000
-"""Interval of pings to an open page; chosen: a closed page is noticed within half a minute."""
+KEEP_ALIVE_MS = 20_000  # Interval of pings to an open page; chosen: a closed page is noticed within half a minute
 
 
 def application(background: BackgroundFit) -> Application:
-    """Return the application, which creates a page for each visitor.
-
-    Parameters
-    ----------
-    background : the background fit, shared by all pages.
-
-    Returns
-    -------
-    Application
-    """
+    """Return the application, which creates a page for each visitor."""
     from vinetrack.explorer.page import Page
 
     shown = [background]
@@ -49,23 +38,7 @@ def application(background: BackgroundFit) -> Application:
 
 
 def start_server(background: BackgroundFit, port: int | None = None) -> Server:
-    """Return a server that is bound to the loopback address and refuses requests from other pages.
-
-    Parameters
-    ----------
-    port
-        Port, 0 for any free one; None for the first free one from `FIRST_PORT`.
-    background : the background fit, shared by all pages.
-
-    Returns
-    -------
-    Server
-
-    Raises
-    ------
-    PageError
-        If the port is taken.
-    """
+    """Return a server that is bound to the loopback address and refuses requests from other pages."""
     return serve_on_free_port(lambda number: _bind(background, number), port)
 
 
@@ -93,9 +66,8 @@ def _bind(background: BackgroundFit, port: int) -> Server:
 
 
 def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
-    """Answer 403, on every route and on the web socket, to requests with another host name (DNS rebinding).
-
-    Bokeh checks only the origin of a web socket, which matches if a foreign name resolves to this machine.
+    """Answer 403, on every route and on the web socket, to requests with another host name (DNS rebinding). Bokeh
+    checks only the origin of a web socket, which matches if a foreign name resolves to this machine.
     """
     tornado = server._tornado
     routed = tornado.find_handler
@@ -109,36 +81,14 @@ def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
 
 
 def address(server: Server) -> str:
-    """Return the address of the page.
-
-    Parameters
-    ----------
-    server : the running server.
-
-    Returns
-    -------
-    str
-    """
+    """Return the address of the page."""
     return f"http://{LOOPBACK}:{server.port}{server.prefix}/"
 
 
 def serve(
     background: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True
 ) -> None:
-    """Serve until Ctrl-C (or SIGTERM).
-
-    Parameters
-    ----------
-    background : the background fit, shared by all pages.
-    say : prints a line.
-    port : as of `start_server`.
-    browser : whether a browser is opened.
-
-    Raises
-    ------
-    PageError
-        If the port is taken.
-    """
+    """Serve until Ctrl-C (or SIGTERM)."""
     for name in SILENCED_LOGGERS:
         logging.getLogger(name).setLevel(logging.ERROR)
     # A background fit would otherwise delay the page.

@@ -25,15 +25,11 @@ from vinetrack.narrative.verdict_summary import estimate_text
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
-FLOOR_MARGIN = 1.15
-"""Chosen: an error up to 1.15 times the replicate scatter counts as equal to it; with six replicates that scatter is
-itself known to 1/√(2·5) = 32 %."""
+FLOOR_MARGIN = 1.15  # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it
 
-MAX_PAIRS = 6
-"""Pairs of correlated parameters shown; chosen: the card has room for six lines."""
+MAX_PAIRS = 6  # Pairs of correlated parameters shown; chosen: the card has room for six lines
 
-MAX_COMPARED_EFFECTS = 8
-"""Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels."""
+MAX_COMPARED_EFFECTS = 8  # Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels
 
 
 @dataclass(frozen=True)
@@ -56,18 +52,7 @@ class HeldModel:
 
 
 def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
-    """Return the held model and the current one as a table: error, and every fitted parameter of either.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    held : None if none is held.
-    now : the current model.
-
-    Returns
-    -------
-    str, HTML; blank if none is held
-    """
+    """Return the held model and the current one as a table: error, and every fitted parameter of either."""
     if held is None:
         return ""
     models = (held, now)
@@ -83,18 +68,7 @@ def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel)
 
 
 def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
-    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    choice : effects and sizes.
-    now_m, before_m : errors by condition, m.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
     now, before, floor = (overall_m(errors, campaign.conditions) for errors in (now_m, before_m, campaign.floors_m))
     words = model_text(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
@@ -118,19 +92,7 @@ def _mm(value_m: float) -> str:
 def fitted_numbers_html(
     campaign: Campaign, fitted: Fitted | None, fitted_models: Sequence[LadderEntry], sizes_changed: bool
 ) -> str:
-    """Return the table of fitted parameters and the models fitted so far, as HTML.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    fitted : the last fit; None before the first.
-    fitted_models : models fitted on this page.
-    sizes_changed : whether sizes were changed since.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return the table of fitted parameters and the models fitted so far, as HTML."""
     if fitted is None:
         return "<p class='muted'>The model in use is being fitted; its parameters will appear here.</p>"
     vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
@@ -180,35 +142,13 @@ def _ladder(campaign: Campaign, fitted_models: Sequence[LadderEntry]) -> str:
 
 
 def ladder_entry(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> LadderEntry:
-    """Return the entry of a fit in the table of fitted models.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    fitted : the fit.
-    before : the fit before it; None for the first.
-
-    Returns
-    -------
-    LadderEntry
-    """
+    """Return the entry of a fit in the table of fitted models."""
     gained = "" if before is None else likelihood_change_text(before.fit, fitted.fit)
     return LadderEntry(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
 
 
 def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fitted | None) -> str:
-    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    summary : the diagnosis; None if there is none.
-    fitted : the last fit; None before the first.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return what the data cannot separate: effects, by the diagnosis; parameters, by their correlations."""
     parts = []
     if summary is None:
         parts.append(
@@ -232,16 +172,7 @@ def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fit
 
 
 def cosine_grid(summary: DiagnosisSummary) -> str:
-    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two.
-
-    Parameters
-    ----------
-    summary : the diagnosis.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
     names = [name for name in summary.best if name in summary.cosine_names]
     names += [name for *pair, _ in summary.most_tied() for name in pair]
     names = list(dict.fromkeys(names))[:MAX_COMPARED_EFFECTS]
@@ -274,17 +205,7 @@ def _spaced(name: str) -> str:
 
 
 def next_panel(campaign: Campaign, summary: DiagnosisSummary | None) -> str:
-    """Return the next experiment of the diagnosis, as HTML.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    summary : the diagnosis; None if there is none.
-
-    Returns
-    -------
-    str, HTML
-    """
+    """Return the next experiment of the diagnosis, as HTML."""
     if summary is None:
         command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
         return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
@@ -358,16 +279,7 @@ class DiagnosisSummary:
         return tuple(dict.fromkeys([*self.answer_set, *ranked]))
 
     def most_tied(self, least: float = TIED_COSINE) -> list[tuple[str, str, float]]:
-        """Return the pairs of candidates with |cosine| of at least `least`, largest first.
-
-        Parameters
-        ----------
-        least : smallest |cosine|.
-
-        Returns
-        -------
-        list of (effect, effect, cosine)
-        """
+        """Return the pairs of candidates with |cosine| of at least `least`, largest first."""
         pairs = [
             (name, other, self.cosines[i][k])
             for i, name in enumerate(self.cosine_names)
@@ -378,16 +290,7 @@ class DiagnosisSummary:
 
 
 def read_summary(folder: Path) -> DiagnosisSummary | None:
-    """Return the diagnosis of a results folder, None if there is none or it cannot be read.
-
-    Parameters
-    ----------
-    folder : the results.
-
-    Returns
-    -------
-    DiagnosisSummary or None
-    """
+    """Return the diagnosis of a results folder, None if there is none or it cannot be read."""
     try:
         diagnosis = read_diagnosis(Results(folder))
     except ResultsError:

@@ -24,33 +24,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_CANDIDATES = 12
-"""Candidates drawn per round; chosen: 0.33 in each, 4 in of figure; the table in the report has all."""
+MAX_CANDIDATES = 12  # Candidates drawn per round; chosen: 0.33 in each, 4 in of figure; the table in the report has all
 
 _ROLES = {
     "answer": ("in the answer set", BLUE),
     "physical": ("explains less", MUTED),
     "measurement": ("fault of the measurement", ORANGE),
 }
-_WIDTH_IN = 8.6
-"""Chosen: bars of 4 in beside names of 22 letters and sizes of 60."""
+_WIDTH_IN = 8.6  # Chosen: bars of 4 in beside names of 22 letters and sizes of 60
 
-_ROW_IN = 0.33
-"""Chosen: two lines of 9 pt would fit, so rows stay apart."""
+_ROW_IN = 0.33  # Chosen: two lines of 9 pt would fit, so rows stay apart
 
 
 def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
-    """Draw √Δχ² of every candidate, with its fitted size.
-
-    Parameters
-    ----------
-    rounds : for each its question as text, and a table with a row per candidate, best first: `effect, kind, status,
-        delta_chi2, sigma, in_answer_set, plausible, size` (fitted values as text, blank if there are none).
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw √Δχ² of every candidate, with its fitted size."""
     from matplotlib.figure import Figure
 
     drawn = [(title, _drawable(table)) for title, table in rounds]
@@ -129,27 +116,13 @@ def _candidate_legend(fig: Figure, tables: Sequence[pd.DataFrame]) -> None:
     fig.legend(handles=handles, loc="outside upper left", ncols=len(handles), fontsize=9, handlelength=1.3)
 
 
-TIED_COSINE = 0.95
-"""Chosen: above it two candidates count as tied. The part of one that the other cannot imitate is √(1 − 0.95²) = 31 %
-of its effect, so telling them apart takes 3.2 times the significance of seeing either. At 0.9 that is 44 % and 2.3
-times, at 0.975 22 % and 4.5 times."""
+TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 
-MAX_EFFECTS = 22
-"""Chosen: 0.36 in each make a square of 8 in, and cells that hold two digits of 7.5 pt."""
+MAX_EFFECTS = 22  # Chosen: 0.36 in each make a square of 8 in, and cells that hold two digits of 7.5 pt
 
 
 def draw_cosines(effects: Sequence[str], matrix: Sequence[Sequence[float]]) -> Figure:
-    """Draw the matrix of cosines.
-
-    Parameters
-    ----------
-    effects : names, the best candidate first.
-    matrix : cosines in their order, shape (n_effects, n_effects).
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the matrix of cosines. Shapes: matrix (n_effects, n_effects)."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
@@ -185,8 +158,8 @@ def draw_cosines(effects: Sequence[str], matrix: Sequence[Sequence[float]]) -> F
     return fig
 
 
-_MAX_DRIFT_PANELS = 6
-"""Chosen: two rows of three panels."""
+_MAX_DRIFT_PANELS = 6  # Chosen: two rows of three panels
+# Conditions: label, and factor from SI
 _CONDITIONS = {
     "pressure_Pa": ("pressure (kPa)", 1e-3),
     "payload_kg": ("payload (g)", 1e3),
@@ -195,25 +168,13 @@ _CONDITIONS = {
     "inlet_m": ("inlet (mm)", 1e3),
     "vine": ("vine", 1.0),
 }
-"""Conditions: label, and factor from SI."""
 
 _MODELS = {"before": (BEFORE, "before", -0.06), "after": (AFTER, "after", 0.06)}
 
 
 def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
-    """Draw the best value of a parameter in each group of trials, relative to the common law, against a condition.
-
-    With a complete model all groups are at 1.
-
-    Parameters
-    ----------
-    groups : one row per group: `model` (`before` or `after`), `parameter, vine, symbol, against, level, ratio,
-        ratio_sigma, n_trials`; SI, `level` NaN if the groups are vines. Panels in order of first appearance.
-    added : the effects that were added, as text.
-
-    Returns
-    -------
-    Figure
+    """Draw the best value of a parameter in each group of trials, relative to the common law, against a condition. With
+    a complete model all groups are at 1.
     """
     from matplotlib.figure import Figure
 

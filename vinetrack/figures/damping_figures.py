@@ -1,6 +1,7 @@
 """The damping law: points with both fits of F = B·x_ssⁿ, and the parameters with all their intervals.
 
-On logarithmic axes the law is a straight line of slope n, the same for all vines. Trials not used in a fit are hollow.
+On logarithmic axes the law is a straight line of slope n, the same for all vines. Trials not used in a fit
+are hollow.
 """
 
 from __future__ import annotations
@@ -22,26 +23,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TWO_LINE_VINES = 6
-"""Chosen: a legend with two lines for each of six vines is 2.5 in high, of 5.6 in of figure; twice as many overflow."""
+_TWO_LINE_VINES = 6  # Chosen: a legend with two lines for each of six vines is 2.5 in high, of 5.6 in of figure
 
-_MAX_LEGEND_VINES = 14
-"""Chosen: with one line each, and those of both methods, they fill the height of the figure; others are counted."""
+_MAX_LEGEND_VINES = 14  # Chosen: with one line each, and those of both methods, they fill the height of the figure
 
 
 def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure:
-    """Draw F against x_ss for every vine.
-
-    Parameters
-    ----------
-    points : one row per trial with `trial, vine, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N, used`.
-    damping : as in `damping.json`.
-
-    Returns
-    -------
-    Figure
-        If there is nothing to draw, it states the reason, as in all drawing functions.
-    """
+    """Draw F against x_ss for every vine."""
     from matplotlib.figure import Figure
 
     drawable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
@@ -106,19 +94,8 @@ def _draw_law(
 
 
 def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.ndarray | None:
-    """Return the standard error of ln F = ln B + n·ln x_ss along the law of one vine.
-
-    With the covariance C of (ln B, n): var ln F = C_BB + 2·ln x_ss·C_Bn + (ln x_ss)²·C_nn.
-
-    Parameters
-    ----------
-    fit : one method's entry of `damping.json`.
-    x_ss_m_s : steady tail speeds, shape (n_points,).
-    vine : its name in `fit`.
-
-    Returns
-    -------
-    array, shape (n_points,), or None if the fit states no finite covariance for this vine
+    """Return the standard error of ln F = ln B + n·ln x_ss along the law of one vine. With the covariance C of (ln B,
+    n): var ln F = C_BB + 2·ln x_ss·C_Bn + (ln x_ss)²·C_nn. Shapes: x_ss_m_s (n_points,) → (n_points,).
     """
     covariance = fit.get("covariance") or {}
     names, matrix = covariance.get("parameters"), covariance.get("matrix")
@@ -164,24 +141,13 @@ def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styl
 
 _B_KEYS = ("B", "B_95", "B_95_total")
 _OFFSETS = {"log_log": -0.17, "both_axes": 0.17}
-_MAX_VINES = 40
-"""Chosen: at half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole."""
+_MAX_VINES = 40  # Chosen: at half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole
 
 
 def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
-    """Draw n and B with their 95 % intervals, B as deviation from its best estimate.
-
-    Thick bars come from a bootstrap of whole trials, or from Student's t if they are too few; thin ones add the stated
-    error of the yield pressure, which all trials of a vine share and a bootstrap cannot show.
-
-    Parameters
-    ----------
-    damping : as in `damping.json`.
-    published : published values, drawn too: `{"n": …, "B": {vine: …}, "source": …}`; None for none.
-
-    Returns
-    -------
-    Figure
+    """Draw n and B with their 95 % intervals, B as deviation from its best estimate. Thick bars come from a bootstrap
+    of whole trials, or from Student's t if they are too few; thin ones add the stated error of the yield pressure,
+    which all trials of a vine share and a bootstrap cannot show.
     """
     from matplotlib.figure import Figure
 

@@ -15,22 +15,12 @@ from vinetrack.figures.style import BLUE, DASHED, INK, MUTED, VERMILLION, VINE_C
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Vine, pressure in kPa, payload in g, speed of the leading edge at y/L = 0.95 in m/s, of one trial
 PlannedPoint = tuple[str, float, float, float]
-"""Vine, pressure in kPa, payload in g, speed of the leading edge at y/L = 0.95 in m/s, of one trial."""
 
 
 def draw_campaign(points: Sequence[PlannedPoint], n_error: float, B_errors: Mapping[str, float]) -> Figure:
-    """Draw every condition, with its number of trials, at its expected speed.
-
-    Parameters
-    ----------
-    points : one per trial.
-    n_error, B_errors : expected standard errors, of B relative and by vine.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw every condition, with its number of trials, at its expected speed."""
     from matplotlib.figure import Figure
 
     counts = Counter(points)
@@ -67,15 +57,7 @@ def draw_campaign(points: Sequence[PlannedPoint], n_error: float, B_errors: Mapp
 
 @dataclass(frozen=True)
 class FilmChoice:
-    """One film.
-
-    Attributes
-    ----------
-    diameters_mm, speeds_m_s : best speed at every diameter, shape (n_diameters,).
-    best : diameter in mm and speed of the fastest.
-    band : 90 % interval of that speed, m/s.
-    odds : probability that this film is the fastest, from 0 to 1.
-    """
+    """One film."""
 
     thickness_um: float
     diameters_mm: np.ndarray
@@ -86,17 +68,7 @@ class FilmChoice:
 
 
 def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
-    """Draw the films side by side: speed against diameter, and the certainty of the choice.
-
-    Parameters
-    ----------
-    films : fastest first.
-    name, y_over_L : name of the speed, and the fraction of the growth at which it is taken.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the films side by side: speed against diameter, and the certainty of the choice."""
     from matplotlib.figure import Figure
 
     label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
@@ -125,8 +97,7 @@ def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figu
     return fig
 
 
-_MIN_LITRE_AXIS = 1e-4
-"""Chosen: below 0.1 mL an axis is in millilitres, so that its ticks need no exponent."""
+_MIN_LITRE_AXIS = 1e-4  # Chosen: below 0.1 mL an axis is in millilitres, so that its ticks need no exponent
 
 
 @dataclass(frozen=True)
@@ -140,19 +111,8 @@ class GasLawLoss:
 def draw_reservoir(
     volumes_m3: np.ndarray, laws: Sequence[GasLawLoss], loss: float, swept_m3: float, chosen_m3: float | None
 ) -> Figure:
-    """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume.
-
-    Parameters
-    ----------
-    volumes_m3 : array, shape (n_volumes,), rising.
-    laws : isothermal and adiabatic; the area between the first two is shaded.
-    loss : allowed fraction of the gauge pressure.
-    swept_m3 : volume of the grown vine.
-    chosen_m3 : volume of the chamber in question; None for none.
-
-    Returns
-    -------
-    Figure
+    """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume. Shapes: volumes_m3
+    (n_volumes,).
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,5 @@
-"""Errors of the models of the ladder, and the condition with the largest error of the initial model, before and after.
+"""Errors of the models of the ladder, and the condition with the largest error of the initial model, before
+and after.
 
 Errors change by factors, so their axis is logarithmic. The range below replicate scatter is shaded: an error there says
 nothing about the model.
@@ -21,31 +22,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Columns of `ladder.csv`, with label, colour, marker and line style
 _ERRORS = {
     "rms_in_sample_m": ("in sample", BLUE, "o", "-"),
     "rms_left_out_m": ("on left-out conditions", VERMILLION, "s", "-"),
     "rms_highest_pressure_m": ("on the left-out highest pressure", GREEN, "^", DASHED),
 }
-"""Columns of `ladder.csv`, with label, colour, marker and line style."""
 
-_WIDTH_IN = 5.2
-"""Chosen: both figures fit side by side on a page of 11 in."""
+_WIDTH_IN = 5.2  # Chosen: both figures fit side by side on a page of 11 in
 
-_STEP_IN = 1.55
-"""Width per model of the ladder; chosen: the longest name of an effect, wrapped at 18 letters of 10 pt."""
+_STEP_IN = 1.55  # Width per model of the ladder; chosen: the longest name of an effect, wrapped at 18 letters of 10 pt
 
 
 def draw_ladder(ladder: pd.DataFrame) -> Figure:
-    """Draw the errors of the initial model and of every further model of the ladder.
-
-    Parameters
-    ----------
-    ladder : as in `ladder.csv`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the errors of the initial model and of every further model of the ladder."""
     from matplotlib.figure import Figure
 
     if not len(ladder):
@@ -134,29 +124,14 @@ def _ladder_legend(ax: Axes, errors_mm: dict[str, np.ndarray]) -> None:
     )
 
 
-BEFORE, AFTER = VERMILLION, BLUE
-"""Colours of the models before and after adding effects, here and in the clips."""
+BEFORE, AFTER = VERMILLION, BLUE  # Colours of the models before and after adding effects, here and in the clips
 
-_BEFORE_LINE: Any = (0, (5, 2))
-"""Dashes of five line widths; chosen: slightly longer than `DASHED`, because lines of replicates overlap."""
-_MAX_POINTS = 160
-"""Points per trial; chosen: 160 on 5 in are one per 2.3 pt, closer than dots of 4.5 pt can be distinguished."""
+_BEFORE_LINE: Any = (0, (5, 2))  # Dashes of five line widths
+_MAX_POINTS = 160  # Points per trial; chosen
 
 
 def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figure:
-    """Draw one condition.
-
-    Parameters
-    ----------
-    title : the condition as text.
-    trials : `trial, time_s, lead_position_m, model_before_m, model_after_m`, time since release and positions from the
-        origin; `model_after_m` is NaN if nothing was added.
-    added : the effects that were added, as text.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw one condition."""
     from matplotlib.figure import Figure
 
     if trials.empty:
@@ -185,17 +160,8 @@ def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figu
 
 
 def rms_m(trials: pd.DataFrame, model: str) -> float:
-    """Return the root mean square error of position of a model after release, m.
-
-    Parameters
-    ----------
-    trials : one row per point with `trial, time_s, lead_position_m` and the model's positions.
-    model : column of the model: `model_before_m` or `model_after_m`.
-
-    Returns
-    -------
-    float
-        All trials have the same weight, as in `comparison.csv`; NaN without a prediction.
+    """Return the root mean square error of position of a model after release, m. Returns all trials have the same
+    weight, as in `comparison.csv`; NaN without a prediction.
     """
     squares = [
         float(np.mean((part["lead_position_m"] - part[model]) ** 2))

@@ -19,27 +19,13 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Floats
 
-_BAND = 1.96
-"""Half width of a 95 % band in standard errors. Derived: normal distribution."""
+_BAND = 1.96  # Half width of a 95 % band in standard errors (derived)
 
-_LEVELS, _LABELLED = 11, 5
-"""Shades from zero to the largest force, and labelled contour lines. Chosen: a tenth of the largest force can still be
-distinguished; more labels would overlap."""
+_LEVELS, _LABELLED = 11, 5  # Shades from zero to the largest force, and labelled contour lines (chosen)
 
 
 def draw_learned_force(table: pd.DataFrame) -> Figure:
-    """Draw the learned force.
-
-    Parameters
-    ----------
-    table : columns `lead_position_m, tail_velocity_m_s, time_s, pressure_Pa` (NaN if the force does not depend on it),
-        `force_N, sigma_N, trials` (number that came near) and `condition`: blank on the grid, else a point along the
-        first trial of a condition.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the learned force."""
     from matplotlib.figure import Figure
 
     variables = [name for name in FORCE_AXES if name in table and table[name].notna().any()]

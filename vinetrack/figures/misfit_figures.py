@@ -22,30 +22,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _AHEAD_COLOUR, _BEHIND_COLOUR = BLUE, VERMILLION
-_MAX_ROWS = 48
-"""Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once. If there are more, those with
-the largest misfit are drawn, and the legend says so."""
+_MAX_ROWS = 48  # Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once
 
-_NUMBERED_ROWS = 26
-"""Chosen: with more conditions, the figure is scaled down until numbers of 7.5 pt cannot be read."""
+_NUMBERED_ROWS = 26  # Chosen: with more conditions, the figure is scaled down until numbers of 7.5 pt cannot be read
 
 _COLUMNS = {"misfit_before_m": "before", "misfit_after_m": "after"}
 
 
 def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
-    """Draw the misfit by condition and position.
-
-    Parameters
-    ----------
-    table : one row per condition and bin of growth: `condition_label, n_trials, growth_from, growth_to` (fractions of
-        the growth), `misfit_before_m, misfit_after_m` (mean of measured minus model; the latter NaN if nothing was
-        added) and `scatter_m` (standard error of that mean from replicate scatter).
-    added : the effects that were added, as text.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the misfit by condition and position."""
     from matplotlib.figure import Figure
 
     shown = [c for c in _COLUMNS if len(table) and np.isfinite(table[c].to_numpy(dtype=float)).any()]
@@ -129,6 +114,7 @@ def _misfit_legend(fig: Figure, words: tuple[str, str], n_columns: int) -> None:
     fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, handlelength=1.3)
 
 
+# Quantities that the force may depend on: label, and factor from SI
 FORCE_AXES = {
     "tail_position_m": ("tail position x (mm)", 1e3),
     "lead_position_m": ("growth y (mm)", 1e3),
@@ -137,24 +123,12 @@ FORCE_AXES = {
     "time_s": ("time since release (ms)", 1e3),
     "pressure_Pa": ("pressure (kPa)", 1e-3),
 }
-"""Quantities that the force may depend on: label, and factor from SI."""
 
-_MAX_FORCE_PANELS = 4
-"""Chosen: two rows of two panels."""
+_MAX_FORCE_PANELS = 4  # Chosen: two rows of two panels
 
 
 def draw_missing_force(table: pd.DataFrame) -> Figure:
-    """Draw the missing force.
-
-    Parameters
-    ----------
-    table : one row per point: `against` (a key of `FORCE_AXES`), `value` (SI), `force_N, sigma_N` (one standard error,
-        NaN if unknown) and `condition`, blank for the mean over all.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the missing force."""
     from matplotlib.figure import Figure
 
     panels = [name for name in FORCE_AXES if len(table) and (table["against"] == name).any()][:_MAX_FORCE_PANELS]

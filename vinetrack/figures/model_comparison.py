@@ -17,47 +17,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_PANELS = 60
-"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label. If there are more
-conditions, those with the largest error are drawn, and the title says so."""
+MAX_PANELS = 60  # Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label
 
-_MAX_POINTS_IN_ALL = 12_000
-"""Measured: 12,000 points keep the SVG below a megabyte, with 200 trials too."""
+_MAX_POINTS_IN_ALL = 12_000  # Measured: 12,000 points keep the SVG below a megabyte, with 200 trials too
 
-_WIDTH_IN = 11.0
-"""Chosen: the width of the page at which letters of 11 pt are as large as its text."""
+_WIDTH_IN = 11.0  # Chosen: the width of the page at which letters of 11 pt are as large as its text
 _NO_FIT = "The model in use was not fitted: there is no prediction to compare with the measurement."
 
 _Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
 
 
 def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw positions since release: replicates, their band, and the model.
-
-    Parameters
-    ----------
-    comparison : one row per condition with `condition, condition_label, vine, rms_position_m, ratio`.
-    trajectories : by condition, `trial, time_s, lead_position_m, model_position_m, replicates_mean_m,
-        replicates_sigma_m`, and, if effects were added, `model_after_m`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw positions since release: replicates, their band, and the model."""
     return _panels(comparison, trajectories, _draw_positions, "time since release (ms)", "growth (mm)")
 
 
 def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw measurement minus model against growth.
-
-    Parameters
-    ----------
-    comparison, trajectories : as of `draw_model_comparison`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw measurement minus model against growth."""
     return _panels(comparison, trajectories, _draw_residuals, "growth (mm)", "measurement − model (mm)")
 
 

@@ -26,24 +26,21 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+# Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey
 TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
-"""Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey."""
 
+# Colour of a bent path: grey, so that only edges are coloured
 PATH = "#9aa3b0"
-"""Colour of a bent path: grey, so that only edges are coloured."""
 BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
-_MAX_ZOOM = 2.0
-"""Pixels of the clip per pixel of the recording; chosen: a larger zoom only shows single pixels."""
+_MAX_ZOOM = 2.0  # Pixels of the clip per pixel of the recording; chosen: a larger zoom only shows single pixels
 
+# Distance from the axis to which the edges of the models before and after are drawn, in radii of the tube
 _MODEL_EDGE_REACH = (2.0, 1.4)
-"""Distance from the axis to which the edges of the models before and after are drawn, in radii of the tube; chosen:
-outside the tube and of unequal length, so that all edges remain visible where they agree."""
 
 
 @dataclass(frozen=True)
 class Edge:
     """One edge in a clip: its name, its colour, and its position along the axis in every frame, px (NaN: none).
-
     `off_mm` is its distance ahead of the tracked edge in every frame, None for the tracked edge itself; `by_hand` marks
     the tracked edge at points corrected by hand.
     """
@@ -57,10 +54,8 @@ class Edge:
 
 @dataclass(frozen=True)
 class ClipView:
-    """Layout shared by all frames of a clip.
-
-    `size_px` is width and height of the recording; `mm_per_px` its scale along the axis; `slowed` the factor of the
-    slow motion.
+    """Layout shared by all frames of a clip. `size_px` is width and height of the recording; `mm_per_px` its scale
+    along the axis; `slowed` the factor of the slow motion.
     """
 
     title: str
@@ -87,20 +82,7 @@ def _even(value: float) -> int:
 
 
 def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
-    """Draw one frame of the clip, RGB, with even height and width.
-
-    Parameters
-    ----------
-    view : layout of the clip.
-    picture : the recording's frame in grey levels, uint8 (see `levels`).
-    frame : index of the frame in the edges.
-    time_ms : since release; NaN if the capture rate is unknown; the frame number is then written instead.
-    edges : the tracked one first, then those of the models before and after, then that of corrected points.
-
-    Returns
-    -------
-    array, uint8, shape (height, width, 3)
-    """
+    """Draw one frame of the clip, RGB, with even height and width. Shape (height, width, 3)."""
     from PIL import Image, ImageDraw
 
     width, height = view.picture_px
@@ -216,16 +198,8 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
-    """Return grey levels stretched so that `low` is black and `high` white.
-
-    Parameters
-    ----------
-    picture : luma of a frame, any integer type, shape (height, width).
-    low, high : values shown as black and as white.
-
-    Returns
-    -------
-    array, uint8, shape (height, width)
+    """Return grey levels stretched so that `low` is black and `high` white. Shapes: picture (height, width) → (height,
+    width).
     """
     stretched = (picture.astype(np.float32) - low) * (255.0 / max(high - low, 1e-9))
     return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

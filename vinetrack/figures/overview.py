@@ -24,20 +24,16 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
+# Chosen: 60 panels in rows of nine are 1.2 in wide, the narrowest that has room for its label
 MAX_CONDITION_PANELS = 60
-"""Chosen: 60 panels in rows of nine are 1.2 in wide, the narrowest that has room for its label."""
 
-MAX_PANELS = 120
-"""Chosen: twelve rows of ten panels; further vines are left out, and the title says so."""
+MAX_PANELS = 120  # Chosen: twelve rows of ten panels; further vines are left out, and the title says so
 
-_MAX_POINTS_IN_ALL = 12_000
-"""Measured: 12,000 points keep the SVG below a megabyte, with 900 trials too."""
+_MAX_POINTS_IN_ALL = 12_000  # Measured: 12,000 points keep the SVG below a megabyte, with 900 trials too
 
-_MIN_POINTS, _MAX_POINTS = 15, 150
-"""Points per trial. Chosen: fifteen suffice for a speed that rises and stays; a panel shows no more than 150."""
+_MIN_POINTS, _MAX_POINTS = 15, 150  # Points per trial (chosen)
 
-_WIDTH_IN = 11.0
-"""Chosen: the width of the page at which letters of 11 pt are as large as its text."""
+_WIDTH_IN = 11.0  # Chosen: the width of the page at which letters of 11 pt are as large as its text
 
 
 @dataclass(frozen=True)
@@ -54,18 +50,7 @@ class _Curve:
 
 
 def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw the speed of every trial.
-
-    Parameters
-    ----------
-    trials : one row per trial with `trial, vine, condition, condition_label, pressure_kPa, status, steady_from_s,
-        steady_to_s`.
-    kinematics : tables by trial, where they exist.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the speed of every trial."""
     from matplotlib.figure import Figure
 
     shown = trials[trials["status"] != "left_out"]

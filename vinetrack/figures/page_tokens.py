@@ -6,6 +6,7 @@ from pathlib import Path
 
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION
 
+# CSS custom property by colour of a figure; purple, sky and orange are visible in either scheme
 TOKENS = {
     INK.lower(): "--ink",
     GRID.lower(): "--grid",
@@ -15,7 +16,6 @@ TOKENS = {
     VERMILLION.lower(): "--vermillion",
     GREEN.lower(): "--green",
 }
-"""CSS custom property by colour of a figure; purple, sky and orange are visible in either scheme."""
 
 
 def page_tokens() -> str:
@@ -29,18 +29,6 @@ def page_frame() -> str:
 
 
 def follows_screen(colour: str) -> str:
-    """Return the CSS of a figure's colour, as a property if the page may change it.
-
-    Parameters
-    ----------
-    colour : hexadecimal code of a colour of figures.
-
-    Returns
-    -------
-    str
-
-    >>> follows_screen("#0072B2"), follows_screen("#CC79A7")
-    ('var(--blue)', '#CC79A7')
-    """
+    """Return the CSS of a figure's colour, as a property if the page may change it."""
     token = TOKENS.get(colour.lower())
     return colour if token is None else f"var({token})"

@@ -17,27 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import ArrayLike
 
-_CHARACTERS_PER_IN = 12.5
-"""Chosen: the mean character of DejaVu Sans at 10 pt is 4.7 pt wide, 15 per inch; a sixth is margin for wide ones."""
+_CHARACTERS_PER_IN = 12.5  # Chosen: the mean character of DejaVu Sans at 10 pt is 4.7 pt wide, 15 per inch
 
-_HEADROOM = 1.08
-"""Chosen: axes that begin at zero end 8 % above the largest value, so that no marker of 6 pt is cut."""
+_HEADROOM = 1.08  # Chosen: axes that begin at zero end 8 % above the largest value, so that no marker of 6 pt is cut
 
 
 def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list[Axes]:
-    """Divide a figure into rows of panels and hide the surplus ones.
-
-    Parameters
-    ----------
-    fig : to be divided.
-    count : panels to be drawn in.
-    n_columns : panels in a row.
-    keywords : of `Figure.subplots`, such as `sharey`.
-
-    Returns
-    -------
-    list, shape (count,)
-    """
+    """Divide a figure into rows of panels and hide the surplus ones. Shape (count,)."""
     axes = fig.subplots(math.ceil(count / n_columns), n_columns, squeeze=False, **keywords).ravel().tolist()
     for ax in axes[count:]:
         ax.set_visible(False)
@@ -45,62 +31,25 @@ def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list
 
 
 def page_columns(n_panels: int, most: int) -> int:
-    """Return the number of panels per row with which the page is about 1.3 times as high as wide.
-
-    Parameters
-    ----------
-    n_panels : panels of the figure.
-    most : maximum per row.
-
-    Returns
-    -------
-    int
-    """
+    """Return the number of panels per row with which the page is about 1.3 times as high as wide."""
     return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), most) if n_panels > 3 else n_panels
 
 
 def panel_font(n_columns: int) -> float:
-    """Return the font size in panels of a page of 11 inches, smaller for narrower panels.
-
-    Parameters
-    ----------
-    n_columns : panels in a row.
-
-    Returns
-    -------
-    float, pt
-    """
+    """Return the font size in panels of a page of 11 inches, smaller for narrower panels."""
     return 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
 
 
 def line_key(label: str, **style: Any) -> Line2D:
-    """Return a legend entry with a line or a marker.
-
-    Parameters
-    ----------
-    label : its text.
-    style : properties of `matplotlib.lines.Line2D`.
-
-    Returns
-    -------
-    Line2D
-    """
+    """Return a legend entry with a line or a marker."""
     from matplotlib.lines import Line2D
 
     return Line2D([], [], label=label, **style)
 
 
 def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: int, label: str, **style: Any) -> None:
-    """Draw points with error bars in the colour and with the marker of a group of vines or conditions.
-
-    Parameters
-    ----------
-    ax : to draw in.
-    x, y : shape (n_points,).
-    sigma : shape (n_points,), or (2, n_points) for bars below and above; NaN for no bar.
-    index : which group, counted from 0.
-    style : further properties of `Axes.errorbar`.
-    label : of the group in the legend.
+    """Draw points with error bars in the colour and with the marker of a group of vines or conditions. Shapes: x, y,
+    sigma (n_points,).
     """
     properties: dict[str, Any] = {"ms": 6, "capsize": 3, **style}
     colour, marker = VINE_COLOURS[index % len(VINE_COLOURS)], VINE_MARKERS[index % len(VINE_MARKERS)]
@@ -109,19 +58,7 @@ def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: 
 
 
 def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) -> float:
-    """Return the font size at which a text fits a width, at most `largest`, pt.
-
-    Parameters
-    ----------
-    text : one line.
-    width_pt : available width.
-    largest : maximum font size, pt.
-    bold : whether the text is bold.
-
-    Returns
-    -------
-    float, pt
-    """
+    """Return the font size at which a text fits a width, at most `largest`, pt."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -131,14 +68,7 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
 
 
 def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
-    """Put the legend above the axes, where it covers no data.
-
-    Parameters
-    ----------
-    ax : whose legend it is.
-    n_columns : columns of entries.
-    keywords : of `Axes.legend`; `handles` replace those of the axes.
-    """
+    """Put the legend above the axes, where it covers no data."""
     handles, labels = ax.get_legend_handles_labels()
     handles = keywords.pop("handles", handles)
     if handles:
@@ -156,26 +86,14 @@ def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
 
 
 def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence below the figure, wrapped to its width; nothing if it is blank.
-
-    Parameters
-    ----------
-    fig : the figure.
-    note : one or more sentences; blank for none.
-    """
+    """Put a sentence below the figure, wrapped to its width; nothing if it is blank."""
     if note:
         fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * _CHARACTERS_PER_IN)), fontsize=10)
 
 
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end slightly above the largest value.
-
-    A margin in proportion to the range of the data would vanish for two points of nearly equal value.
-
-    Parameters
-    ----------
-    ax : with everything drawn.
-    x : whether the horizontal axis begins at zero too.
+    """Let the axes begin at zero and end slightly above the largest value. A margin in proportion to the range of the
+    data would vanish for two points of nearly equal value.
     """
     ax.set_ylim(0, _HEADROOM * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
     if x:
@@ -183,31 +101,12 @@ def up_from_zero(ax: Axes, *, x: bool = False) -> None:
 
 
 def counted(low: int, high: int, noun: str) -> str:
-    """Return a count with its noun, or the range of counts.
-
-    Parameters
-    ----------
-    low, high : the smallest and the largest count.
-    noun : in the singular.
-
-    Returns
-    -------
-    str
-
-    >>> counted(1, 1, "trial"), counted(2, 3, "trial")
-    ('1 trial', '2–3 trials')
-    """
+    """Return a count with its noun, or the range of counts."""
     return f"{low}–{high} {noun}s" if low != high else f"{low} {noun}" + ("" if low == 1 else "s")
 
 
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
-    """Label logarithmic axes with plain numbers, readable even within less than a decade.
-
-    Parameters
-    ----------
-    ax : with logarithmic axes.
-    which : `x`, `y` or `both`.
-    """
+    """Label logarithmic axes with plain numbers, readable even within less than a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     for axis in {"x": (ax.xaxis,), "y": (ax.yaxis,), "both": (ax.xaxis, ax.yaxis)}[which]:

@@ -39,18 +39,7 @@ _DAMPING_PANELS = (
 def draw_paper_damping(
     points: pd.DataFrame, damping: Mapping[str, Any], printed: Mapping[int, float], exponent: float
 ) -> Figure:
-    """Draw growth force against steady speed of the four scales, by the published rule and with errors on both axes.
-
-    Parameters
-    ----------
-    points : as in `damping_points.csv`.
-    damping : as in `damping.json`.
-    printed, exponent : published B by scale, and n.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw growth force against steady speed of the four scales, by the published rule and with errors on both axes."""
     from matplotlib.figure import Figure
 
     sizes = zip(points["diameter_mm"], points["thickness_um"], strict=True)
@@ -113,29 +102,15 @@ _BANDS = (
     ("depletion_slow", "depletion_fast", ORANGE, "chamber not refilled,\nisothermal to adiabatic"),
     ("depletion_slow_slack", "depletion_fast_slack", PURPLE, "both"),
 )
-_MAX_MEAN_POINTS = 40
-"""Chosen: circles of 3.2 pt along 3 in of panel touch each other where there are more than 70."""
+_MAX_MEAN_POINTS = 40  # Chosen: circles of 3.2 pt along 3 in of panel touch each other where there are more than 70
 
-_MAX_DURATION_RATIO = 1.9
-"""Chosen: panels end at 1.9 times the duration of Eq. (2); slower motions are cut off."""
+_MAX_DURATION_RATIO = 1.9  # Chosen: panels end at 1.9 times the duration of Eq. (2); slower motions are cut off
 
 
 def draw_paper_position(
     motions: pd.DataFrame, means: pd.DataFrame, errors: pd.DataFrame, printed_cm: Mapping[int, float]
 ) -> Figure:
-    """Draw the leading edge at three pressures (Fig. 4), with the consequences of departures from Eq. (2).
-
-    Parameters
-    ----------
-    motions : `pressure_kPa, departure, time_s, lead_position_m`; `departure` is `eq2` or the term added to it.
-    means : `pressure_kPa, time_s, lead_position_m, lead_position_sigma_m, n_trials`, since release; may be empty.
-    errors : `pressure_kPa, rms_mean_m`; may be empty.
-    printed_cm : published root mean square by pressure in kPa.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the leading edge at three pressures (Fig. 4), with the consequences of departures from Eq. (2)."""
     from matplotlib.figure import Figure
 
     pressures = sorted(motions["pressure_kPa"].unique())
@@ -215,16 +190,7 @@ def _draw_mean(ax: Axes, mean: pd.DataFrame) -> None:
 
 
 def draw_paper_reservoir(pressures: pd.DataFrame) -> Figure:
-    """Draw the gauge pressure left in the chamber while the largest vine grows, if it is not refilled.
-
-    Parameters
-    ----------
-    pressures : `pressure_kPa, departure, lead_position_m, gauge_left`; `departure` is `depletion_slow` or `…_fast`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the gauge pressure left in the chamber while the largest vine grows, if it is not refilled."""
     from matplotlib.figure import Figure
 
     with look():
@@ -268,22 +234,11 @@ _DEPARTURES = (
     ("tail that cannot push", "slack", "slack", GREEN),
     ("both", "depletion_slow_slack", "depletion_fast_slack", PURPLE),
 )
-_MIN_RMS = 0.01
-"""Chosen: 0.1 mm and 1 cm/s, a hundredth of the printed errors; smaller ones are not drawn on the logarithmic axis."""
+_MIN_RMS = 0.01  # Chosen: 0.1 mm and 1 cm/s, a hundredth of the printed errors
 
 
 def draw_paper_rms(paper: pd.DataFrame, departures: pd.DataFrame) -> Figure:
-    """Draw Table II: published errors of Eq. (2), ours, and those that departures from Eq. (2) would cause.
-
-    Parameters
-    ----------
-    paper : as in `paper.csv`.
-    departures : as in `paper_departures.csv`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw Table II: published errors of Eq. (2), ours, and those that departures from Eq. (2) would cause."""
     from matplotlib.figure import Figure
 
     with look():

@@ -1,4 +1,5 @@
-"""Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or half pixels.
+"""Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or
+half pixels.
 
 Without a bias the edges of many frames are distributed uniformly within a pixel. A periodic error ε = −A sin 2πy at the
 position y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the modulus πA.
@@ -22,24 +23,12 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Floats
 
-MIN_EDGES = 100
-"""Minimum number of edges for a histogram. Chosen: ten in each bin; a locking of 0.05 px is then significant. At half
-one of 0.08 px is, at twice one of 0.04 px."""
-BINS = 10
-"""Bins of a pixel. Chosen: locking has one or two humps per pixel; half would hide the second."""
+MIN_EDGES = 100  # Minimum number of edges for a histogram (chosen)
+BINS = 10  # Bins of a pixel (chosen)
 
 
 def subpixel_positions(tracks: Mapping[str, pd.DataFrame]) -> Floats:
-    """Return the positions of the edges of all unflagged frames within their pixel.
-
-    Parameters
-    ----------
-    tracks : `tracks/<trial>.csv` by trial.
-
-    Returns
-    -------
-    array, shape (n_edges,), px, 0 to 1: the fractional part of `edge_px`.
-    """
+    """Return the positions of the edges of all unflagged frames within their pixel. Shape (n_edges,)."""
     parts = [np.zeros(0)]
     for track in tracks.values():
         sound = (track["flag"].isna() | track["flag"].eq("")) & track["edge_px"].notna()
@@ -48,15 +37,8 @@ def subpixel_positions(tracks: Mapping[str, pd.DataFrame]) -> Floats:
 
 
 def periodic_error(subpixel_px: Floats) -> tuple[float, float]:
-    """Estimate the error that is periodic with one pixel.
-
-    Parameters
-    ----------
-    subpixel_px : position within a pixel, shape (n_edges,), px.
-
-    Returns
-    -------
-    amplitude, px, and its 5 % critical value under uniformity (Rayleigh test: √(ln 20 / n) / π).
+    """Estimate the error that is periodic with one pixel. Returns amplitude, px, and its 5 % critical value under
+    uniformity (Rayleigh test: √(ln 20 / n) / π). Shapes: subpixel_px (n_edges,).
     """
     length = abs(np.mean(np.exp(2j * np.pi * subpixel_px)))
     return float(length) / math.pi, math.sqrt(math.log(20) / len(subpixel_px)) / math.pi
@@ -64,14 +46,7 @@ def periodic_error(subpixel_px: Floats) -> tuple[float, float]:
 
 def draw_pixel_places(subpixel_px: Floats) -> Figure:
     """Draw the histogram of edges within a pixel, with the two-standard-deviation band of a uniform distribution.
-
-    Parameters
-    ----------
-    subpixel_px : position within a pixel, shape (n_edges,), px.
-
-    Returns
-    -------
-    Figure
+    Shapes: subpixel_px (n_edges,).
     """
     from matplotlib.figure import Figure
 

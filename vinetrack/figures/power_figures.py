@@ -20,29 +20,16 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.power import EffectPower, Power
 
+# Range of sizes relative to the largest plausible one, and columns of the map (chosen)
 MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS = 1e-4, 3.0, 108
-"""Range of sizes relative to the largest plausible one, and columns of the map. Chosen: no detail is needed below a
-ten-thousandth of it, and no diagnosis accepts a size beyond three times it; 24
-columns per decade make a 10 % step."""
 
-_TEXT_COLUMN_X = (0.0, 0.35, 0.7)
-"""Abscissae of the columns of sizes, relative to their width. Chosen: numbers with the longest unit do not touch."""
+_TEXT_COLUMN_X = (0.0, 0.35, 0.7)  # Abscissae of the columns of sizes, relative to their width (chosen)
 
-_ROW_IN, _WIDTH_IN = 0.31, 9.6
-"""Chosen: one line of 10 pt per row; a map of 4 in between names and sizes."""
+_ROW_IN, _WIDTH_IN = 0.31, 9.6  # Chosen: one line of 10 pt per row; a map of 4 in between names and sizes
 
 
 def draw_power(power: Power) -> Figure:
-    """Draw the power to detect each effect against its size.
-
-    Parameters
-    ----------
-    power : of a campaign.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the power to detect each effect against its size."""
     from matplotlib.figure import Figure
 
     entries = sorted(power.effects, key=_order)

@@ -17,31 +17,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_CURVES = len(VINE_COLOURS)
-"""Derived: the number of colours."""
-_PREDICTION_WIDTH_IN = 9.6
-"""Chosen: two panels of 4 in with their labels."""
+MAX_CURVES = len(VINE_COLOURS)  # Derived: the number of colours
+_PREDICTION_WIDTH_IN = 9.6  # Chosen: two panels of 4 in with their labels
 
+# Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis
 _LOG_AXIS_RATIO = 6.0
-"""Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis; then it is
-logarithmic, that of time from 1 % of the fastest on."""
 
+# Chosen: compression in the tail below 1 % of the largest tension is rounding of the simulation and gets no note
 _NEGLIGIBLE_COMPRESSION = 0.01
-"""Chosen: compression in the tail below 1 % of the largest tension is rounding of the simulation and gets no note."""
 
 
 @dataclass(frozen=True)
 class PredictionPicture:
-    """The prediction of one condition.
-
-    Attributes
-    ----------
-    curve : table with the columns of `vinetrack.planning.prediction.CURVE_COLUMNS`.
-    final_name : name of the final speed.
-    shares : uncertainty budget: (input, low, high) of the final speed with that input's uncertainty alone, m/s,
-        largest first.
-    final : low, median and high of the final speed with all uncertainties, m/s.
-    """
+    """The prediction of one condition."""
 
     title: str
     curve: pd.DataFrame
@@ -51,17 +39,7 @@ class PredictionPicture:
 
 
 def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
-    """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed.
-
-    Parameters
-    ----------
-    pictures : the conditions; the first six are drawn and the number of the others is stated.
-    at_fraction : y/L at which final speeds are taken.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed."""
     from matplotlib.figure import Figure
 
     drawn = pictures[:MAX_CURVES]
@@ -177,24 +155,11 @@ def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
         ax.text(0.1, 0.02, f"and {len(pictures) - len(lines)} more, not drawn", transform=ax.transAxes, color=MUTED)
 
 
-_EFFECT_WIDTH_IN = 7.2
-"""Chosen: one panel that fits a page of A4."""
+_EFFECT_WIDTH_IN = 7.2  # Chosen: one panel that fits a page of A4
 
 
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
-    """Draw position and speed of the leading edge with and without one effect, and the difference.
-
-    Parameters
-    ----------
-    name : of the effect.
-    size : its parameters as text, such as `C_D = 1`; blank if it has none.
-    vine : the vine and the trial as text.
-    table : columns as of `vinetrack.dynamics.effect_motion.effect_motion`.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw position and speed of the leading edge with and without one effect, and the difference."""
     from matplotlib.figure import Figure
 
     time_ms = 1e3 * table["time_s"].to_numpy()

@@ -1,8 +1,8 @@
 """Every figure of a results folder, declared once: file name, label, title, section of the report, data and drawing.
 
 The workflow uses the file names, its report label, category and caption, the figures stage the drawing function, and
-the page title, caption and data. A new figure is an entry of `_ALL`, an entry of `_drawing` and a caption
-`<name>.rst` in `CAPTIONS` (files, because Snakemake's report reads captions from files). Does not import matplotlib.
+the page title, caption and data. A new figure is an entry of `_ALL`, an entry of `_drawing` and a caption `<name>.rst`
+in `CAPTIONS` (files, because Snakemake's report reads captions from files). Does not import matplotlib.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CAPTIONS = Path(__file__).parents[1] / "report" / "captions"
-"""Folder of the captions; absolute, because Snakemake resolves relative paths from the file of the rule."""
+CAPTIONS = Path(__file__).parents[1] / "report" / "captions"  # Folder of the captions
 
+# Category in Snakemake's report by section of the page; all other sections belong to the diagnosis
 _CATEGORIES = {
     "damping": "Experiment",
     "model": "Experiment",
@@ -25,22 +25,11 @@ _CATEGORIES = {
     "paper": "Comparison with the paper",
     "power": "Power",
 }
-"""Category in Snakemake's report by section of the page; all other sections belong to the diagnosis."""
 
 
 @dataclass(frozen=True)
 class RegisteredFigure:
-    """One figure of a results folder.
-
-    Attributes
-    ----------
-    name : of its files `figures/<name>.<format>` and of its caption.
-    section : its section of the page: `damping`, `model`, `paper`, `trials`, or one of the diagnosis
-        (`verdict`, `where`, `candidates`, `tied`, `power`, `drift`).
-    label : its name in Snakemake's report.
-    title : its heading on the page.
-    data : file of the results folder with its data; blank if the page makes a separate table for it.
-    """
+    """One figure of a results folder."""
 
     name: str
     section: str
@@ -119,38 +108,22 @@ _ALL = (
     RegisteredFigure("strip", "trials", "Strip", "Strip of one recording"),
     RegisteredFigure("overlay", "trials", "Clip", "Clip of one recording"),
 )
-FIGURES = {figure.name: figure for figure in _ALL}
-"""All figures by name, in the order of the page."""
+FIGURES = {figure.name: figure for figure in _ALL}  # All figures by name, in the order of the page
 
+# Figures of a whole experiment
 CAMPAIGN_FIGURES = {
     name: figure for name, figure in FIGURES.items() if figure.section not in ("paper", "power", "trials")
 }
-"""Figures of a whole experiment."""
 
+# Further figures of an experiment that is compared with the published numbers
 PAPER_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.section == "paper"}
-"""Further figures of an experiment that is compared with the published numbers."""
 
+# Figures that show the diagnosis
 DIAGNOSIS_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.category == "Diagnosis"}
-"""Figures that show the diagnosis."""
 
 
 def draw(name: str, *inputs: Any, **options: Any) -> Figure:
-    """Draw a figure by its name in `FIGURES`.
-
-    Parameters
-    ----------
-    name : of the figure.
-    inputs, options : arguments of the drawing function.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    KeyError
-        If no figure has this name.
-    """
+    """Draw a figure by its name in `FIGURES`."""
     return _drawing(name)(*inputs, **options)
 
 

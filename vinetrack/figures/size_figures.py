@@ -30,23 +30,11 @@ if TYPE_CHECKING:
 
 _LABELS = {"diameter_mm": "diameter (mm)", "thickness_um": "wall thickness (µm)"}
 _TITLES = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
-_MAX_SCALING_FAMILIES = 4
-"""Chosen: four families have twelve lines of legend above the axes; more would leave no room for the axes."""
+_MAX_SCALING_FAMILIES = 4  # Chosen: four families have twelve lines of legend above the axes
 
 
 def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure:
-    """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter.
-
-    Parameters
-    ----------
-    scaling : as in `scaling.json`.
-    published : published values, drawn too: `{"B": {vine: …}, "source": …}`; None for none.
-    note : a sentence below the figure.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter."""
     from matplotlib.figure import Figure
 
     kinds = [kind for kind in _TITLES if scaling.get(kind)]
@@ -108,8 +96,7 @@ def _finish_scaling(ax: Axes, families: list[dict[str, Any]]) -> None:
         ax.set_xticks(sizes)
 
 
-_MAX_SPEED_FAMILIES = 5
-"""Chosen: each pressure has three lines of legend above the axes; the others are in scaling.json."""
+_MAX_SPEED_FAMILIES = 5  # Chosen: each pressure has three lines of legend above the axes
 _SPEED_PANELS = (
     ("x_ss_m_s", "x_ss_sigma_m_s", "steady tail speed x_ss (m/s)", "Speed"),
     ("x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "x_ss / diameter (1/s)", "Speed over diameter"),
@@ -117,18 +104,8 @@ _SPEED_PANELS = (
 
 
 def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
-    """Draw x_ss and x_ss/D against D: straight lines full, power laws dashed.
-
-    Error bars are standard errors; that of a single trial does not include replicate scatter.
-
-    Parameters
-    ----------
-    scaling : as in `scaling.json`; its `steady_speed`.
-    note : a sentence below the figure, such as a published value.
-
-    Returns
-    -------
-    Figure
+    """Draw x_ss and x_ss/D against D: straight lines full, power laws dashed. Error bars are standard errors; that of a
+    single trial does not include replicate scatter.
     """
     from matplotlib.figure import Figure
 
@@ -191,17 +168,7 @@ _SIZE_UNITS = {"thickness_um": "µm", "diameter_mm": "mm"}
 
 
 def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
-    """Draw the largest family of conditions that differ only in size.
-
-    Parameters
-    ----------
-    scaling : as in `scaling.json`; its `efficiency`.
-    note : a sentence below the figure, such as a published value.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the largest family of conditions that differ only in size."""
     from matplotlib.figure import Figure
 
     families = scaling.get("efficiency") or []
@@ -260,29 +227,14 @@ def _efficiency_title(family: dict[str, Any], n_families: int) -> str:
     )
 
 
-_MAX_VINES = 6
-"""Chosen: two rows of three panels."""
-PAYLOAD_LINE = "model and its 95 %"
-"""Name of the model's curve in the legend."""
+_MAX_VINES = 6  # Chosen: two rows of three panels
+PAYLOAD_LINE = "model and its 95 %"  # Name of the model's curve in the legend
 
 
 def draw_payload_speed(
     conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = PAYLOAD_LINE
 ) -> Figure:
-    """Draw final speeds of vines grown with more than one payload.
-
-    Parameters
-    ----------
-    conditions : one row per condition with `vine, pressure_kPa, payload_g, n_final, final_at_mm,
-        final_lead_velocity_m_s, final_lead_velocity_sigma_m_s`.
-    model : the same for the model, without `n_final`; may be empty.
-    note : a sentence below the figure, such as a published value.
-    line : name of the model's curve.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw final speeds of vines grown with more than one payload."""
     from matplotlib.figure import Figure
 
     reached = conditions[conditions["final_lead_velocity_m_s"] > 0]

@@ -16,28 +16,15 @@ if TYPE_CHECKING:
 
     from vinetrack.video.track import Tracking
 
-MAX_STRIP_PX = 480
-"""Pixels per side of the strip; chosen: 67 per inch, so that the edge is visible and 200 strips fit a page of 10 MB."""
+MAX_STRIP_PX = 480  # Pixels per side of the strip
 
-_FRAME_PX = 320
-"""Pixels per side of a frame; chosen: frames are a third as wide as the strip, 133 pixels per inch."""
+_FRAME_PX = 320  # Pixels per side of a frame; chosen: frames are a third as wide as the strip, 133 pixels per inch
 
 _IGNORED_FLAGS = frozenset({"before_release"})
 
 
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
-    """Draw the strip of one tracked recording.
-
-    Parameters
-    ----------
-    title : name of the trial.
-    tracking : result of the tracker; if its times are NaN, the axis counts frames.
-    m_per_px : scale along the axis, for the axis in millimetres; NaN for none.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the strip of one tracked recording."""
     from matplotlib.figure import Figure
 
     with look():
@@ -100,16 +87,8 @@ def _time_axis(tracking: Tracking) -> tuple[np.ndarray, str]:
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture reduced to at most `largest_px` pixels per side by averaging, ignoring NaN.
-
-    Parameters
-    ----------
-    picture : shape (height, width), NaN where unknown.
-    largest_px : maximum pixels per side.
-
-    Returns
-    -------
-    array, shape (≤ largest_px, ≤ largest_px)
+    """Return a picture reduced to at most `largest_px` pixels per side by averaging, ignoring NaN. Shapes: picture
+    (height, width) → (≤ largest_px, ≤ largest_px).
     """
     for axis in (0, 1):
         step = -(-picture.shape[axis] // largest_px)
@@ -123,15 +102,8 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
 
 
 def flagged(flag: Any) -> np.ndarray:
-    """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`.
-
-    Parameters
-    ----------
-    flag : flags of every frame, separated by semicolons, shape (n_frames,).
-
-    Returns
-    -------
-    array of bool, shape (n_frames,)
+    """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`. Shapes: flag (n_frames,) →
+    (n_frames,).
     """
     return np.array([bool(set(str(entry).split(";")) - _IGNORED_FLAGS - {""}) for entry in flag], dtype=bool)
 

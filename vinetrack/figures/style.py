@@ -21,23 +21,21 @@ if TYPE_CHECKING:
 INK = "#20242a"
 MUTED = "#7b828c"
 GRID = "#d9dde3"
+# Filling of hollow markers; a page may recolour it like INK and GRID
 PAPER = "#fdfdfe"
-"""Filling of hollow markers; a page may recolour it like INK and GRID."""
 
+# Okabe and Ito's palette without black and yellow, each of which is invisible on one of the backgrounds
 BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
-"""Okabe and Ito's palette without black and yellow, each of which is invisible on one of the backgrounds."""
 
 VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
 VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
+# Colour of each rule for steady windows, the same in every figure
 RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "user": GREEN}
-"""Colour of each rule for steady windows, the same in every figure."""
 
 RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
 
-DASHED: Any = (0, (4, 2))
-"""Line of the second of two models, methods or laws: dashes of four line widths with gaps of two; chosen to
-stay apart from a grid line at 0.7 pt."""
+DASHED: Any = (0, (4, 2))  # Line of the second of two models, methods or laws
 
 METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
 METHOD_LINES = {"log_log": DASHED, "both_axes": "-"}
@@ -93,16 +91,7 @@ def look() -> Iterator[None]:
 
 
 def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
-    """Give each vine, in the order of first appearance, a colour and a marker; with 42 different pairs.
-
-    Parameters
-    ----------
-    vines : names, in any number of repetitions.
-
-    Returns
-    -------
-    dict, a style by name
-    """
+    """Give each vine, in the order of first appearance, a colour and a marker; with 42 different pairs."""
     names = list(dict.fromkeys(vines))
     n_colours, n_markers = len(VINE_COLOURS), len(VINE_MARKERS)
     return {
@@ -112,31 +101,12 @@ def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
 
 
 def rows(table: pd.DataFrame) -> Iterator[Any]:
-    """Iterate over the rows of a table with its columns as attributes, typed as `Any` for convenience.
-
-    Parameters
-    ----------
-    table : its column names must be Python identifiers.
-
-    Returns
-    -------
-    iterator of named tuples
-    """
+    """Iterate over the rows of a table with its columns as attributes, typed as `Any` for convenience."""
     return iter(table.itertuples(index=False))
 
 
 def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure:
-    """Return a figure with a message in place of a figure that cannot be drawn.
-
-    Parameters
-    ----------
-    message : the reason, in one or more sentences.
-    width_in, height_in : size of the figure, inches.
-
-    Returns
-    -------
-    Figure
-    """
+    """Return a figure with a message in place of a figure that cannot be drawn."""
     from matplotlib.figure import Figure
 
     with look():
@@ -147,18 +117,7 @@ def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure
 
 
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
-    """Return the figure in each format, reproducible to the byte; PNG on white, the others transparent.
-
-    Parameters
-    ----------
-    fig : the figure.
-    formats : of `png`, `svg`, `pdf`.
-    dpi : pixels per inch of a PNG.
-
-    Returns
-    -------
-    dict, the file by its format
-    """
+    """Return the figure in each format, reproducible to the byte; PNG on white, the others transparent."""
     details: dict[str, dict[str, Any]] = {
         "png": {"facecolor": "white", "metadata": {"Software": None}},
         "svg": {"metadata": {"Date": None, "Creator": None}},

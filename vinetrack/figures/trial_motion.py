@@ -21,35 +21,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_WIDTH_IN = 7.2
-"""Chosen: one panel that fits a page of A4."""
+_WIDTH_IN = 7.2  # Chosen: one panel that fits a page of A4
 
-_TEXT_COLUMNS = 106
-"""Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt makes 126; a sixth is a margin for wide letters."""
+_TEXT_COLUMNS = 106  # Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt makes 126
 
-_LINE_IN = 0.175
-"""Derived: 8.8 pt · 1.43 spacing / 72 pt."""
+_LINE_IN = 0.175  # Derived: 8.8 pt · 1.43 spacing / 72 pt
 
-_MAX_DOTS = 600
-"""Chosen: on 5.5 in, 600 dots of 3.5 pt overlap; more would enlarge the SVG of a long track by megabytes."""
+_MAX_DOTS = 600  # Chosen: on 5.5 in, 600 dots of 3.5 pt overlap
 
 
 def draw_trial_motion(
     title: str, track: pd.DataFrame, kinematics: pd.DataFrame, windows: pd.DataFrame, travel_ratio: float = 2.0
 ) -> Figure:
-    """Draw one trial.
-
-    Parameters
-    ----------
-    title : the trial's name, vine and pressure.
-    track, kinematics : tables as in `tracks/<trial>.csv` and `kinematics/<trial>.csv`.
-    windows : rows of `steady.csv` for this trial.
-    travel_ratio : tail speed over that of the leading edge, for the axis on the right.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw one trial."""
     from matplotlib.figure import Figure
 
     if kinematics.empty:

@@ -38,25 +38,7 @@ def assemble(
     *,
     profile: bool,
 ) -> Fit:
-    """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages.
-
-    Parameters
-    ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
-    left_out : mapping
-        Trials that could not be used, with the reason.
-    options : mapping
-        Options of the fit (`fixed`, `free`, `shared`, `held`), kept for refits.
-    profile : bool
-        Whether intervals near a bound are found by profile.
-
-    Returns
-    -------
-    Fit
-    """
+    """Assemble a `Fit` from a solution: numbers with errors and intervals, trial effects, messages."""
     layout, state = predictor.layout, solution.state
     plain = log_likelihood(solution) - 0.5 * trace_error_penalty(predictor.data)
     smooth = smooth_errors(predictor, solution, options.get("held"))
@@ -107,10 +89,9 @@ def assemble(
 
 
 def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
-    """Trials with the deviations and residuals of the fit that includes smooth errors of position.
-
-    The deviations come from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit
-    are (LARGEST_DEVIATION). The residuals are those of the step itself.
+    """Trials with the deviations and residuals of the fit that includes smooth errors of position. The deviations come
+    from one linear step, which is unbounded for a poor fit, so they are limited as those of a fit are
+    (LARGEST_DEVIATION). The residuals are those of the step itself.
     """
     effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return tuple(
@@ -125,9 +106,8 @@ def _with_smooth_errors_removed(trials: Sequence[TrialFit], smooth: SmoothErrors
 
 
 def _pooled_if_few(predictor: Predictor, solution: Solution, options: Mapping[str, Any]) -> Pooled | None:
-    """The fit with trials weighted by their disagreement, where the fit itself has no term for it.
-
-    That is where trials are few, or have neither B nor pressure, which are what trials of a vine may differ by.
+    """The fit with trials weighted by their disagreement, where the fit itself has no term for it. That is where trials
+    are few, or have neither B nor pressure, which are what trials of a vine may differ by.
     """
     held = options.get("held")
     if held is not None and held.noise is not None:
@@ -147,17 +127,7 @@ def _with_undetermined(covariance: Floats, precision_of_fit: Precision) -> Float
 
 
 def log_likelihood(solution: Solution) -> float:
-    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models.
-
-    Parameters
-    ----------
-    solution
-        Where the iterations ended.
-
-    Returns
-    -------
-    float
-    """
+    """Marginal ln L, maximised over the between-trial standard deviations; the restricted one cannot compare models."""
     part = marginal(solution.cross_products, solution.problem, solution.state)
     spread = estimate_between_trial_sd(part, solution.problem, solution.state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, solution.problem, solution.state, spread, restricted=False)
@@ -270,28 +240,8 @@ def trial_fit(
     rho: float,
     variance: float,
 ) -> TrialFit:
-    """One trial with its trial effects and the predictions of the model.
-
-    Parameters
-    ----------
-    trial_data
-        The data of the trial.
-    trial_effects : array, shape (4,)
-        Release, s; origin, m; deviations of pressure and ln B.
-    sigma : array, shape (4,)
-        Their standard errors.
-    position_m : array, shape (n_points,), m
-        Predicted positions, from an origin of 0.
-    velocity_m_s : array, shape (n_points,), m/s
-        Predicted speed of the leading edge.
-    rho : float
-        Lag-one correlation of the noise.
-    variance : float
-        Variance of its innovations, m².
-
-    Returns
-    -------
-    TrialFit
+    """One trial with its trial effects and the predictions of the model. Shapes: trial_effects, sigma (4,); position_m,
+    velocity_m_s (n_points,).
     """
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m

@@ -18,16 +18,11 @@ from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import parameter_shifts
 from vinetrack.inference.systematics import FILM_ERROR, film_errors
 
-FILM = "film_mass"
-"""The effect that makes the mass of the film a free parameter."""
+FILM = "film_mass"  # The effect that makes the mass of the film a free parameter
 
-MATTERS = 1.0
-"""Change of a number, in its stated errors, from which the film is mentioned. Derived: with the film included, the
-error of the number would be √2 times as large; at half 1.12 times, at twice 2.2 times. It decides wording alone."""
+MATTERS = 1.0  # Change of a number, in its stated errors, from which the film is mentioned (derived)
 
-MOST_NAMED = 4
-"""Largest number of changes listed, the largest first. Chosen: two lines; at half n may be listed alone, at twice it
-fills four. Wording alone."""
+MOST_NAMED = 4  # Largest number of changes listed, the largest first (chosen)
 
 
 def film_influence(fit: Fit) -> Floats:
@@ -59,18 +54,8 @@ def film_influence(fit: Fit) -> Floats:
 
 
 def film_messages(numbers: Sequence[Number], moved: Floats) -> tuple[str, ...]:
-    """A message on the film mass where it matters as much as the stated errors, else none.
-
-    Parameters
-    ----------
-    numbers : sequence of Number
-        Of the fit.
-    moved : array, shape (n_numbers,)
-        As of `film_influence`.
-
-    Returns
-    -------
-    tuple of str
+    """A message on the film mass where it matters as much as the stated errors, else none. Shapes: moved
+    (n_numbers,).
     """
     sigma = np.array([number.sigma for number in numbers])
     ratio = np.divide(moved, sigma, out=np.zeros_like(moved), where=np.isfinite(sigma) & (sigma > 0))

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FitError", "fit", "predict", "refit"]
 
-STANDSTILL_M = 1e-9
-"""Travel below which a simulated trial counts as standing still. Derived: no camera resolves a nanometre."""
+STANDSTILL_M = 1e-9  # Travel below which a simulated trial counts as standing still (derived)
 
 
 @in_one_blas_thread
@@ -64,49 +63,7 @@ def fit(
     thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
-    """Fit a model to all trials of an experiment.
-
-    Parameters
-    ----------
-    model : sum of effects; fixed parameters keep the values they have in it.
-    experiment : an experiment or its folder, or pairs of trial and track.
-    tracks : mapping, optional
-        Tracks by name of trial, where the experiment consists of recordings.
-    fixed, free : iterable of str
-        Parameters to keep at the model's values; parameters to estimate although they are fixed by default (g). `n` is
-        accepted for `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
-    shared : mapping, optional
-        `"all"`, `"vine"` or `"day"` by name of parameter, in place of the effect's default.
-    start : mapping, optional
-        Starting values of further parameters, SI; those of B and n are always searched for.
-    spreads : (float, float), optional
-        Relative between-trial standard deviations of pressure and of B, if they are not to be estimated.
-    noise : (float, float), optional
-        Standard deviation of a position, m, and its lag-one correlation, if they are not to be estimated; all points
-        then have the same weight.
-    profile : bool
-        Whether intervals near a bound are profile-likelihood intervals, which take a few refits each.
-    host : Model, optional
-        A larger model whose compiled form serves this one and every later `refit`, so that nothing is compiled again.
-    thorough : bool
-        Whether a poor fit is repeated from other starting values. Unnecessary for a fit that is only tested for
-        missing effects.
-    watch : callable, optional
-        Called with every `Step` of the iterations; an exception that it raises ends the fit.
-
-    Returns
-    -------
-    Fit
-
-    Raises
-    ------
-    FitError
-        If no trial can be fitted, or none can be simulated from any starting values; the message is one sentence.
-    EffectError
-        If a trial lacks a value that an effect of the model needs.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Fit a model to all trials of an experiment."""
     pairs, left_out = pairs_of(experiment, tracks)
     data, unusable = prepare(pairs, weighted=noise is None)
     left_out = {**left_out, **unusable}
@@ -126,13 +83,7 @@ def fit(
 
 
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
-    """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks.
-
-    Raises
-    ------
-    FitError
-        If no trial moves.
-    """
+    """Refuse a model in which no trial is driven: it has no trajectories to compare with the tracks."""
     trajectories = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
     if any(float(np.ptp(trajectory.observed_position_m)) > STANDSTILL_M for trajectory in trajectories):
         return

@@ -21,61 +21,36 @@ from vinetrack.tracks.smoothed_positions import Smoothing
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
 
-FEWEST_POINTS = 5
-"""A trial with fewer points is refused. Derived: release, origin, speed and curvature take four."""
+FEWEST_POINTS = 5  # A trial with fewer points is refused (derived)
 
-FEWEST_MOVING = 4
-"""A trial with fewer points in motion is refused. Derived: release, speed and curvature take three; with only those,
-any motion fits exactly, and two disturbed frames at a door count as motion."""
+FEWEST_MOVING = 4  # A trial with fewer points in motion is refused (derived)
 
+# A point later than this many frames after the previous one begins a new stretch, whose noise is independent of the
+# previous one's (derived)
 GAP_FRAMES = 1.5
-"""A point later than this many frames after the previous one begins a new stretch, whose noise is independent of the
-previous one's. Derived: halfway between one frame and two."""
 
-MOVES_SIGMAS = 8.0
-"""Standard deviations by which the edge must move for a trial to be fitted. Chosen: medians of three points differ by
-that with a probability below 1e-14 under normal noise, and still below 1e-4 with heavy tails; twice would refuse short
-growth."""
+MOVES_SIGMAS = 8.0  # Standard deviations by which the edge must move for a trial to be fitted
 
 
+# Where a trace begins below this part of its median, the tube was pressurised during the recording (chosen)
 SETTLED_PRESSURE_PART = 0.5
-"""Where a trace begins below this part of its median, the tube was pressurised during the recording. Chosen: a settled
-trace stays within a few per cent, a pressurisation begins near zero; anything between 0.2 and 0.8 separates them."""
 
-END_FRACTION = 0.95
-"""The growth beyond this fraction of the length is left out. There the mass of a bare vine goes to zero and its speed
-diverges, and a frame across the end of growth is a corner at which no sensitivity exists. Points after the end are
-used. Chosen as the place at which the speed of a bare vine is quoted; 0.9 loses a tenth of the data, 0.975 comes twice
-as near to the singularity."""
+END_FRACTION = 0.95  # The growth beyond this fraction of the length is left out (chosen)
 
-FRAMES_BEHIND_END = 2
-"""Frames left out after the end of growth. Derived: the frame in which growth ends and one for the exposure across
-it."""
+FRAMES_BEHIND_END = 2  # Frames left out after the end of growth (derived)
 
 
+# A point is left out if its stated error exceeds the median of the better half by this factor, provided that at least
+# the second fraction of points remains (chosen)
 IMPRECISE_FACTOR, LEAST_PRECISE_PART, REST_DISCARD_PART = 3.0, 0.3, 0.5
-"""A point is left out if its stated error exceeds the median of the better half by this factor, provided that at least
-the second fraction of points remains. The whole rest before the motion is left out if more than the third fraction of
-it is. Chosen: a point of three times the error carries a ninth of the information, yet would get full weight, since one
-noise holds for all points of a trial. At half, many good points go; at twice, blurred ones stay."""
 
 
+# Range of rounded positions at rest, in rounding steps, up to which rounding hides their noise (derived)
 QUANTISED_REST_STEPS = 1.5
-"""Range of rounded positions at rest, in rounding steps, up to which rounding hides their noise. Derived: two
-neighbouring values are one step apart, three are two; noise of a third of a step shows three values in twenty frames,
-and the mean is then good to a twentieth of a step."""
 
 
 class FitError(UserError, ValueError):
-    """The fit cannot be made; the message is one sentence with a remedy.
-
-    Examples
-    --------
-    >>> import vinetrack as vt
-    >>> vt.fit(vt.base_model(), [])
-    Traceback (most recent call last):
-    vinetrack.inference.fit_data.FitError: No trial can be fitted: there is none.
-    """
+    """The fit cannot be made; the message is one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -89,22 +64,9 @@ class ImpreciseRest:
 
 @dataclass(frozen=True)
 class FitTrial:
-    """One trial as a fit sees it; arrays have shape (n_points,) unless stated.
-
-    Positions: `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the
-    motion, 0 where the track begins in motion. `imprecise_rest` replaces a rest whose points are left out.
-
-    Noise: `noise_m` and `correlation` are estimated from the track alone, without a model. `relative_sd` is the noise
-    of each point relative to `noise_m`, with a geometric mean of 1 so that it leaves the likelihood unchanged by
-    itself; None where all points are equally noisy. It follows from `blur_s`, the noise per speed, or, where that is 0,
-    from `stated_m`, the standard deviations in the file. `slow_m` is the standard deviation of the tracker's slowly
-    varying error at each point, None where positions were measured elsewhere.
-
-    Recorded pressure: `trace` holds time, s, on the clock of the track, and gauge pressure, Pa, with one extrapolated
-    sample at its end. Gauge noise leaves two errors in it: `gauge_error`, relative, constant over the motion; and the
-    columns of `trace_errors_Pa`, shape (n_samples, n_errors), one standard deviation each of an error that varies in
-    time. Where `trace_is_curve`, a fit estimates the latter: `trace_error_sizes`, shape (n_errors,), are the estimates
-    already added to the trace, in standard deviations (`vinetrack.inference.trace_errors`).
+    """One trial as a fit sees it; arrays have shape (n_points,) unless stated. Positions: `first` marks the points that
+    begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0 where the track begins in
+    motion. `imprecise_rest` replaces a rest whose points are left out.
     """
 
     trial: Trial
@@ -168,7 +130,6 @@ class FitTrial:
     @cached_property
     def pressurised_in_recording(self) -> bool:
         """Whether the tube was pressurised during the recording; the trace then shows when the growth was started.
-
         Nothing else holds such a vine, and a free release would stand in for a threshold of the pressure.
         """
         return self.trace is not None and bool(self.trace[1][0] < SETTLED_PRESSURE_PART * np.median(self.trace[1]))
@@ -184,29 +145,7 @@ def prepare_trial(
     smoothing: Smoothing | None = None,
     rounding_m: float = 0.0,
 ) -> FitTrial:
-    """The data of one trial: its usable points, rest included, and the noise that they show.
-
-    Parameters
-    ----------
-    trial : row of the sheet.
-    track : its positions.
-    denoised : DenoisedTrace, optional
-        Its denoised pressure from `denoised_traces` of the whole campaign; by default from this track alone.
-    smoothing : Smoothing, optional
-        How its positions were smoothed; of the points that a window correlates, one is kept.
-    rounding_m : float, m
-        Standard deviation of the rounding error of positions of the campaign, 0 where they are not rounded.
-
-    Returns
-    -------
-    FitTrial
-
-    Raises
-    ------
-    FitError
-        Fewer than five usable points, or four in motion; times that do not increase; a leading edge that never moves,
-        or one that moves although its pressure cannot move it.
-    """
+    """The data of one trial: its usable points, rest included, and the noise that they show."""
     usable = track.usable & ~_near_end_of_growth(trial, track)
     imprecise, imprecise_rest = _imprecise_points(track, usable)
     usable &= ~imprecise
@@ -271,9 +210,8 @@ def prepare_trial(
 
 
 def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
-    """The tracker's slowly varying error at the usable points, m, interpolated where a point states none.
-
-    A track with a single stated error, as in results of 0.1.0, is taken to state the slow one, which is the larger.
+    """The tracker's slowly varying error at the usable points, m, interpolated where a point states none. A track with
+    a single stated error, as in results of 0.1.0, is taken to state the slow one, which is the larger.
     """
     for slow_m in (track.lead_position_systematic_m, track.lead_position_sigma_m):
         if slow_m is not None and np.isfinite(slow_m[usable]).any():
@@ -300,9 +238,8 @@ def _gauge_error(denoised: DenoisedTrace, moving_s: Floats) -> float:
 
 
 def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points whose stated error is several times that of the others, such as an edge half behind the door.
-
-    Also the position and end of the rest before the motion, where it consists of such points.
+    """Points whose stated error is several times that of the others, such as an edge half behind the door. Also the
+    position and end of the rest before the motion, where it consists of such points.
     """
     sigma_m = track.lead_position_sigma_m
     if track.lead_position_systematic_m is not None:
@@ -332,10 +269,9 @@ def _imprecise_points(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[
 def _quantised_points(
     track: Track, usable: NDArray[np.bool_], rounding_m: float
 ) -> tuple[NDArray[np.bool_], ImpreciseRest | None]:
-    """Points at standstill that rounding makes identical, because their noise is smaller than the rounding step.
-
-    They all have the same error, so that together they are worth one point. The rest before the motion is replaced by
-    its mean with the error of one point; of a standstill at the end the first point is kept.
+    """Points at standstill that rounding makes identical, because their noise is smaller than the rounding step. They
+    all have the same error, so that together they are worth one point. The rest before the motion is replaced by its
+    mean with the error of one point; of a standstill at the end the first point is kept.
     """
     places = np.flatnonzero(usable)
     y = track.lead_position_m[places]
@@ -384,24 +320,8 @@ def _near_end_of_growth(trial: Trial, track: Track) -> NDArray[np.bool_]:
 def pairs_of(
     experiment: Experiment | Path | str | Pairs, tracks: Mapping[str, Track] | None = None
 ) -> tuple[list[tuple[Trial, Track]], dict[str, str]]:
-    """Trials and their tracks, and the reason for each trial without one.
-
-    Parameters
-    ----------
-    experiment : an experiment, the path of its folder, or pairs of trial and track.
-    tracks : mapping, optional
-        Tracks by name of trial, for recordings that were tracked before; else they are read from the experiment.
-
-    Returns
-    -------
-    pairs : list of (Trial, Track)
-    left_out : dict
-        Reason by name of trial.
-
-    Raises
-    ------
-    ExperimentError
-        If the folder is no experiment.
+    """Trials and their tracks, and the reason for each trial without one. Returns pairs, left_out (reason by name of
+    trial).
     """
     from vinetrack.experiment.folder import Experiment, read_experiment
 

@@ -18,26 +18,18 @@ from vinetrack.inference.parameters import ParameterMap
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trace_errors import trace_correction_Pa
 
-STRONG_CORRELATION = 0.98
-"""Correlation of two fitted numbers from which the fit warns. Chosen: at 0.98 the error of each is five times what it
-would be with the other known (1/√(1 − 0.98²)); it decides a warning alone."""
+STRONG_CORRELATION = 0.98  # Correlation of two fitted numbers from which the fit warns (chosen)
 
+# Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it (chosen)
 UNCONSTRAINED_RATIO = 0.95
-"""Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it. Chosen: at 0.95 they
-add a tenth of the information; it decides wording alone."""
 
+# The same ratio from which the message explains why the fitted error exceeds the stated one (chosen)
 WIDENED_RATIO = 1.05
-"""The same ratio from which the message explains why the fitted error exceeds the stated one. Chosen; it decides
-wording alone."""
 
-MISFIT_CHI2 = 2.0
-"""χ² per degree of freedom from which the fit warns of misfit. Chosen: half of it would warn of every sound fit (χ² per
-degree of freedom is 1 there), twice would not mention visible misfit; it decides a warning alone."""
+MISFIT_CHI2 = 2.0  # χ² per degree of freedom from which the fit warns of misfit (chosen)
 
+# Standard deviation between trials, in errors of the shared number, from which the fit says that trials disagree
 DISAGREEMENT_SIGMAS = 1.0
-"""Standard deviation between trials, in errors of the shared number, from which the fit says that trials disagree.
-Derived: for two trials that scatter by more than their noise it is √2, for trials that agree mostly 0; it decides
-wording alone."""
 
 SPREAD_NAMES = ("pressure", "B")
 
@@ -50,24 +42,7 @@ def fit_messages(
     between: Floats,
     chi2: float,
 ) -> tuple[str, ...]:
-    """All messages of a fit.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    numbers : sequence of Number
-        The fitted numbers.
-    precision : their precision, scaled.
-    between : array, shape (n_numbers, n_numbers)
-        Covariance of the numbers of a trial about the shared ones, SI.
-    chi2 : float
-        χ² per degree of freedom.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """All messages of a fit. Shapes: between (n_numbers, n_numbers)."""
     return (
         *_messages(predictor.layout, solution, numbers, precision, chi2),
         *_disagreement_messages(numbers, between),

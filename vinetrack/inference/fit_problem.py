@@ -12,41 +12,24 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import initial_trial_effects
 
-FIRST_SPREADS = (0.01, 0.03)
-"""Initial between-trial standard deviations of pressure (relative) and ln B. Chosen as those of a typical batch of
-vines."""
+FIRST_SPREADS = (0.01, 0.03)  # Initial between-trial standard deviations of pressure (relative) and ln B (chosen)
 
+# Least noise, relative to a trial's travel, because the integrator is not more accurate (measured)
 INTEGRATOR_ERROR = 2e-6
-"""Least noise, relative to a trial's travel, because the integrator is not more accurate. Measured: the integrator errs
-by at most 7e-7 (benchmarks/integrator.py)."""
 
+# Prior standard deviations of release, frames, and of origin, in standard deviations of the noise (chosen)
 RELEASE_PRIOR_FRAMES, ORIGIN_PRIOR_SIGMAS = 10.0, 10.0
-"""Prior standard deviations of release, frames, and of origin, in standard deviations of the noise, where the rest was
-recorded. Its points already determine both, so the prior matters only where a wrong model would drag them along.
-Chosen: ten standard deviations give the prior a hundredth of the information of the frames."""
 
+# Prior standard deviation of the release of a vine that was pressurised during the recording: it is known (chosen)
 KNOWN_RELEASE_S = 1e-6
-"""Prior standard deviation of the release of a vine that was pressurised during the recording: it is known. Chosen far
-below any frame."""
 
+# A between-trial standard deviation is estimated where it applies to this many more trials than there are parameters
+# without a prior (chosen)
 FEWEST_TO_SPARE = 3
-"""A between-trial standard deviation is estimated where it applies to this many more trials than there are parameters
-without a prior. Chosen: with fewer degrees of freedom a variance is known to worse than a factor of two."""
 
 
 def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
-    """The constant part of a fit.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    trial_effects : array, shape (n_trials, 4)
-        Initial estimates of releases and origins; prior means where no rest was recorded.
-
-    Returns
-    -------
-    MixedProblem
-    """
+    """The constant part of a fit. Shapes: trial_effects (n_trials, 4)."""
     layout, data = predictor.layout, predictor.data
     lower, upper = layout.bounds
     durations = np.array([trial_data.time_s[-1] - trial_data.time_s[0] for trial_data in data])
@@ -81,18 +64,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
 
 def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) -> FitState:
     """Initial state: noise of the tracks alone, between-trial standard deviations as stated in the sheet or typical.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-    theta : array, shape (n_free,)
-        Starting values of the parameters, scaled.
-    trial_effects : array, shape (n_trials, 4)
-        Starting values of the trial effects.
-
-    Returns
-    -------
-    FitState
+    Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
     rho = track_correlation(data)
     variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
@@ -102,16 +74,8 @@ def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) 
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
-    """Lag-one correlation of the noise, estimated from the tracks without a model.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    float
-        Mean over trials, weighted by points.
+    """Lag-one correlation of the noise, estimated from the tracks without a model. Returns mean over trials, weighted
+    by points.
     """
     return float(
         np.average(
@@ -131,29 +95,13 @@ def _stated_between_trial_sd(data: Sequence[FitTrial]) -> tuple[float, float]:
 
 
 def variance_floor(data: Sequence[FitTrial]) -> Floats:
-    """Least variance of the noise of each trial, given the accuracy of the integrator.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    array, shape (n_trials,), m²
-    """
+    """Least variance of the noise of each trial, given the accuracy of the integrator. Shape (n_trials,)."""
     return np.array([(INTEGRATOR_ERROR * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
 
 
 def estimable(problem: MixedProblem) -> tuple[bool, bool]:
     """Whether there are enough trials to estimate the between-trial standard deviations of pressure and of ln B.
-
-    Parameters
-    ----------
-    problem : the constant part of the fit.
-
-    Returns
-    -------
-    (bool, bool)
+    Returns (bool, bool).
     """
     needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
     has_estimated_sd = problem.has_deviation & np.column_stack(

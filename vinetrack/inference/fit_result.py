@@ -27,11 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Number:
-    """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval.
-
-    `vine` is blank if the number applies to all. `method` tells how the interval was found: `linear`, `profile` near a
-    bound, `none` if the data do not determine it. `bound` is the bound at which the number is, NaN elsewhere; `lower`
-    and `upper` are the bounds of the fit.
+    """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval. `vine` is blank if the
+    number applies to all. `method` tells how the interval was found: `linear`, `profile` near a bound, `none` if the
+    data do not determine it.
     """
 
     key: str
@@ -77,16 +75,7 @@ class Number:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Number:
-        """Read what `to_json` wrote; unknown numbers are NaN, degrees of freedom too.
-
-        Parameters
-        ----------
-        entry : `parameter, symbol, unit, value` at least, SI.
-
-        Returns
-        -------
-        Number
-        """
+        """Read what `to_json` wrote; unknown numbers are NaN, degrees of freedom too."""
         value, sigma, low, high, bound = (
             or_nan(entry.get(key)) for key in ("value", "sigma", "low_95", "high_95", "bound")
         )
@@ -124,12 +113,9 @@ class BetweenTrialSpread:
 
 @dataclass(frozen=True)
 class TrialFit:
-    """One trial under the model; arrays have shape (n_points,), at the points that were used.
-
-    `whitened` are whitened residuals, without smooth errors of position, in standard deviations. Deviations are
-    relative to the set pressure and to the vine's B. `band_m`, for a trial that was not in the fit, is the half width
-    of the 95 % prediction band of its position. `imprecise_rest` replaces a rest before the motion whose points were
-    left out.
+    """One trial under the model; arrays have shape (n_points,), at the points that were used. `whitened` are whitened
+    residuals, without smooth errors of position, in standard deviations. Deviations are relative to the set pressure
+    and to the vine's B.
     """
 
     trial: Trial
@@ -176,13 +162,7 @@ class NumberTable:
     covariance: Floats
 
     def __getitem__(self, name: str) -> Number:
-        """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
-
-        Raises
-        ------
-        FitError
-            If there is none or several.
-        """
+        """The number of this name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique."""
         fits = [n for n in self.numbers if name in (n.name, n.key, n.key.split(".")[1], n.title)]
         if len(fits) != 1:
             known = ", ".join(number.name for number in (fits or self.numbers)) or "none"
@@ -190,17 +170,7 @@ class NumberTable:
         return fits[0]
 
     def correlation(self, first: str, second: str) -> float:
-        """Correlation of the errors of two numbers.
-
-        Parameters
-        ----------
-        first, second : str
-            Names of numbers, as for indexing.
-
-        Returns
-        -------
-        float
-        """
+        """Correlation of the errors of two numbers."""
         i, j = self.numbers.index(self[first]), self.numbers.index(self[second])
         return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
 
@@ -216,17 +186,8 @@ class NumberTable:
 
 @dataclass(frozen=True, repr=False)
 class Fit(NumberTable):
-    """A model fitted to trajectories. Printed, it is a table.
-
-    `model` has the fitted values. `covariance` is that of `numbers`, SI, in their order. `noise_m` is the standard
-    deviation of a position and `noise_correlation` its lag-one correlation, estimated with the model; `chi2_per_dof`
-    compares the residuals with the noise of the tracks alone: 1 without misfit. `log_likelihood` is the marginal one,
-    trial effects integrated out, at its maximum over noise and between-trial standard deviations: hypotheses are
-    compared by it. `left_out` are the trials that could not be used, with the reason; `pairs` are the trials with their
-    tracks, empty for a fit to a subset of another fit's trials. `between`, of the shape of `covariance`, is the
-    between-trial covariance of the numbers beyond the deviations of pressure and B (`vinetrack.inference.pooling`):
-    zero where the trials agree, or are many. `smooth` is the state of the solution with smooth errors of position
-    included, None where positions have none.
+    """A model fitted to trajectories. Printed, it is a table. `model` has the fitted values. `covariance` is that of
+    `numbers`, SI, in their order.
     """
 
     model: Model
@@ -251,9 +212,8 @@ class Fit(NumberTable):
 
     @property
     def state(self) -> FitState:
-        """State of the solution, with the variance components of the fit that includes smooth errors of position.
-
-        The iterations are without smooth errors, so that the displacement by a lens is taken for deviations of single
+        """State of the solution, with the variance components of the fit that includes smooth errors of position. The
+        iterations are without smooth errors, so that the displacement by a lens is taken for deviations of single
         trials and enlarges noise and standard deviations.
         """
         state, smooth = self.solution.state, self.smooth
@@ -262,17 +222,7 @@ class Fit(NumberTable):
         return replace(state, spread=smooth.spread, rho=smooth.rho, variance=smooth.variance)
 
     def trial(self, name: str) -> TrialFit:
-        """The trial of that name; KeyError where there is none.
-
-        Parameters
-        ----------
-        name : str
-            Name of the trial.
-
-        Returns
-        -------
-        TrialFit
-        """
+        """The trial of that name; KeyError where there is none."""
         return {trial.name: trial for trial in self.trials}[name]
 
     @property
@@ -281,13 +231,7 @@ class Fit(NumberTable):
         return self.model.names
 
     def positions(self) -> pd.DataFrame:
-        """Measured and predicted positions of all trials, one row per point.
-
-        Returns
-        -------
-        DataFrame
-            Columns `trial, time_s, lead_position_m, predicted_position_m, residual_m`, on the clock of each track.
-        """
+        """Measured and predicted positions of all trials, one row per point."""
         import pandas as pd
 
         parts = [
@@ -305,19 +249,7 @@ class Fit(NumberTable):
         return pd.concat(parts, ignore_index=True)
 
     def plot(self, name: str = "model_comparison", **options: Any) -> Figure:
-        """A figure of the report for this model: `model_comparison` or `model_residuals`.
-
-        Parameters
-        ----------
-        name : str
-            Name of the figure.
-        **options
-            Passed on to the drawing.
-
-        Returns
-        -------
-        Figure
-        """
+        """A figure of the report for this model: `model_comparison` or `model_residuals`."""
         return plot(self, name, **options)
 
     def __repr__(self) -> str:
@@ -335,16 +267,7 @@ class Fit(NumberTable):
 
 
 def numbers_text(fit: Any) -> list[str]:
-    """The numbers of a fit, its noise and its messages as lines of text.
-
-    Parameters
-    ----------
-    fit : a `Fit`, or a `FitSummary`.
-
-    Returns
-    -------
-    list of str
-    """
+    """The numbers of a fit, its noise and its messages as lines of text."""
     lines = aligned([("", "value", "error", "95 % interval", "unit"), *map(number_row, fit.numbers)])
     lines += [_spread_line(name, spread) for name, spread in fit.spreads.items()]
     lines.append(
@@ -358,16 +281,7 @@ def numbers_text(fit: Any) -> list[str]:
 
 
 def number_row(number: Number) -> tuple[str, ...]:
-    """A number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit.
-
-    Parameters
-    ----------
-    number : SI.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """A number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit."""
     unit, factor = display_unit(number.unit)
     if math.isfinite(number.bound):
         return number.title, f"{number.bound * factor:.4g}", "at its bound", "", unit
@@ -379,16 +293,8 @@ def number_row(number: Number) -> tuple[str, ...]:
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of (name, value, error, interval, unit) as aligned lines of text; values to the right, others to the left.
-
-    Parameters
-    ----------
-    rows : sequence of tuple of str
-        All of one length.
-
-    Returns
-    -------
-    list of str
+    """Rows of (name, value, error, interval, unit) as aligned lines of text; values to the right, others to
+    the left.
     """
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = []

@@ -39,12 +39,9 @@ class TrialEstimates:
 
 @dataclass(frozen=True, repr=False)
 class FitSummary(NumberTable):
-    """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field.
-
-    `names` are those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the
-    audit. `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
-    `moved_by_film`, shape (n_numbers,), is the further standard deviation of each number if the film mass is uncertain
-    by 2 %.
+    """The quoted results of a fit: see `vinetrack.inference.fit_result.Fit` for the meaning of each field. `names` are
+    those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the audit.
+    `refused` is the reason why the model was not fitted, blank if it was: everything else is empty then.
     """
 
     names: tuple[str, ...]
@@ -102,16 +99,7 @@ class FitSummary(NumberTable):
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> FitSummary:
-        """Read what `to_json` wrote; unknown numbers are NaN.
-
-        Parameters
-        ----------
-        content : of `fit.json`; what is absent is empty.
-
-        Returns
-        -------
-        FitSummary
-        """
+        """Read what `to_json` wrote; unknown numbers are NaN."""
         numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
         matrix, between = (
             [[or_nan(cell) for cell in row] for row in content.get(key) or ()]

@@ -17,32 +17,22 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.inference.gauge_readings import GaugeNoise, Readings, whitened
 
-LARGEST_OFFSET_FRAMES = 60
-"""Largest clock offset, samples. Chosen: 60 frames are 40 ms at 1500 frames/s; larger offsets should be corrected at
-the clock. At half, offsets of 20 ms and more are read as bends of the pressure; twice as many cost twice the time."""
+LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
 
-ENOUGH_READINGS = 400
-"""Readings used to estimate an offset. Chosen: a few hundred determine it to a frame, more only cost time. At half its
-error grows by √2, at twice it falls by as much for traces that are long enough."""
+ENOUGH_READINGS = 400  # Readings used to estimate an offset (chosen)
 
-EM_ITERATIONS = 30
-"""Iterations of the expectation–maximisation of frequencies. Measured: after ten, frequencies of kinds of curves in
-twelve campaigns (kind null:trace of the hidden effects, seeds 20600 to 20611) change by 1e-5 at most."""
+EM_ITERATIONS = 30  # Iterations of the expectation–maximisation of frequencies (measured)
 
-PEAK_LOG_WIDTH = 4.5
-"""Log posterior below the maximum down to which an offset belongs to its peak. Derived: that of normal errors at three
-standard deviations; further away, only the uniform part of the prior contributes."""
+PEAK_LOG_WIDTH = 4.5  # Log posterior below the maximum down to which an offset belongs to its peak (derived)
 
+# Degrees in time and in growth of the curve by which the offset is estimated (chosen)
 TIME_DEGREE, GROWTH_DEGREE = 1, 2
-"""Degrees in time and in growth of the curve by which the offset is estimated. Chosen: a chamber that empties without
-heat is of second degree in the growth to 1e-4 of its pressure; a supply that refills it is slow in time."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Clock offset, samples: delay from a reading to the growth that belongs to it; and its standard deviation.
-
-    `cost` is −2 ln of the prior probability of this offset.
+    """Clock offset, samples: delay from a reading to the growth that belongs to it; and its standard deviation. `cost`
+    is −2 ln of the prior probability of this offset.
     """
 
     offset: float
@@ -58,56 +48,22 @@ class Growth:
     frame_s: float
 
     def at(self, places: Floats) -> Floats:
-        """Growth at places among the samples, m; constant beyond both ends.
-
-        Parameters
-        ----------
-        places : array, samples from the first
-
-        Returns
-        -------
-        array, of the same shape
-        """
+        """Growth at places among the samples, m; constant beyond both ends."""
         return np.interp(places, np.arange(self.grown_m.size), self.grown_m)
 
 
 def polynomial_along(t: Floats, growth_m: Floats, time_degree: int, growth_degree: int) -> Floats:
-    """Powers of time and of growth.
-
-    Parameters
-    ----------
-    t : array, shape (n,)
-        Time on any scale.
-    growth_m : array, shape (n,)
-        Growth on any scale.
-    time_degree, growth_degree : int
-        Degrees in time and in growth.
-
-    Returns
-    -------
-    array, shape (n, bent + along + 1)
-        The first column is 1.
-    """
+    """Powers of time and of growth. Returns the first column is 1. Shapes: t, growth_m (n,) → (n, bent + along + 1)."""
     return np.column_stack(
         [*(t**k for k in range(time_degree + 1)), *(growth_m**k for k in range(1, growth_degree + 1))]
     )
 
 
 def frequencies_in_other_trials(likelihoods: Floats) -> Floats:
-    """Frequencies of several kinds in the other trials of a campaign, as a prior for each trial.
-
-    Estimated by expectation–maximisation. One pseudo-trial that is of every kind alike is added, so that none is ruled
-    out. A trial does not contribute to its own prior, since a chance result would then make itself likely (collapsed
-    variational rule: Asuncion et al., Proc. 25th UAI, 27, 2009).
-
-    Parameters
-    ----------
-    likelihoods : array, shape (n_trials, n_kinds)
-        Each trial on its own scale; all 0 for a trial without information.
-
-    Returns
-    -------
-    array, of the same shape
+    """Frequencies of several kinds in the other trials of a campaign, as a prior for each trial. Estimated by
+    expectation–maximisation. One pseudo-trial that is of every kind alike is added, so that none is ruled out. A trial
+    does not contribute to its own prior, since a chance result would then make itself likely (collapsed variational
+    rule: Asuncion et al., Proc. 25th UAI, 27, 2009). Shapes: likelihoods (n_trials, n_kinds).
     """
     informative = likelihoods.any(axis=1)
     n_kinds = likelihoods.shape[1]
@@ -123,20 +79,7 @@ def frequencies_in_other_trials(likelihoods: Floats) -> Floats:
 def gauge_clocks(
     read: Sequence[Readings], growths: Sequence[Growth | None], noises: Sequence[GaugeNoise]
 ) -> list[Clock | None]:
-    """Clock offset of every trace of a campaign.
-
-    Parameters
-    ----------
-    read : sequence of Readings
-    growths : sequence of Growth or None
-        Of the same trials.
-    noises : sequence of GaugeNoise
-
-    Returns
-    -------
-    list of Clock or None
-        None where nothing grows, or nothing is noisy.
-    """
+    """Clock offset of every trace of a campaign."""
     frames_s = [growth.frame_s for growth in growths if growth is not None]
     if not frames_s:
         return [None] * len(read)
@@ -172,9 +115,8 @@ def gauge_clocks(
 
 
 def _offset_log_likelihood(readings: Readings, growth: Growth, noise: GaugeNoise, offsets: Floats) -> Floats | None:
-    """Log likelihood of offsets, samples, relative to the likeliest; None if there is no information.
-
-    Where no curve explains the readings to their noise, the residual counts as noise.
+    """Log likelihood of offsets, samples, relative to the likeliest; None if there is no information. Where no curve
+    explains the readings to their noise, the residual counts as noise.
     """
     size, columns = readings.places.size, TIME_DEGREE + GROWTH_DEGREE + 1
     if size <= columns:

@@ -9,11 +9,7 @@ offset of gauge and camera (`vinetrack.inference.gauge_clock`), on the scale on 
 is linear in the growth. Of the curves that leave only noise, the one with the least BIC is taken (Schwarz, Ann. Stat.
 6, 461, 1978): a superfluous term bends the speed through the whole trial, at 0.1 kPa of noise by more than its position
 errors. The frequency of each kind of curve in the campaign is estimated too and used as a prior (empirical Bayes:
-Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956), and so is the exponent of the gas, which all trials share. Where a
-second kind is not much less probable, the curve is the average of both and their difference an error (Bayesian model
-averaging). Where no curve leaves only noise, a local line is fitted around each sample, over the widest window whose
-residuals look like noise and that agrees with all narrower ones: wide where the pressure runs straight, narrow at a
-corner (intersection of confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
+Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956), and so is the exponent of the gas, which all trials share.
 """
 
 from __future__ import annotations
@@ -40,62 +36,38 @@ from vinetrack.inference.gauge_readings import (
     whitened,
 )
 
+# Half widths of the windows of local lines, samples (chosen)
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
-"""Half widths of the windows of local lines, samples. Chosen: each half as wide again as the previous one, so that the
-best width is met within a quarter."""
 
-AGREE_SIGMAS = 4.0
-"""Half width, in standard deviations, of the intervals of local lines that must overlap. Chosen (Lepski's rule with κ
-of 3 to 4): at half, corners are found in noise; at twice, corners are rounded."""
+AGREE_SIGMAS = 4.0  # Half width, in standard deviations, of the intervals of local lines that must overlap (chosen)
 
+# Probability with which pure noise leaves a larger residual sum of squares than is accepted (chosen)
 RESIDUAL_FALSE_ALARM = 1e-5
-"""Probability with which pure noise leaves a larger residual sum of squares than is accepted. Chosen: one false alarm
-in 1e5 traces (4.3 standard deviations); at half as many standard deviations one in 60, at twice none."""
 
-LARGEST_DEGREE, EXTRA_DEGREES, SLOW_SIGMAS = 6, 12, 4.0
-"""Largest degree of a polynomial in time; number of higher degrees whose coefficients are tested in the residual; and
-the standard deviations at which one counts as present. Chosen: sixth degree follows any observed filling and draining.
-Derived: 4 standard deviations have a probability of 1e-3 among the nineteen tests of a trace; at half, three traces in
-five would be refused their curve; at twice, a slow part of eight standard errors remains."""
+LARGEST_DEGREE, EXTRA_DEGREES, SLOW_SIGMAS = 6, 12, 4.0  # Largest degree of a polynomial in time (chosen)
 
-LOCAL_SIGMAS = 5.0
-"""Standard deviations from which a sum of neighbouring residuals is more than noise. Chosen: of 40,000 simulated
-traces, a thousand samples of white noise each, one in 600 has a sum beyond it; at 4 one in eight has, and local lines
-replace a valid curve."""
+LOCAL_SIGMAS = 5.0  # Standard deviations from which a sum of neighbouring residuals is more than noise
 
-EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)
-"""Exponents γ with which a chamber may empty into the tube, (P + P_air) V^γ constant; curves are fitted on the scale on
-which the pressure is then linear in the growth. Derived: 1 with heat exchange, 1.4 without. On falls of 5 to 8 kPa a
-line along the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7 with an exponent wrong by 0.1
-(measured on `gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
+EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)  # Exponents γ with which a chamber may empty into the tube, (derived)
 
+# Degrees in time and in growth of the other kinds of curves (chosen)
 GROWTH_DEGREES = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
-"""Degrees in time and in growth of the other kinds of curves. Chosen: a chamber that empties without heat is of second
-degree in the growth to 1e-4 of its pressure; a supply that refills it is slow in time."""
 
+# Probability, relative to the most probable kind of curve, from which a kind enters the average (chosen)
 LEAST_WEIGHT = 0.01
-"""Probability, relative to the most probable kind of curve, from which a kind enters the average. Chosen: below it, an
-error of at most a tenth (√0.01) of the difference between the kinds is neglected; at half 0.07, at twice 0.14 of it."""
 
+# Last part of a trace whose line extrapolates it beyond its end (measured)
 END_PART, EXTRAPOLATED_PART = 0.1, 0.2
-"""Last part of a trace whose line extrapolates it beyond its end, and for how long, both relative to its duration.
-Measured: offsets of 13.5, 25 and 40 ms between clocks in 16 trials of 0.2 to 0.4 s (`trace_clock` of the laboratories,
-tuning seeds 20611 to 20613). With a constant extrapolation a fit finds 6 to 9, 11 to 13 and 20 to 23 ms; with this one
-11 to 13, 21 to 25, 31 to 37. At half or twice the first it finds the same to 4 ms; at half of the second 18 to 22 of 25
-ms and 25 to 27 of 40."""
 
+# Part of the total error variance of a curve below which a principal direction is dropped (chosen)
 NEGLIGIBLE_VARIANCE = 1e-3
-"""Part of the total error variance of a curve below which a principal direction is dropped. Chosen: 3 % of the standard
-deviation, at half 2 and at twice 4 %; each direction costs a simulation of its trial."""
 
 
 @dataclass(frozen=True)
 class DenoisedTrace:
-    """A recorded pressure without its noise, s and Pa, shape (n,), with its remaining errors.
-
-    `mean_error_Pa` is the standard deviation of its mean, 0 where the trace was left unchanged. The columns of
-    `errors_Pa`, shape (n, n_errors), are one standard deviation each of the other errors of the curve. Where it
-    `is_curve` they are specific; for local lines they only state how large the error is in total.
+    """A recorded pressure without its noise, s and Pa, shape (n,), with its remaining errors. `mean_error_Pa` is the
+    standard deviation of its mean, 0 where the trace was left unchanged. The columns of `errors_Pa`, shape (n,
+    n_errors), are one standard deviation each of the other errors of the curve.
     """
 
     time_s: Floats
@@ -105,10 +77,9 @@ class DenoisedTrace:
     is_curve: bool = False
 
     def extended(self) -> DenoisedTrace:
-        """The trace with one more sample beyond its end, along the line through its last part.
-
-        If the clock of the gauge is behind that of the camera, the last frames were filmed under a pressure that was
-        not recorded any more. A constant extrapolation of a falling pressure would bias a fit of the clock offset.
+        """The trace with one more sample beyond its end, along the line through its last part. If the clock of the
+        gauge is behind that of the camera, the last frames were filmed under a pressure that was not recorded any more.
+        A constant extrapolation of a falling pressure would bias a fit of the clock offset.
         """
         last_s, span_s = self.time_s[-1], np.ptp(self.time_s)
         late = self.time_s >= last_s - END_PART * span_s
@@ -130,9 +101,8 @@ class DenoisedTrace:
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown.
-
-    The exponent of the emptying chamber has an error, which is shared by `n_trials` trials.
+    """A trace to be denoised: readings, number of samples, noise; growth and clock offset, None where unknown. The
+    exponent of the emptying chamber has an error, which is shared by `n_trials` trials.
     """
 
     readings: Readings
@@ -146,7 +116,6 @@ class _Recorded:
 
     def basis(self, kind: int, offset_sigmas: float = 0.0) -> tuple[Floats, Floats]:
         """Basis functions of a kind of curve at the readings, orthonormal, and at all samples; the first is the mean.
-
         `offset_sigmas` shifts the clock by so many of its standard deviations.
         """
         at_samples = self._columns(kind, np.arange(float(self.count)), offset_sigmas)
@@ -171,9 +140,8 @@ class _Recorded:
         return polynomial_along(t, grown, *GROWTH_DEGREES[kind - LARGEST_DEGREE - 1])
 
     def criteria(self, exponents: Sequence[float] | None = None) -> Floats:
-        """BIC of every kind of curve, infinite where its residual is more than noise.
-
-        Of shape (n_kinds,), or (n_exponents, n_kinds) for several exponents of the emptying chamber.
+        """BIC of every kind of curve, infinite where its residual is more than noise. Of shape (n_kinds,), or
+        (n_exponents, n_kinds) for several exponents of the emptying chamber.
         """
         recorded = [self] if exponents is None else [replace(self, exponent=exponent) for exponent in exponents]
         y = whitened(np.column_stack([each._linearised(self.readings.values_Pa) for each in recorded]), self.noise.rho)
@@ -199,7 +167,6 @@ class _Recorded:
 
     def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
         """As `curve`, averaged over kinds with these weights; the differences between kinds are errors of the average.
-
         The errors within a kind are those of the kind of largest weight. Bayesian model averaging (Hoeting et al.,
         Stat. Sci. 14, 382, 1999).
         """
@@ -218,11 +185,8 @@ class _Recorded:
         return mean_Pa, of_mean_Pa, _principal_errors(np.column_stack(all_errors_Pa))
 
     def _clock_and_exponent_errors(self, kind: int) -> list[Floats]:
-        """Errors of a curve in growth due to one standard deviation of clock offset and of exponent, Pa.
-
-        The error σ of the exponent is common to n trials. As it is given to each trial separately, each gets √n σ, so
-        that one common error costs as much as it should, but at most the standard deviation of the exponents
-        considered.
+        """Errors of a curve in growth due to one standard deviation of clock offset and of exponent, Pa. The error σ of
+        the exponent is common to n trials.
         """
         if kind <= LARGEST_DEGREE:
             return []
@@ -237,9 +201,8 @@ class _Recorded:
         return replace(self, exponent=self.exponent + offset_sigmas * sigma)
 
     def curve(self, kind: int | None, offset_sigmas: float = 0.0) -> tuple[Floats, float, Floats]:
-        """The curve of a kind at all samples, Pa, the error of its mean, Pa, and one column per other error.
-
-        Without a kind the curve consists of local lines. Errors are one standard deviation each.
+        """The curve of a kind at all samples, Pa, the error of its mean, Pa, and one column per other error. Without a
+        kind the curve consists of local lines. Errors are one standard deviation each.
         """
         noise, values_Pa = self.noise, self.readings.values_Pa
         if kind is None:
@@ -285,19 +248,9 @@ def _principal_errors(errors_Pa: Floats) -> Floats:
 
 
 def denoised_traces(tracks: Sequence[Track]) -> list[DenoisedTrace | None]:
-    """Recorded pressures of the trials of a campaign without gauge noise; None for trials without a trace.
-
-    The frequency of each kind of curve in the campaign enters as a prior: where all other pressures are constant, a
-    bend that a single trace shows by chance counts as noise.
-
-    Parameters
-    ----------
-    tracks : sequence of Track
-
-    Returns
-    -------
-    list of DenoisedTrace or None
-        At the samples with a known pressure.
+    """Recorded pressures of the trials of a campaign without gauge noise; None for trials without a trace. The
+    frequency of each kind of curve in the campaign enters as a prior: where all other pressures are constant, a bend
+    that a single trace shows by chance counts as noise.
     """
     times: dict[int, Floats] = {}
     recorded: list[tuple[Floats, Growth | None]] = []
@@ -429,10 +382,8 @@ def _local_lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
 
 
 def _local_line(y: Floats, half: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Value at every sample of the line through its neighbours, up to `half` to each side.
-
-    Also its standard deviation relative to that of a sample, the residual sum of squares and its degrees of freedom;
-    all of shape (n,).
+    """Value at every sample of the line through its neighbours, up to `half` to each side. Also its standard deviation
+    relative to that of a sample, the residual sum of squares and its degrees of freedom; all of shape (n,).
     """
     y_mean = float(np.mean(y))
     y = y - y_mean

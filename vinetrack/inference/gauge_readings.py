@@ -20,73 +20,45 @@ from vinetrack.core.records import Floats
 from vinetrack.inference.whitening import whiten
 from vinetrack.tracks.position_noise import rough_noise
 
+# Deviation of samples from a line drawn between readings, relative to the largest pressure, if the last digit is not
+# coarser (derived)
 EXACT_TOLERANCE = 1e-9
-"""Deviation of samples from a line drawn between readings, relative to the largest pressure, if the last digit is not
-coarser. Derived: a million times the rounding of double precision."""
 
+# Fraction of samples on a line through two others above which a trace counts as interpolated (chosen)
 INTERPOLATED_PART = 0.25
-"""Fraction of samples on a line through two others above which a trace counts as interpolated. Chosen: with three
-samples per reading a third do, of white noise none; at half, a trace of which an eighth stands still counts as
-interpolated; at twice, a gauge at two fifths of the frame rate is not recognised."""
 
-LEAST_SCATTER_DIGITS = 2.0
-"""Least median scatter, in last digits, of the readings found in traces; below it they are not accepted, since any
-samples rounded to a coarse digit lie on lines. Measured on 400 samples at 2.2 to 40 per reading: noise without readings
-scatters by at most 1.1 digits where every trace seems interpolated, readings with noise of two digits and more by 1.6.
-At half, noise of one digit is taken for readings; at twice, readings with noise of three digits are taken for
-samples."""
+LEAST_SCATTER_DIGITS = 2.0  # Least median scatter, in last digits, of the readings found in traces (measured)
 
+# Samples by which a change may deviate from the even sampling period of a gauge (derived)
 PERIOD_TOLERANCE, PERIOD_FALSE_ALARM = 0.75, 1e-4
-"""Samples by which a change may deviate from the even sampling period of a gauge, and the probability that random
-changes are that regular. Derived: a reading shows up to one sample late, half a sample either way, and a period fitted
-to few of them is off by half of that. Chosen: one trace in ten thousand; at half and at twice, a gauge of five samples
-per reading must change half a time more or less often."""
 
+# Fraction of a line that must be visible at an end of a trace to determine the reading that it leads to (chosen)
 LEAST_LINE_PART = 0.25
-"""Fraction of a line that must be visible at an end of a trace to determine the reading that it leads to. Chosen: a
-line through rounded samples is then known to four digits there; at half to eight; at twice, one more reading of noise
-is lost in every other trace."""
 
-NEGLIGIBLE_NOISE = 1e-4
-"""Noise below this fraction of the median pressure is rounding, and is not removed. Chosen: a tenth of the last digit
-that pressure gauges print."""
+NEGLIGIBLE_NOISE = 1e-4  # Noise below this fraction of the median pressure is rounding, and is not removed (chosen)
 
-FEWEST_SAMPLES = 9
-"""Samples below which a trace does not determine its noise. Derived: twice the degrees of freedom of a cubic, and
-one."""
+FEWEST_SAMPLES = 9  # Samples below which a trace does not determine its noise (derived)
 
+# Least number of blocks into which a trace in coarse steps is divided, and least number of samples in each (chosen)
 FEWEST_BLOCKS = 4
-"""Least number of blocks into which a trace in coarse steps is divided, and least number of samples in each. Chosen:
-four distinguish a slope from a bend; at half, a pressure that falls by less than a step is a line at most; at twice,
-the block means are correlated. Traces with shorter blocks are left unchanged."""
 
-DERIVED_DEGREES = 1e6
-"""Degrees of freedom of a noise that is derived instead of estimated. Derived: practically infinite."""
+DERIVED_DEGREES = 1e6  # Degrees of freedom of a noise that is derived instead of estimated
 
+# Samples below which a trace is left unchanged although other traces determine the noise (derived)
 FEWEST_WITH_OTHERS = 3
-"""Samples below which a trace is left unchanged although other traces determine the noise. Derived: a mean, and two to
-test it."""
 
+# Standard deviations at which differences are clipped in the noise estimate, the part of the variance of normal noise
+# that remains (derived: 0.9707 + 9 · 0.0027), and iterations, of which the last changes it by 1e-4
 CLIP_SIGMAS, VARIANCE_KEPT, CLIP_ROUNDS = 3.0, 0.9950, 3
-"""Standard deviations at which differences are clipped in the noise estimate, the part of the variance of normal noise
-that remains (derived: 0.9707 + 9 · 0.0027), and iterations, of which the last changes it by 1e-4. Chosen: on 2,000
-traces of 300 samples its error is 6.2 %, with clipping at 2 6.4 %; a corner of ten standard deviations raises it by 1.2
-%, with clipping at 4 by 1.7 %."""
 
-NOISE_DEGREES = 2 / 4.62
-"""Degrees of freedom of the noise variance per sample. Derived: neighbouring third differences are correlated by
--15/20, 6/20 and -1/20, so that the relative variance of their mean square is 2 (1 + 2 · 0.655) / n = 4.62 / n."""
+NOISE_DEGREES = 2 / 4.62  # Degrees of freedom of the noise variance per sample (derived)
 
+# Degrees of freedom that the other traces of a campaign add to the noise of a trace (chosen)
 DEGREES_FROM_OTHERS = 20.0
-"""Degrees of freedom that the other traces of a campaign add to the noise of a trace. Chosen: one gauge reads them all;
-as much as 46 readings of its own. At half, the noise estimate of short traces is dominated by chance; at twice, a gauge
-whose noise grows with the pressure is misjudged more."""
 
+# Lag at which noise is compared with that of neighbouring readings, standard deviations from which it counts as
+# correlated, and the largest correlation (chosen)
 COMPARED_LAG, CORRELATION_SIGMAS, LARGEST_CORRELATION = 4, 3.0, 0.97
-"""Lag at which noise is compared with that of neighbouring readings, standard deviations from which it counts as
-correlated, and the largest correlation. Chosen: at lag 4, noise of correlation 0.5 is practically independent, while at
-lag 8 pressures themselves move as far; 3 standard deviations have a probability of 1e-3; a correlation of 0.97 lasts
-for 33 readings, beyond which noise and pressure changes cannot be separated."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +73,8 @@ class GaugeNoise:
 @dataclass(frozen=True)
 class Readings:
     """Readings of a gauge during a trace, Pa, and their places, in samples from the first; both of shape (n,).
-
     `rounding_Pa` is the standard deviation of the rounding error, 0 where nothing is rounded. Where the readings are
-    `all_noise`, their scatter does not determine the noise. Where they are means of blocks of samples, `edges`, shape
-    (n + 1,), are the limits of the blocks.
+    `all_noise`, their scatter does not determine the noise.
     """
 
     places: Floats
@@ -114,15 +84,8 @@ class Readings:
     edges: NDArray[np.intp] | None = None
 
     def means_of(self, curves: Floats) -> Floats:
-        """Block means of curves given at all samples, where the readings are such means.
-
-        Parameters
-        ----------
-        curves : array, shape (n_samples, …)
-
-        Returns
-        -------
-        array, shape (n, …)
+        """Block means of curves given at all samples, where the readings are such means. Shapes: curves (n_samples, …)
+        → (n, …).
         """
         assert self.edges is not None
         sums = np.add.reduceat(curves, self.edges[:-1], axis=0)
@@ -131,17 +94,8 @@ class Readings:
 
 
 def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
-    """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held.
-
-    Parameters
-    ----------
-    traces : sequence of arrays, shape (n,), Pa
-        Evenly spaced samples of one gauge, possibly rounded after interpolation.
-
-    Returns
-    -------
-    list of Readings
-        Their places increase; the first and the last may lie before and after the trace.
+    """Readings of a gauge: the samples of a trace, or those between which it was interpolated or held. Shapes: traces
+    (n,).
     """
     candidates = [_interpolated_readings(pressure_Pa) for pressure_Pa in traces]
     scatter_digits = [digits for _, digits in filter(None, candidates)]
@@ -154,9 +108,8 @@ def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
 
 
 def _samples_as_readings(pressure_Pa: Floats) -> Readings:
-    """Samples as readings; where they are in steps coarser than their noise, means of blocks of samples.
-
-    The rounding errors of such samples are correlated over as many samples as the pressure takes for one step.
+    """Samples as readings; where they are in steps coarser than their noise, means of blocks of samples. The rounding
+    errors of such samples are correlated over as many samples as the pressure takes for one step.
     """
     count = pressure_Pa.size
     plain = Readings(np.arange(float(count)), pressure_Pa)
@@ -221,9 +174,8 @@ def _common_divisor(values: Floats, exact: float) -> float:
 
 
 def _straight_runs(values: Floats, reach: float) -> NDArray[np.intp]:
-    """First samples of maximal runs that a straight line fits to within `reach`.
-
-    A line through intervals exists if the ranges of slopes that each pair of them allows have a common value.
+    """First samples of maximal runs that a straight line fits to within `reach`. A line through intervals exists if the
+    ranges of slopes that each pair of them allows have a common value.
     """
     begins = [0]
     low, high = -math.inf, math.inf
@@ -249,10 +201,9 @@ def _noise_of_uneven(places: Floats, values: Floats) -> float:
 
 
 def _sample_and_hold_readings(pressure_Pa: Floats, digit_Pa: float) -> tuple[Floats, Floats] | None:
-    """Readings that are held until the next one; each was read up to a sample before it first appears.
-
-    In coarse steps many readings equal the previous one: they follow from the even period of those that differ. None if
-    the trace is not held.
+    """Readings that are held until the next one; each was read up to a sample before it first appears. In coarse steps
+    many readings equal the previous one: they follow from the even period of those that differ. None if the trace is
+    not held.
     """
     steps = np.diff(pressure_Pa)
     changes = np.flatnonzero(steps) + 1
@@ -296,7 +247,6 @@ def _sampling_period(instants: Floats) -> tuple[float, float] | None:
 
 def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Readings that were interpolated linearly: the intersections of lines through neighbouring runs of samples.
-
     `begins` are the first samples of the runs. A trace begins and ends between two readings: the readings outside it
     are the values of its first and last line after the typical spacing.
     """
@@ -327,18 +277,8 @@ def _line_intersections(pressure_Pa: Floats, begins: NDArray[np.intp]) -> tuple[
 
 
 def white_noise_sd(pressure_Pa: Floats) -> float:
-    """Standard deviation of white noise on a smooth curve, from third differences; their variance is 20 σ².
-
-    Differences beyond three standard deviations, such as at a corner, are clipped (Winsorised).
-
-    Parameters
-    ----------
-    pressure_Pa : array, shape (n,), Pa
-        Samples of a trace.
-
-    Returns
-    -------
-    float, Pa
+    """Standard deviation of white noise on a smooth curve, from third differences; their variance is 20 σ². Differences
+    beyond three standard deviations, such as at a corner, are clipped (Winsorised). Shapes: pressure_Pa (n,).
     """
     third = np.diff(pressure_Pa, 3) / math.sqrt(20)
     sigma = rough_noise(pressure_Pa)
@@ -348,18 +288,7 @@ def white_noise_sd(pressure_Pa: Floats) -> float:
 
 
 def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise]:
-    """Noise of every trace, shrunk towards that of other traces of the gauge; 0 if negligible or undetermined.
-
-    Parameters
-    ----------
-    readings : sequence of Readings
-    rho : float
-        Lag-one correlation.
-
-    Returns
-    -------
-    list of GaugeNoise
-    """
+    """Noise of every trace, shrunk towards that of other traces of the gauge; 0 if negligible or undetermined."""
     own_sigma = [math.nan] * len(readings)
     for i, each in enumerate(readings):
         if each.values_Pa.size >= FEWEST_SAMPLES and not each.all_noise:
@@ -382,18 +311,10 @@ def noise_of_traces(readings: Sequence[Readings], rho: float) -> list[GaugeNoise
 
 
 def noise_correlation(traces: Sequence[Floats]) -> float:
-    """Lag-one correlation of the noise of readings, the same in all traces; 0 unless significantly positive.
-
-    If noise is correlated, third differences of readings COMPARED_LAG apart are larger than those of neighbours. A
-    changing pressure has slow differences too, but not in most traces, so the median over traces is used.
-
-    Parameters
-    ----------
-    traces : sequence of arrays, shape (n_readings,), Pa
-
-    Returns
-    -------
-    float
+    """Lag-one correlation of the noise of readings, the same in all traces; 0 unless significantly positive. If noise
+    is correlated, third differences of readings COMPARED_LAG apart are larger than those of neighbours. A changing
+    pressure has slow differences too, but not in most traces, so the median over traces is used. Shapes: traces
+    (n_readings,).
     """
     ratios, counts = [], []
     for readings_Pa in traces:
@@ -426,15 +347,7 @@ def _third_difference_variance(rho: Floats) -> Floats:
 
 
 def whitened(values: Floats, rho: float) -> Floats:
-    """Readings, or columns of curves through them, whitened for noise of the given lag-one correlation.
-
-    Parameters
-    ----------
-    values : array, shape (n,) or (n, k)
-    rho : float
-
-    Returns
-    -------
-    array, of the same shape
+    """Readings, or columns of curves through them, whitened for noise of the given lag-one correlation. Shapes: values
+    (n,).
     """
     return whiten(values, np.arange(len(values)) == 0, rho)

@@ -22,26 +22,11 @@ from vinetrack.inference.whitening import at_correlation
 def levenberg_marquardt_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, damping: float
 ) -> tuple[Floats, Floats, float]:
-    """Damped Gauss–Newton step of parameters and trial effects, and the decrease that it predicts.
-
-    The trial effects are eliminated from the normal equations (Schur complement), the reduced system is solved within
-    the bounds, and the trial effects follow by back-substitution.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, k, k)
-        Of [trial effects, keys, residual], see `whitening`.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    damping : float
-        The diagonal is multiplied by 1 plus this (Levenberg–Marquardt); 0 for a Gauss–Newton step.
-
-    Returns
-    -------
-    step : array, shape (n_free,)
-    trial_effect_step : array, shape (n_trials, 4)
-    predicted_decrease : float
-        Of the penalised sum of squares along this step, by the linear model without the damping.
+    """Damped Gauss–Newton step of parameters and trial effects, and the decrease that it predicts. The trial effects
+    are eliminated from the normal equations (Schur complement), the reduced system is solved within the bounds, and the
+    trial effects follow by back-substitution. Returns step, trial_effect_step, predicted_decrease (of the penalised sum
+    of squares along this step, by the linear model without the damping). Shapes: cross_products (n_trials, 3, k, k) →
+    (n_free,).
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     effect_information, effect_gradient = _trial_effect_equations(white, problem, state)
@@ -73,20 +58,8 @@ def levenberg_marquardt_step(
 def trial_effect_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, *, fixed_release: bool = False
 ) -> Floats:
-    """Gauss–Newton step of the trial effects at fixed parameters.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, k, k)
-        Of [trial effects, keys, residual], see `whitening`.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    fixed_release : bool
-        Whether the release stays where it is.
-
-    Returns
-    -------
-    array, shape (n_trials, 4)
+    """Gauss–Newton step of the trial effects at fixed parameters. Shapes: cross_products (n_trials, 3, k, k) →
+    (n_trials, 4).
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     square, slope = _trial_effect_equations(white, problem, state)
@@ -106,27 +79,10 @@ def _trial_effect_equations(white: Floats, problem: MixedProblem, state: FitStat
 def bounded_solve(
     square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Step to the minimum of a quadratic form within bounds.
-
-    Primal active-set method (Nocedal & Wright, Numerical Optimization, 2nd ed., Springer 2006, algorithm 16.3): a
-    parameter that meets its bound is held there while the others go on. At their minimum, the one that the gradient
-    draws back inside most is released: of two parameters that met their bounds together, one alone may belong there.
-
-    Parameters
-    ----------
-    square : array, shape (n_free, n_free)
-        Information of the free parameters.
-    slope : array, shape (n_free,)
-        Half the negative gradient of the sum of squares.
-    problem : bounds, and which parameters are estimated.
-    theta : array, shape (n_free,)
-        Current parameters, scaled.
-
-    Returns
-    -------
-    step : array, shape (n_free,)
-    moving : array of bool, shape (n_free,)
-        Parameters that do not end at a bound.
+    """Step to the minimum of a quadratic form within bounds. Primal active-set method (Nocedal & Wright, Numerical
+    Optimization, 2nd ed., Springer 2006, algorithm 16.3): a parameter that meets its bound is held there while the
+    others go on. Returns step, moving (parameters that do not end at a bound). Shapes: square (n_free, n_free); slope,
+    theta (n_free,) → (n_free,).
     """
     moving = problem.free & (np.diag(square) > 0)
     if moving.all():
@@ -164,17 +120,8 @@ def bounded_solve(
 
 
 def solve_scaled(square: Floats, slope: Floats) -> Floats:
-    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular.
-
-    Parameters
-    ----------
-    square : array, shape (n, n)
-        Symmetric.
-    slope : array, shape (n,)
-
-    Returns
-    -------
-    array, shape (n,)
+    """Solve a symmetric system scaled to a unit diagonal, by least squares where it is singular. Shapes: square (n, n);
+    slope (n,) → (n,).
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(square), 1e-300))
     scaled = square * scale[:, None] * scale

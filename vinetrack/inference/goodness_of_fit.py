@@ -14,29 +14,16 @@ if TYPE_CHECKING:
     from vinetrack.inference.optimiser import Solution
     from vinetrack.inference.sensitivity import Predictor
 
+# χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried (chosen)
 POOR_FIT = 3.0
-"""χ² per degree of freedom above which a fit may be at a local minimum, and other starts are tried. Chosen: half would
-try further starts for most fits (time), twice would keep local minima."""
 
+# Residual of the median trial, relative to its growth, above which a fit is poor (chosen)
 POOR_RELATIVE_RESIDUAL = 3e-3
-"""Residual of the median trial, relative to its growth, above which a fit is poor. Chosen: several times the slowly
-varying error of a tracker; it decides whether further starts are tried, so half costs time and twice may keep a local
-minimum."""
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone.
-
-    Noise below the accuracy of the integrator is replaced by that accuracy, see `fit_problem.variance_floor`.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    float
+    """χ² per degree of freedom, relative to the noise (variance and correlation) estimated from the tracks alone. Noise
+    below the accuracy of the integrator is replaced by that accuracy, see `fit_problem.variance_floor`.
     """
     data = predictor.data
     rho = track_correlation(data)
@@ -49,19 +36,9 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
-    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth.
-
-    Both are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths.
-    That is far above its noise, but no reason to try other starts.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    bool
+    """Whether a solution misses the tracks by far more than their noise and by a visible fraction of the growth. Both
+    are needed: a tracker whose frames agree to a hundredth of a millimetre may have slow errors of a few tenths. That
+    is far above its noise, but no reason to try other starts.
     """
     return bool(
         chi2_per_dof(predictor, solution) > POOR_FIT and relative_residual(predictor, solution) > POOR_RELATIVE_RESIDUAL
@@ -69,17 +46,7 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 
 
 def relative_residual(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square residual of the median trial, relative to its observed growth.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    float
-    """
+    """Root mean square residual of the median trial, relative to its observed growth."""
     relative = [
         math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
         for columns, trial_data in zip(solution.columns, predictor.data, strict=True)

@@ -21,28 +21,21 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import FixedTerms, Solution, solve
 from vinetrack.inference.sensitivity import Predictor
 
+# Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined
 SINGULAR_EIGENVALUE = 1e-10
-"""Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined."""
 
-LEAST_INFORMATION = 1e-6
-"""Information below which a parameter has no influence on the trajectories: χ² would change by this over the whole
-scale of the parameter. Chosen far below anything relevant: a Δχ² of 1e-6 gives an interval of a thousand scales."""
+LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence on the trajectories (chosen)
 
-NEAR_BOUND_SIGMAS = 3.5
-"""Standard errors from a bound within which the interval is a profile interval. Derived: beyond 3.5 the normal 95 %
-interval and the profile interval agree to a thousandth."""
+NEAR_BOUND_SIGMAS = 3.5  # Standard errors from a bound within which the interval is a profile interval
 
-LOG_STEP = 0.1
-"""Step of derivatives in the logarithm of a positive number. Chosen: 10 % a step; only time depends on it, the end of
-the interval is interpolated."""
+LOG_STEP = 0.1  # Step of derivatives in the logarithm of a positive number (chosen)
 
 
 @dataclass(frozen=True)
 class Precision:
-    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones.
-
-    `degrees`, shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without
-    influence on the trajectories, `collinear` those of which only a combination with others is determined.
+    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones. `degrees`,
+    shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without influence on the
+    trajectories, `collinear` those of which only a combination with others is determined.
     """
 
     covariance: Floats
@@ -52,18 +45,7 @@ class Precision:
 
 
 def first_parameters(precision_of_all: Precision, count: int) -> Precision:
-    """The precision of the first `count` parameters, the others integrated out.
-
-    Parameters
-    ----------
-    precision_of_all : of all parameters.
-    count : int
-        How many are kept.
-
-    Returns
-    -------
-    Precision
-    """
+    """The precision of the first `count` parameters, the others integrated out."""
     return Precision(
         precision_of_all.covariance[:count, :count],
         precision_of_all.degrees[:count],
@@ -73,16 +55,7 @@ def first_parameters(precision_of_all: Precision, count: int) -> Precision:
 
 
 def precision(solution: Solution) -> Precision:
-    """Covariance at the end of a fit, from the model of noise and between-trial variation.
-
-    Parameters
-    ----------
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    Precision
-    """
+    """Covariance at the end of a fit, from the model of noise and between-trial variation."""
     part = marginal(solution.cross_products, solution.problem, solution.state)
     covariance, insensitive, collinear = _covariance(part, solution.problem, solution.state, solution.state.spread)
     return Precision(covariance, degrees_of_freedom(solution), insensitive, collinear)
@@ -112,18 +85,9 @@ def _covariance(
 
 
 def degrees_of_freedom(solution: Solution) -> Floats:
-    """Satterthwaite degrees of freedom of every free parameter; infinite if no between-trial variance matters.
-
-    Source: Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted
-    likelihood in the logarithms of the between-trial standard deviations.
-
-    Parameters
-    ----------
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    array, shape (n_free,)
+    """Satterthwaite degrees of freedom of every free parameter; infinite if no between-trial variance matters. Source:
+    Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted likelihood in
+    the logarithms of the between-trial standard deviations. Shape (n_free,).
     """
     problem, state = solution.problem, solution.state
     active = [k for k in range(2) if solution.estimable[k] and state.spread[k] > 1e-4]
@@ -175,35 +139,14 @@ def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
 
 
 def student(dof: Floats) -> Floats:
-    """Half width of a 95 % interval in standard errors.
-
-    Parameters
-    ----------
-    dof : array
-        Degrees of freedom, infinite for a normal distribution.
-
-    Returns
-    -------
-    array
-    """
+    """Half width of a 95 % interval in standard errors."""
     from scipy.stats import t
 
     return np.asarray(t.ppf(0.975, np.minimum(dof, 1e6)))
 
 
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
-    """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors.
-
-    Parameters
-    ----------
-    solution : where the iterations ended.
-    sigma : array, shape (n_free,)
-        Standard errors, scaled.
-
-    Returns
-    -------
-    array of bool, shape (n_free,)
-    """
+    """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors. Shapes: sigma (n_free,) → (n_free,)."""
     problem, theta = solution.problem, solution.state.theta
     room = np.minimum(theta - problem.lower, problem.upper - theta)
     return np.isfinite(sigma) & (room < NEAR_BOUND_SIGMAS * sigma)
@@ -213,25 +156,8 @@ def profile_interval(
     predictor: Predictor, solution: Solution, place: int, sigma: float, reach: float
 ) -> tuple[float, float]:
     """Profile-likelihood interval of one parameter: constrained fits whose −2 ln L lies within `reach`² of the best.
-
     Between-trial standard deviations and noise stay those of the best fit, so that for a linear model this is the
-    interval ± `reach` · `sigma`. A side that meets a bound first ends there.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    place : int
-        Index of the parameter.
-    sigma : float
-        Its standard error, scaled.
-    reach : float
-        Half width of the interval in standard errors.
-
-    Returns
-    -------
-    low, high : float
-        Scaled.
+    interval ± `reach` · `sigma`. A side that meets a bound first ends there. Returns low, high : float: Scaled.
     """
     problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))

@@ -31,67 +31,23 @@ from vinetrack.inference.whitening import all_products, at_correlation
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
 
+# Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
 LEAST_EIGENVALUE = 1e-4
-"""Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined. Chosen:
-at 1e-4 their correlation is 0.9999."""
 
-MOST_STEPS = 20
-"""Maximum number of Gauss–Newton steps for release and origin. Chosen as a safeguard."""
+MOST_STEPS = 20  # Maximum number of Gauss–Newton steps for release and origin (chosen)
 
-SETTLED_FRAMES = 1e-3
-"""Step of the release below which it has converged, frames. Chosen: a hundredth of the resolution of a good tracker;
-half takes one more step, twice is still invisible."""
+SETTLED_FRAMES = 1e-3  # Step of the release below which it has converged, frames (chosen)
 
-FEWEST_AT_REST = 5
-"""Frames at rest that determine where a vine started, to half the noise of one. Derived: the mean of five frames errs
-by 0.45 of one frame's noise."""
+FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
 def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
-    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`.
-
-    Parameters
-    ----------
-    fit : a fit.
-    pairs : iterable of (Trial, Track)
-        Trials to predict.
-    from_rest : bool
-        Take the origin from the frames at rest, and fit the release (and the origin where no rest was recorded) by
-        ordinary least squares. By default both are fitted with the noise correlation of the fit, which is nearly 1
-        where a model fails, so that the origin then depends on the misfit.
-
-    Returns
-    -------
-    list of TrialFit
-
-    Raises
-    ------
-    FitError
-        If a trial cannot be used, or its vine was not in the fit and B is one per vine.
-    """
+    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
     return predict_prepared(fit, prepared_pairs(pairs), from_rest=from_rest)
 
 
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
-    """As `predict_trials`, for trials whose data are already prepared.
-
-    Parameters
-    ----------
-    fit : a fit.
-    data : sequence of FitTrial
-        Trials to predict.
-    from_rest : bool
-        Whether the origin is taken from the frames at rest.
-
-    Returns
-    -------
-    list of TrialFit
-
-    Raises
-    ------
-    FitError
-        If a vine was not in the fit and B is one per vine, or the model cannot be simulated.
-    """
+    """As `predict_trials`, for trials whose data are already prepared."""
     rho = 0.0 if from_rest else fit.noise_correlation
     variance = fit.noise_m**2 * (1 - rho**2)
     predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
@@ -117,28 +73,9 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
 
 
 def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
-    """Fit release and origin of trials to a fitted model.
-
-    Parameters
-    ----------
-    fit : a fit.
-    data : sequence of FitTrial
-    from_rest : bool
-        Whether the origin is taken from the frames at rest.
-
-    Returns
-    -------
-    predictor : Predictor
-        Of these trials, without free parameters.
-    trial_effects : array, shape (n_trials, 4)
-        Release and origin; zero deviations.
-    square : array, shape (n_trials, 2, 2)
-        Whitened cross products of release and origin.
-
-    Raises
-    ------
-    FitError
-        As `predict_prepared`.
+    """Fit release and origin of trials to a fitted model. Returns predictor (of these trials, without free parameters),
+    trial_effects (release and origin; zero deviations), square (whitened cross products of release and origin). Shape
+    (n_trials, 4).
     """
     data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
     predictor = Predictor(_without_free_parameters(fit, data), data, fit.predictor.host)
@@ -153,37 +90,16 @@ def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) ->
 
 
 def scaled_least_squares(design: Floats, residual: Floats, least: float) -> Floats:
-    """Least squares with columns scaled to unit length; directions that are hardly determined get zero.
-
-    At constant speed a later release and a higher origin are collinear.
-
-    Parameters
-    ----------
-    design : array, shape (n_points, n_columns)
-    residual : array, shape (n_points,)
-        Right-hand side.
-    least : float
-        Least singular value that counts, relative to the largest.
-
-    Returns
-    -------
-    array, shape (n_columns,)
+    """Least squares with columns scaled to unit length; directions that are hardly determined get zero. At constant
+    speed a later release and a higher origin are collinear. Shapes: design (n_points, n_columns); residual (n_points,)
+    → (n_columns,).
     """
     length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     return np.asarray(np.linalg.lstsq(design / length, residual, rcond=least)[0] / length)
 
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
-    """Trials with enough frames at rest to determine where they started.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    array of bool, shape (n_trials,)
-    """
+    """Trials with enough frames at rest to determine where they started. Shape (n_trials,)."""
     return np.array(
         [trial_data.n_rest >= FEWEST_AT_REST or trial_data.imprecise_rest is not None for trial_data in data],
         dtype=bool,
@@ -191,21 +107,7 @@ def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
 
 
 def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
-    """Prepare the data of trials for a prediction.
-
-    Parameters
-    ----------
-    pairs : trials with their tracks
-
-    Returns
-    -------
-    list of FitTrial
-
-    Raises
-    ------
-    FitError
-        If a trial cannot be used; the message names it.
-    """
+    """Prepare the data of trials for a prediction."""
     data, unusable = prepare(pairs, weighted=False)
     for name, reason in unusable.items():
         raise FitError(f"Trial {name}: {reason}.")
@@ -233,9 +135,8 @@ def _without_free_parameters(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap
 def _fit_release_and_origin(
     predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool
 ) -> tuple[Floats, Floats]:
-    """Gauss–Newton steps in release and origin, of at most two frames; the trial effects and their information.
-
-    Trials that have converged are not simulated again.
+    """Gauss–Newton steps in release and origin, of at most two frames; the trial effects and their information. Trials
+    that have converged are not simulated again.
     """
     data = predictor.data
     frames = np.array([trial_data.frame_s for trial_data in data])

@@ -31,37 +31,26 @@ from vinetrack.inference.variance_kernels import (
 )
 from vinetrack.inference.whitening import at_correlation
 
-LARGEST_SPREAD = (0.04, 0.15)
-"""Upper bounds of the between-trial standard deviations of pressure and ln B: four times what a batch of vines shows.
-With more, the pressure and B of each trial would absorb whatever the model lacks. Chosen: a batch of vines varies by a
-few per cent of B and one per cent of pressure; at half, real batches are cut short; at twice, missing effects are
-absorbed."""
+LARGEST_SPREAD = (0.04, 0.15)  # Upper bounds of the between-trial standard deviations of pressure and ln B (chosen)
 
+# Standard deviations from which the maximum of the likelihood is searched
 SPREAD_GRID = (0.001, 0.004, 0.01, 0.025, 0.06)
-"""Standard deviations from which the maximum of the likelihood is searched. Chosen: steps of a factor of about 2.5,
-less than the width of a maximum, from below what any batch shows to beyond the largest of pressure."""
 
-LARGEST_CORRELATION = 0.9998
-"""Upper bound of the noise correlation, nearly 1: the misfit of a wrong model is slow and large, and must not count as
-thousands of independent points. Derived: a correlation time of 5000 frames, longer than any recording."""
+LARGEST_CORRELATION = 0.9998  # Upper bound of the noise correlation, nearly 1 (derived)
 
 CORRELATIONS = np.concatenate(
     [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
 )
 
+# Prior precision of a shared parameter that is freed in each trial, relative to that trial's information at white
+# noise; least part of the residual sum of squares that remains (derived)
 VAGUE_PRECISION, LEAST_RESIDUAL_PART = 1e-9, 1e-6
-"""Prior precision of a shared parameter that is freed in each trial, relative to that trial's information at white
-noise; least part of the residual sum of squares that remains. Derived: 1e-9 is far below any information at the
-correlations of the grid, far above rounding; a residual of which a millionth remains is a thousand times its noise."""
 
 
 @dataclass(frozen=True)
 class Marginal:
-    """Whitened cross products of each trial with release and origin eliminated.
-
-    `blocks`, shape (n_trials, 2 + n_keys + 1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual
-    taken at zero deviations. `log_constant` is the part of −2 ln L that does not depend on the between-trial standard
-    deviations.
+    """Whitened cross products of each trial with release and origin eliminated. `blocks`, shape (n_trials, 2 + n_keys +
+    1, 2 + n_keys + 1), are those of [deviations, keys, residual], the residual taken at zero deviations.
     """
 
     blocks: Floats
@@ -69,18 +58,8 @@ class Marginal:
 
 
 def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> Marginal:
-    """Eliminate release and origin, and take the residual at zero deviations.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, k, k)
-        Of [trial effects, keys, residual], see `whitening`.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-
-    Returns
-    -------
-    Marginal
+    """Eliminate release and origin, and take the residual at zero deviations. Shapes: cross_products (n_trials, 3, k,
+    k).
     """
     white = at_correlation(cross_products, state.rho) / state.variance[:, None, None]
     white = at_zero_deviations(white, state, -1)
@@ -94,21 +73,9 @@ def marginal(cross_products: Floats, problem: MixedProblem, state: FitState) -> 
 
 
 def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out.
-
-    Parameters
-    ----------
-    part : release and origin eliminated.
-    problem : the constant part of the fit.
-    spread : (float, float)
-        Between-trial standard deviations of pressure and ln B.
-
-    Returns
-    -------
-    blocks : array, shape (n_trials, n_keys + 1, n_keys + 1)
-        The last row and column belong to the residual.
-    inner : array, shape (n_trials, 2, 2)
-        I + S Z S of the deviations, whose determinant enters ln L; S are the standard deviations.
+    """Whitened cross products of the keys and residual of each trial, all trial effects integrated out. Returns blocks
+    (the last row and column belong to the residual), inner (I + S Z S of the deviations, whose determinant enters ln L;
+    S are the standard deviations). Shape (n_trials, n_keys + 1, n_keys + 1).
     """
     root = trial_deviation_sd(problem, spread) * problem.has_deviation
     inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
@@ -119,25 +86,9 @@ def deviations_eliminated(part: Marginal, problem: MixedProblem, spread: tuple[f
 def normal_equations(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
-    """Normal equations of the free parameters at given between-trial standard deviations.
-
-    Parameters
-    ----------
-    part : release and origin eliminated.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    spread : (float, float)
-        Between-trial standard deviations of pressure and ln B.
-
-    Returns
-    -------
-    information : array, shape (n_free, n_free)
-    slope : array, shape (n_free,)
-        Half the negative gradient of the sum of squares.
-    square : float
-        Penalised sum of squares at the current parameters.
-    log_det : float
-        Sum over trials of ln det(I + S Z S).
+    """Normal equations of the free parameters at given between-trial standard deviations. Returns information, slope
+    (half the negative gradient of the sum of squares), square (penalised sum of squares at the current parameters),
+    log_det (sum over trials of ln det(I + S Z S)). Shape (n_free, n_free).
     """
     root = trial_deviation_sd(problem, spread) * problem.has_deviation
     size = problem.prior_mean.size
@@ -151,22 +102,7 @@ def normal_equations(
 def deviance(
     part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
 ) -> float:
-    """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters.
-
-    Parameters
-    ----------
-    part : release and origin eliminated.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    spread : (float, float)
-        Between-trial standard deviations of pressure and ln B.
-    restricted : bool
-        Whether the likelihood is the restricted one (REML).
-
-    Returns
-    -------
-    float
-    """
+    """−2 ln of the (restricted) likelihood at given between-trial standard deviations, profiled over the parameters."""
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
     constant = square + log_det + part.log_constant
     return profiled_deviance(information, slope, constant, problem, state, restricted=restricted)
@@ -175,22 +111,8 @@ def deviance(
 def profiled_deviance(
     information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
 ) -> float:
-    """−2 ln L minimised over the free parameters, from their normal equations.
-
-    Parameters
-    ----------
-    information : array, shape (n_free, n_free)
-    slope : array, shape (n_free,)
-    constant : float
-        −2 ln L at the current parameters.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    restricted : bool
-        Whether the likelihood is the restricted one (REML).
-
-    Returns
-    -------
-    float
+    """−2 ln L minimised over the free parameters, from their normal equations. Shapes: information (n_free, n_free);
+    slope (n_free,).
     """
     if restricted or problem.random is None:
         below, above = state.theta - problem.lower, problem.upper - state.theta
@@ -211,10 +133,9 @@ def profiled_deviance(
 
 
 def _groups_integrated(information: Floats, prior_precision: Floats, random: NDArray[np.bool_]) -> float:
-    """Change of −2 ln L when the random effects w of groups of trials are integrated out: ln det(I + D M D).
-
-    With w ~ N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is
-    det(D (M + D⁻²) D)^(−½). So a hypothesis with many groups is penalised for each of them.
+    """Change of −2 ln L when the random effects w of groups of trials are integrated out: ln det(I + D M D). With w ~
+    N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is det(D (M + D⁻²)
+    D)^(−½). So a hypothesis with many groups is penalised for each of them.
     """
     sd = 1 / np.sqrt(prior_precision[random])
     return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
@@ -228,25 +149,9 @@ def estimate_between_trial_sd(
     *,
     restricted: bool = True,
 ) -> tuple[float, float]:
-    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood.
-
-    The likelihood may have two maxima, since pressure and B can explain the same variation. So the search starts from
-    the best of a grid and the current values.
-
-    Parameters
-    ----------
-    part : release and origin eliminated.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    estimable : (bool, bool)
-        Which of the two are estimated; the other keeps its value.
-    restricted : bool
-        Whether the likelihood is the restricted one.
-
-    Returns
-    -------
-    (float, float)
-        Of pressure, relative, and of ln B.
+    """Between-trial standard deviations that maximise the restricted (or marginal) likelihood. The likelihood may have
+    two maxima, since pressure and B can explain the same variation. So the search starts from the best of a grid and
+    the current values. Returns (float, float).
     """
     from scipy.optimize import minimize
 
@@ -280,27 +185,10 @@ def estimate_between_trial_sd(
 def estimate_noise(
     cross_products: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
 ) -> tuple[float, Floats]:
-    """Noise correlation, the same for all trials, and innovation variance of each trial, by restricted likelihood.
-
-    The residuals are those after the trial effects have been fitted. Each variance is shrunk towards the common one by
-    as much as the differences between trials are due to chance.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, k, k)
-        Of [trial effects, keys, residual], see `whitening`.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    rho : float, optional
-        Correlation, if it is fixed.
-    within : bool
-        Whether the shared parameters are free in each trial too, so that disagreement between trials is not taken for
-        noise.
-
-    Returns
-    -------
-    rho : float
-    variance : array, shape (n_trials,), m²
+    """Noise correlation, the same for all trials, and innovation variance of each trial, by restricted likelihood. The
+    residuals are those after the trial effects have been fitted. Each variance is shrunk towards the common one by as
+    much as the differences between trials are due to chance. Returns rho, variance. Shapes: cross_products (n_trials,
+    3, k, k) → (n_trials,).
     """
     grid = CORRELATIONS if rho is None else np.array([rho])
     centre, precision = trial_effect_prior(problem, state)

@@ -1,4 +1,5 @@
-"""Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole trajectories.
+"""Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole
+trajectories.
 
 Both use the same recordings, but not the same part of them: steady windows show the final speed of a vine, trajectories
 also the approach to it. If they differ by more than their errors, the model lacks an effect.
@@ -24,25 +25,7 @@ CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory",
 
 
 def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
-    """One row per vine, as `model_check.csv` holds it.
-
-    Parameters
-    ----------
-    fit : a fit with B and n free.
-    damping : one fit of `damping.json`: `both_axes` or `log_log`.
-
-    Returns
-    -------
-    DataFrame
-        `z` is the difference between the two pairs (n, ln B) of a vine, as the normal deviate with the same p-value.
-        Errors are added as if the two were independent; as they share their noise, z is too small rather than too
-        large. NaN where a vine is missing in either.
-
-    Raises
-    ------
-    FitError
-        If the exponent was not estimated in the fit.
-    """
+    """One row per vine, as `model_check.csv` holds it."""
     import pandas as pd
 
     if EXPONENT not in [number.key for number in fit.numbers]:

@@ -29,52 +29,34 @@ from vinetrack.inference.trial_effects import (
     trial_costs,
 )
 
-MOST_ITERATIONS = 60
-"""Maximum number of steps. Chosen as a safeguard against very slow convergence; a fit that reaches it reports that it
-has not converged."""
+MOST_ITERATIONS = 60  # Maximum number of steps (chosen)
 
-CONVERGED_DECREASE = 1e-2
-"""Predicted decrease of −2 ln L per step below which the parameters have converged. Derived: a decrease of 0.01 is a
-step of 0.1 standard errors, all parameters together."""
+CONVERGED_DECREASE = 1e-2  # Predicted decrease of −2 ln L per step below which the parameters have converged (derived)
 
+# Relative change of noise and between-trial standard deviations that counts as converged (chosen)
 CONVERGED_VARIANCES = 0.02
-"""Relative change of noise and between-trial standard deviations that counts as converged. Chosen: standard errors are
-then good to 2 %; half costs one or two iterations, twice changes intervals by 4 %."""
 
+# Releases that no frame at rest determines are searched globally once the predicted decrease of a step falls below the
+# first number, or after this many steps (along the valley between two releases Gauss–Newton steps become tiny); and how
+# many of these searches may move a release (chosen)
 NEARLY_CONVERGED, RELEASE_SEARCH_INTERVAL, MOST_RELEASE_SEARCHES = 3.0, 4, 8
-"""Releases that no frame at rest determines are searched globally once the predicted decrease of a step falls below the
-first number, or after this many steps (along the valley between two releases Gauss–Newton steps become tiny); and how
-many of these searches may move a release. Chosen for time: one search costs as much as four steps."""
 
+# Steps in which between-trial standard deviations and noise correlation keep their initial values (chosen)
 FIRST_ITERATIONS, MOST_FIRST_ITERATIONS, FAR_FROM_OPTIMUM = 3, 9, 1e3
-"""Steps in which between-trial standard deviations and noise correlation keep their initial values; then up to so many,
-as long as the predicted decrease of −2 ln L exceeds the third number. A misfit that has not been fitted yet must not be
-taken for noise or between-trial variation. Chosen: after three steps most starts are closer than that; at half, the
-standard deviations absorb what the first steps have not fitted yet."""
 
-PROGRESS_STEPS = 4
-"""Steps over which progress is measured before a fit is stopped early. Chosen: as many as lie between two searches of
-releases, after which −2 ln L may rise for a step or two; at half, such a rise would stop the fit; at twice, a third of
-the steps is saved instead of more than half. The likelihood of a vine that sticks has corners at which progress pauses
-for longer, so a fit that is not part of a search is never stopped."""
+PROGRESS_STEPS = 4  # Steps over which progress is measured before a fit is stopped early (chosen)
 
+# Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped (derived)
 STAGNATION_DECREASE = 2e-3
-"""Decrease of −2 ln L per point over PROGRESS_STEPS steps below which a poor fit in a search is stopped. Derived: for n
-points with noise s, −2 ln L is n ln s², so the residual then changes by less than a thousandth; the ranking among poor
-fits does not matter. At half and at twice, it stops a step or two later or earlier."""
 
+# Fractions of a step that a line search tries, and how many times the damping is then increased (chosen)
 STEP_FRACTIONS, MOST_DAMPING_INCREASES = (1.0, 0.4, 0.15), 11
-"""Fractions of a step that a line search tries, and how many times the damping is then increased. Chosen: a line search
-in factors of about 0.4, then damping in factors of ten."""
 
 
 @dataclass(frozen=True)
 class FixedTerms:
-    """Variance components that are fixed instead of estimated.
-
-    `spread` are the between-trial standard deviations of pressure (relative) and of ln B; `noise` is the correlation
-    and the innovation variance of each trial, m². `correlation` alone fixes the correlation but leaves the variance
-    free: the misfit then counts as noise, but not as slow noise, which could absorb any misfit.
+    """Variance components that are fixed instead of estimated. `spread` are the between-trial standard deviations of
+    pressure (relative) and of ln B; `noise` is the correlation and the innovation variance of each trial, m².
     """
 
     spread: tuple[float, float] | None = None
@@ -84,10 +66,8 @@ class FixedTerms:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iterations ended.
-
-    `columns` are the sensitivities and residuals of each trial at `state` (`Predictor.linearise`), `cross_products`
-    their sums of products (`whitening.products`).
+    """Where the iterations ended. `columns` are the sensitivities and residuals of each trial at `state`
+    (`Predictor.linearise`), `cross_products` their sums of products (`whitening.products`).
     """
 
     state: FitState
@@ -101,10 +81,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts.
-
-    Smooth errors of position (`vinetrack.inference.position_errors`) are fitted after the last step and change the
-    reported values slightly.
+    """Progress of a fit: parameter values, SI, by name, and the decrease of −2 ln L that the next step predicts. Smooth
+    errors of position (`vinetrack.inference.position_errors`) are fitted after the last step and change the reported
+    values slightly.
     """
 
     iteration: int
@@ -112,11 +91,10 @@ class Step:
     predicted_decrease: float
 
 
-Watch = Callable[[Step], None]
-"""Called with every step; an exception that it raises ends the fit."""
+Watch = Callable[[Step], None]  # Called with every step; an exception that it raises ends the fit
 
+# By how much −2 ln L still exceeds the target, given cross products, problem, state and penalised sum of squares
 Shortfall = Callable[[Floats, MixedProblem, FitState, float], float]
-"""By how much −2 ln L still exceeds the target, given cross products, problem, state and penalised sum of squares."""
 
 
 def solve(
@@ -133,42 +111,9 @@ def solve(
     search: bool = False,
     shortfall: Shortfall | None = None,
 ) -> Solution:
-    """Iterate the mixed-effects fit to convergence.
-
-    Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton steps for the parameters alternate with estimates
-    of noise and between-trial standard deviations; Levenberg–Marquardt damping where a full step fails.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    problem : the constant part of the fit.
-    state : starting values.
-    fixed_terms : FixedTerms, optional
-        Variance components that are not estimated.
-    warm : bool
-        Whether the start is close to the optimum already: no damping, and variances are estimated from the first step.
-    most_iterations : int
-        Maximum number of steps.
-    watch : callable, optional
-        Called with every step.
-    columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
-        Sensitivities and residuals at the starting values (`Predictor.linearise`), if already computed.
-    least_decrease : float
-        Predicted decrease of −2 ln L per step below which the parameters have converged.
-    search : bool
-        Whether the fit is one of many candidates: it is stopped where it is poor and stagnates.
-    shortfall : callable, optional
-        Stops the fit, unconverged, once the target is out of reach even if this step brings all that it predicts and
-        every remaining one as much as the recent ones.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    SimulationError
-        If the trajectories at the starting values cannot be simulated.
+    """Iterate the mixed-effects fit to convergence. Method: Lindstrom & Bates, Biometrics 46, 673 (1990): Gauss–Newton
+    steps for the parameters alternate with estimates of noise and between-trial standard deviations;
+    Levenberg–Marquardt damping where a full step fails. Shapes: columns (n_points, 4 + n_keys + 1).
     """
     fixed_terms = fixed_terms or FixedTerms()
     estimable_sd = (False, False) if fixed_terms.spread is not None else estimable(problem)
@@ -255,9 +200,8 @@ def solve(
 def _next_step(
     cross_products: Floats, problem: MixedProblem, state: FitState, damping: float, least_decrease: float
 ) -> tuple[tuple[Floats, Floats, float], float]:
-    """The damped step, or the full one where the damped one looks converged; and the damping of the step returned.
-
-    A damped step is short wherever the minimum lies, so only the full step tells whether a fit has converged.
+    """The damped step, or the full one where the damped one looks converged; and the damping of the step returned. A
+    damped step is short wherever the minimum lies, so only the full step tells whether a fit has converged.
     """
     damped = levenberg_marquardt_step(cross_products, problem, state, damping)
     if damping == 0 or damped[2] >= least_decrease:
@@ -283,10 +227,9 @@ def _deviance_of(problem: MixedProblem, state: FitState, penalised_squares: floa
 
 
 def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted_decrease: float) -> float:
-    """Largest decrease of −2 ln L by this step: the predicted decrease, followed by a new estimate of the noise.
-
-    With n points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares
-    except the noise itself.
+    """Largest decrease of −2 ln L by this step: the predicted decrease, followed by a new estimate of the noise. With n
+    points and noise s, −2 ln L is n ln s²; near the optimum a step predicts nearly the whole sum of squares except the
+    noise itself.
     """
     remaining = 1 - predicted_decrease / max(penalised_squares, 1e-300)
     return -float(np.sum(problem.points)) * math.log(remaining) if remaining > 0 else math.inf
@@ -294,7 +237,6 @@ def _largest_decrease(problem: MixedProblem, penalised_squares: float, predicted
 
 def _decrease_per_step(deviances: Sequence[float]) -> float:
     """Mean decrease of the lowest −2 ln L over the last PROGRESS_STEPS steps; infinite if there are too few steps.
-
     Single values may go up and down, as noise and parameters are estimated in turn.
     """
     before = deviances[:-PROGRESS_STEPS]
@@ -342,17 +284,8 @@ def _update_variances(
 
 
 def variance_change(before: FitState, after: FitState) -> float:
-    """Largest relative change of noise and between-trial standard deviations.
-
-    Between-trial standard deviations well below 0.001 count as zero.
-
-    Parameters
-    ----------
-    before, after : states.
-
-    Returns
-    -------
-    float
+    """Largest relative change of noise and between-trial standard deviations. Between-trial standard deviations well
+    below 0.001 count as zero.
     """
     spreads = [abs(np.log((b + 1e-3) / (a + 1e-3))) for a, b in zip(before.spread, after.spread, strict=True)]
     noise = np.max(np.abs(np.log(after.variance / before.variance)))
@@ -369,11 +302,9 @@ def _accepted_step(
     damping: float,
     penalised_squares: float,
 ) -> tuple[FitState | None, float]:
-    """The first state that lowers the penalised sum of squares, and the damping for the next step.
-
-    A line search comes first, then ever more damping: in a curved valley a step that is too long has the right
-    direction, and damping would turn it across the valley. `penalised_squares` is that of the current state. The state
-    is None if no step lowers it.
+    """The first state that lowers the penalised sum of squares, and the damping for the next step. A line search comes
+    first, then ever more damping: in a curved valley a step that is too long has the right direction, and damping would
+    turn it across the valley. `penalised_squares` is that of the current state.
     """
     for fraction in STEP_FRACTIONS:
         candidate = _candidate_state(
@@ -406,11 +337,9 @@ def _candidate_state(
     *,
     reject_by_prediction: bool = False,
 ) -> FitState | None:
-    """The state after a step and new trial effects, if it lowers the penalised sum of squares; else None.
-
-    With `reject_by_prediction`, a step is rejected without simulating the new trial effects where their linear
-    prediction cannot make up for it. That prediction fails where a release crosses a frame, so the last candidates are
-    always simulated.
+    """The state after a step and new trial effects, if it lowers the penalised sum of squares; else None. With
+    `reject_by_prediction`, a step is rejected without simulating the new trial effects where their linear prediction
+    cannot make up for it.
     """
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     try:
@@ -428,17 +357,6 @@ def cost(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
 ) -> float:
     """Penalised sum of squares: whitened residuals of all trials plus the priors of parameters and trial effects.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    residuals : sequence of arrays, shape (n_points,), m, optional
-        Residuals of each trial at this state, if already computed.
-
-    Returns
-    -------
-    float
+    Shapes: residuals (n_points,).
     """
     return float(np.sum(trial_costs(predictor, problem, state, residuals))) + shared_penalty(problem, state)

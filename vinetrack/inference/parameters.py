@@ -23,29 +23,13 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 YIELD_PRESSURE = "yield_pressure.P_y"
 DAMPING = "eversion_damping.B"
 EXPONENT = "eversion_damping.n"
-LEAST_DAMPING = 1e-6
-"""Least B, N·(s/m)ⁿ. Chosen: a millionth of the smallest published value."""
+LEAST_DAMPING = 1e-6  # Least B, N·(s/m)ⁿ (chosen)
 
 
 @dataclass(frozen=True)
 class BetweenTerm:
     """A systematic difference between trials as part of the model: deviation_j = Σ_g a_g z_j over the groups of trials.
-
     It is added to the set pressure (relative) or ln B of trial j, before the random deviation.
-
-    Parameters
-    ----------
-    key
-        Name of the hypothesis and of the coefficient: `order_drift.B`.
-    pressure
-        Whether the pressure deviates (relative), else ln B.
-    groups
-        For each trial the group whose coefficient applies, blank if none does.
-    regressor
-        z_j, shape (n_trials,), relative deviation per unit of the coefficient.
-    prior_sd
-        Standard deviation of the coefficients, in their unit, if they are a random effect of the group; infinite if
-        they are fixed effects. Random ones are integrated out of the likelihood (`marginal_likelihood.deviance`).
     """
 
     key: str
@@ -61,7 +45,6 @@ class BetweenTerm:
 @dataclass(frozen=True)
 class FreeParameter:
     """One free parameter of a fit, SI. `vine` is the vine or day to which it belongs; blank if it applies to all.
-
     `prior_sd` is infinite without a prior; the mean of a prior is `start`.
     """
 
@@ -83,55 +66,25 @@ class FreeParameter:
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
     def to_scaled(self, value: float) -> float:
-        """The scaled value.
-
-        Parameters
-        ----------
-        value : float, SI
-
-        Returns
-        -------
-        float
-        """
+        """The scaled value."""
         if self.logarithmic:
             return math.log(max(value, LEAST_DAMPING))
         return value / self.scale
 
     def from_scaled(self, theta: float) -> float:
-        """The value, SI, of a scaled value.
-
-        Parameters
-        ----------
-        theta : float
-            Scaled.
-
-        Returns
-        -------
-        float
-        """
+        """The value, SI, of a scaled value."""
         return math.exp(theta) if self.logarithmic else theta * self.scale
 
     def derivative(self, value: float) -> float:
-        """Derivative of the value with respect to the scaled value.
-
-        Parameters
-        ----------
-        value : float, SI
-
-        Returns
-        -------
-        float
-        """
+        """Derivative of the value with respect to the scaled value."""
         return self.from_scaled(self.to_scaled(value)) if self.logarithmic else self.scale
 
 
 @dataclass(frozen=True)
 class ParameterMap:
-    """The free parameters in order, and which of them apply to each trial.
-
-    `index`, shape (n_trials, n_keys), gives the place among `free` of each key for each trial, -1 where it does not
-    apply. Every trial has as many columns as there are keys, however many vines there are. `base`, shape (n_trials,
-    n_parameters), are the parameters of the model before the free ones are set.
+    """The free parameters in order, and which of them apply to each trial. `index`, shape (n_trials, n_keys), gives the
+    place among `free` of each key for each trial, -1 where it does not apply. Every trial has as many columns as there
+    are keys, however many vines there are.
     """
 
     model: Model
@@ -160,32 +113,12 @@ class ParameterMap:
         return np.array([(number.scale / number.prior_sd) ** 2 for number in self.free])
 
     def values(self, theta: Floats) -> Floats:
-        """Values, SI, of scaled parameters.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Scaled.
-
-        Returns
-        -------
-        array, shape (n_free,)
-        """
+        """Values, SI, of scaled parameters. Shapes: theta (n_free,) → (n_free,)."""
         return np.array([number.from_scaled(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
-        """Model parameters and yield pressures of every trial for scaled parameters.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Scaled.
-
-        Returns
-        -------
-        rows : array, shape (n_trials, n_parameters), SI
-        yields : array, shape (n_trials,), Pa
-            NaN where the value in the sheet applies.
+        """Model parameters and yield pressures of every trial for scaled parameters. Returns rows, yields (naN where
+        the value in the sheet applies). Shapes: theta (n_free,) → (n_trials, n_parameters).
         """
         rows = self.base.copy()
         values = self.values(theta)
@@ -199,17 +132,7 @@ class ParameterMap:
         return rows, yields
 
     def term(self, key: str) -> BetweenTerm | None:
-        """The difference between trials of which this key is the coefficient; None for a parameter of the model.
-
-        Parameters
-        ----------
-        key : str
-            A key of the map.
-
-        Returns
-        -------
-        BetweenTerm or None
-        """
+        """The difference between trials of which this key is the coefficient; None for a parameter of the model."""
         return next((term for term in self.between if term.key == key), None)
 
     @property
@@ -219,16 +142,8 @@ class ParameterMap:
         return np.array([number.key in keys for number in self.free], dtype=bool)
 
     def shifts(self, theta: Floats) -> Floats:
-        """Deviations of pressure (relative) and ln B by the systematic differences between trials.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Scaled.
-
-        Returns
-        -------
-        array, shape (n_trials, 2)
+        """Deviations of pressure (relative) and ln B by the systematic differences between trials. Shapes: theta
+        (n_free,) → (n_trials, 2).
         """
         shifts = np.zeros((self.index.shape[0], 2))
         values = np.append(self.values(theta), 0.0) if self.between else np.zeros(1)
@@ -248,32 +163,8 @@ def make_layout(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] = (),
 ) -> ParameterMap:
-    """Choose the free parameters of a fit and map them to the trials.
-
-    By default every parameter of every effect is free, except those that are `held` (g), and so is the yield pressure
-    of each vine within the error in the sheet. A model of gravity alone then has no free parameter: a free g would
-    absorb the drag of a falling body.
-
-    Parameters
-    ----------
-    model : sum of effects with its values.
-    data : sequence of FitTrial
-    fixed, free : iterable of str
-        Parameters to keep at the value of the model, or to estimate although held. The short name of a parameter is
-        accepted if it is unique.
-    shared : mapping, optional
-        `"all"`, `"vine"` or `"day"` by name, in place of the effect's default.
-    between : sequence of BetweenTerm
-        Systematic differences between trials to estimate.
-
-    Returns
-    -------
-    ParameterMap
-
-    Raises
-    ------
-    FitError
-        If a name is not that of any parameter.
+    """Choose the free parameters of a fit and map them to the trials. By default every parameter of every effect is
+    free, except those that are `held` (g), and so is the yield pressure of each vine within the error in the sheet.
     """
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
     names = [*parameters, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
@@ -313,19 +204,8 @@ def make_layout(
 
 
 def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
-    """For each trial the name of the group with which it shares a parameter; blank if all trials share it.
-
-    With `day`, all trials share it unless the sheet states several days, and one for every trial.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-    shared : str
-        `all`, `vine` or `day`.
-
-    Returns
-    -------
-    list of str
+    """For each trial the name of the group with which it shares a parameter; blank if all trials share it. With `day`,
+    all trials share it unless the sheet states several days, and one for every trial.
     """
     groups = [trial.group(shared) for trial in trials]
     if shared == "day" and (not all(groups) or len(set(groups)) == 1):
@@ -334,19 +214,7 @@ def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
 
 
 def group_names(trials: Sequence[Trial], shared: str) -> list[str]:
-    """Names of the groups of trials that share a parameter.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-    shared : str
-        `all`, `vine` or `day`.
-
-    Returns
-    -------
-    list of str
-        Vines in the order of the trials; days sorted, 2 before 10.
-    """
+    """Names of the groups of trials that share a parameter."""
     names = list(dict.fromkeys(groups_of(trials, shared)))
     return sorted(names, key=lambda name: (len(name), name)) if shared == "day" else names
 
@@ -366,13 +234,7 @@ def _between_coefficient(term: BetweenTerm, group: str) -> FreeParameter:
 
 
 def _find_name(name: str, names: Sequence[str]) -> str:
-    """The full name among `names` for a full or short name.
-
-    Raises
-    ------
-    FitError
-        If there is none, or several; the message suggests names.
-    """
+    """The full name among `names` for a full or short name."""
     if name in names:
         return name
     short = [full for full in names if full.split(".")[1] == name]

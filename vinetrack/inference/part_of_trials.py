@@ -16,18 +16,7 @@ Indices = NDArray[np.int_]
 
 
 def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
-    """Indices of the free parameters that apply to some of these trials, in order.
-
-    Parameters
-    ----------
-    layout : free parameters of all trials.
-    rows : array of int
-        Indices of the trials.
-
-    Returns
-    -------
-    array of int
-    """
+    """Indices of the free parameters that apply to some of these trials, in order."""
     applicable = np.unique(layout.index[rows])
     return np.asarray(applicable[applicable >= 0])
 
@@ -52,18 +41,7 @@ def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> Para
 
 
 def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
-    """A predictor of these trials, with the finite-difference steps of the other.
-
-    Parameters
-    ----------
-    predictor : of all trials.
-    rows, places : arrays of int
-        Indices of the trials and of their free parameters.
-
-    Returns
-    -------
-    Predictor
-    """
+    """A predictor of these trials, with the finite-difference steps of the other."""
     layout = _subset_layout(predictor.layout, rows, places)
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
     smaller.pressure_step = predictor.pressure_step[rows].copy()
@@ -72,37 +50,14 @@ def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Pr
 
 
 def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
-    """The state of these trials and parameters.
-
-    Parameters
-    ----------
-    state : of all trials.
-    rows, places : arrays of int
-        Indices of the trials and of their free parameters.
-
-    Returns
-    -------
-    FitState
-    """
+    """The state of these trials and parameters."""
     return replace(
         state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
     )
 
 
 def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
-    """The problem of these trials and parameters.
-
-    Parameters
-    ----------
-    problem : of all trials.
-    layout : free parameters of these trials.
-    rows, places : arrays of int
-        Indices of the trials and of their free parameters.
-
-    Returns
-    -------
-    MixedProblem
-    """
+    """The problem of these trials and parameters."""
 
     def numbers(values: Floats) -> Floats:
         return values[places]

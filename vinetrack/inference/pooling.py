@@ -5,21 +5,8 @@ parameter that they share (the drag of two bodies, the yield pressure of a tube 
 smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights further.
 So:
 
-1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too.
-2. The parameters θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M). Assumed: the between-trial covariance is
-   proportional to M, the covariance of all parameters from the noise of one typical trial (that of all trials together
-   times the number of trials that depend on a parameter). So there is one unknown, τ², instead of k(k + 1)/2, which a
-   handful of trials could not determine: parameters scatter in the directions in which a trial is imprecise, and by the
-   same multiple of their errors. Where trials differ in one precisely known parameter alone, M is wrong, and τ² too
-   large for the others. With A_i the information and g_i the score of a trial at the current parameters, its estimate
-   has the covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood of several parameters at once (multivariate
-   random-effects meta-analysis by REML: van Houwelingen, Arends & Stijnen, Statistics in Medicine 21, 589, 2002, and
-   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one parameter: Viechtbauer, J.
-   Educ. Behav. Stat. 30, 261, 2005, who compares REML with the moments of DerSimonian & Laird, Controlled Clinical
-   Trials 7, 177, 1986).
-3. A step in θ with these weights, new trajectories, and so on to convergence.
-
-With τ² = 0 the weights are those of the noise; with a large τ² all trials have nearly equal weights.
+1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too. 2. The parameters θ_i
+of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
 """
 
 from __future__ import annotations
@@ -46,31 +33,21 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes, with_shapes
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 
+# Maximum number of steps, and the length of a step in standard errors at which they have converged (chosen)
 MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05
-"""Maximum number of steps, and the length of a step in standard errors at which they have converged. Chosen: a
-twentieth of an error; the two drops of the tests take four steps."""
 
-LARGEST_TAU2 = 1e6
-"""Largest τ², in variances of one trial by its noise. Chosen: trials that lie a thousand standard errors apart have
-practically equal weights."""
+LARGEST_TAU2 = 1e6  # Largest τ², in variances of one trial by its noise (chosen)
 
-LONGEST_STEP = 3.0
-"""Longest step of a parameter, in units of √(its variance + the variance between trials). Chosen: the linear model is
-inaccurate beyond it; half takes a few more steps."""
+LONGEST_STEP = 3.0  # Longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
 
+# Least information of a trial on a direction that counts, relative to its largest (derived)
 LEAST_RELATIVE_INFORMATION = 1e-12
-"""Least information of a trial on a direction that counts, relative to its largest. Derived: ten thousand roundings of
-a double."""
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """Shared parameters with trials weighted by noise and disagreement, scaled.
-
-    `solution` is the state at these parameters, with the smooth errors of position as further ones. `information`,
-    shape (n_trials, n_free, n_free), and `scores`, shape (n_trials, n_free), are those of the trials with τ² included;
-    `covariance`, shape (n_free, n_free), is that of the shared parameters; `between`, of the same shape, is τ² M, the
-    covariance of a trial's parameters about the shared ones.
+    """Shared parameters with trials weighted by noise and disagreement, scaled. `solution` is the state at these
+    parameters, with the smooth errors of position as further ones.
     """
 
     solution: Solution
@@ -80,27 +57,13 @@ class Pooled:
     between: Floats
 
 
+# Deviation of a trial's ln B, or relative one of its pressure, at which a step has left the region in which the model
+# is nearly linear (chosen)
 FARTHEST_DEVIATION = 3.0
-"""Deviation of a trial's ln B, or relative one of its pressure, at which a step has left the region in which the model
-is nearly linear. Chosen: twenty times B; at half as at twice the steps that end there are the same, those that
-diverge."""
 
 
 def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
-    """Estimate the shared parameters with trials weighted by noise and disagreement.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the fit ended.
-    shared : int
-        Number of its free parameters that may differ between trials: the first ones.
-
-    Returns
-    -------
-    Pooled or None
-        None for a single trial, or if it diverges or a simulation fails.
-    """
+    """Estimate the shared parameters with trials weighted by noise and disagreement."""
     if len(predictor.data) < 2:
         return None
     shapes = _shapes(predictor, solution)
@@ -211,16 +174,8 @@ def _with_weights(solution: Solution, shared: int) -> Pooled:
 
 
 def trial_information(solution: Solution) -> tuple[Floats, Floats]:
-    """Information and scores of each trial on the free parameters, its trial effects integrated out.
-
-    Parameters
-    ----------
-    solution : gives the state
-
-    Returns
-    -------
-    information : array, shape (n_trials, n_free, n_free)
-    scores : array, shape (n_trials, n_free), the gradients of ln L
+    """Information and scores of each trial on the free parameters, its trial effects integrated out. Returns
+    information, scores. Shape (n_trials, n_free, n_free).
     """
     problem = solution.problem
     size, p = problem.prior_mean.size, problem.index.shape[1]

@@ -10,44 +10,21 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import Trajectory
 
+# Time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay that the perturbation
+# causes (derived)
 LONGEST_EXTRAPOLATION = 3.0
-"""Time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay that the perturbation
-causes. Derived: 1 for a motion that keeps its speed to the end; 3 allows for one that slows down to a third."""
 
 
 def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
     """Set the change of position after the end of growth: that of the end position, or 0 where only the time changes.
-
-    Parameters
-    ----------
-    change : array, shape (n_points,), m
-        Modified in place.
-    over : array of bool, shape (n_points,)
-        Points after the end of the unperturbed trajectory.
-    moved_ends : bool
-        Whether the perturbed trajectory reaches the end of growth too.
+    Shapes: change, over (n_points,).
     """
     change[over] = change[-1] if moved_ends else 0.0
 
 
 def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
-    """Change of the observed positions of a trial under a small perturbation, m, shape (n_points,).
-
-    Growth ends at the same position whenever it ends. Between the two end times a plain difference therefore has a jump
-    as large as the whole response, which depends on the sign and size of the perturbation: two effects with exactly the
-    same action would seem to differ in that one frame. So the perturbed trajectory is extrapolated at its last speed
-    until the unperturbed one ends; after that, only a change of the end position counts.
-
-    Parameters
-    ----------
-    plain : Trajectory
-        The unperturbed trajectory.
-    moved : Trajectory
-        The perturbed trajectory of the same trial at the same times.
-
-    Returns
-    -------
-    array, shape (n_points,), m
+    """Change of the observed positions of a trial under a small perturbation, m, shape (n_points,). Growth ends at the
+    same position whenever it ends. Shape (n_points,).
     """
     change = np.asarray(moved.observed_position_m - plain.observed_position_m)
     if plain.status == "ended":

@@ -38,27 +38,19 @@ from vinetrack.inference.whitening import whiten
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
-ORDERS = (1, 2, 3, 4)
-"""Legendre orders of the shapes. Order 0 is the origin, which is free in every trial; a lens to lowest order is orders
-1 to 3 (`effects/lens.py`); chosen: 4 allows for deviations from a cubic. With 2 fewer, a lens off the middle of the
-growth is not covered; with 2 more, errors grow further for shapes that no lens makes."""
+ORDERS = (1, 2, 3, 4)  # Legendre orders of the shapes
 
-NO_GROWTH_M = 1e-9
-"""Growth that counts as none. Derived: no camera resolves a nanometre."""
+NO_GROWTH_M = 1e-9  # Growth that counts as none (derived)
 
+# Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
+# comparison, where differences count from 1; and the maximum number of steps (measured)
 CONVERGED_DECREASE_SMOOTH, MOST_STEPS = 1e-2, 15
-"""Decrease of −2 ln L of a step at which the linear iteration has converged, a hundredth of what matters in a
-comparison, where differences count from 1; and the maximum number of steps. Measured on campaigns of 20 trials: 2 to 4
-steps."""
 
 
 @dataclass(frozen=True)
 class SmoothErrors:
-    """A fit with smooth errors of position included.
-
-    `solution` holds the free parameters of the fit and after them the sizes of the errors in prior standard deviations.
-    `gain` is the increase of ln L, priors included; `whitened`, shape (n_points,) each, are the whitened residuals in
-    standard deviations; `displacement_m`, shape (n_points,) each, is the smooth error itself.
+    """A fit with smooth errors of position included. `solution` holds the free parameters of the fit and after them the
+    sizes of the errors in prior standard deviations.
     """
 
     solution: Solution
@@ -68,20 +60,8 @@ class SmoothErrors:
 
 
 def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
-    """Displacement by one standard deviation of each shape, m, for every trial.
-
-    The polynomials span the growth of all trials, since one camera records them.
-
-    Parameters
-    ----------
-    predictor : of the trials.
-    grown_m : sequence of arrays, shape (n_points,), m
-        Growth at each point of each trial.
-
-    Returns
-    -------
-    list of arrays, shape (n_points, n_shapes), m
-        Zeros for a trial without such an error; no columns if no trial has one.
+    """Displacement by one standard deviation of each shape, m, for every trial. The polynomials span the growth of all
+    trials, since one camera records them. Shapes: grown_m (n_points,) → (n_points, n_shapes).
     """
     sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
     if not (sigma_m > 0).any():
@@ -98,22 +78,8 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
 
 
 def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
-    """Fit the smooth errors of position along with the parameters of a fit, to first order; None where there are none.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    held : FixedTerms, optional
-        Variance components that the fit did not estimate.
-
-    Returns
-    -------
-    SmoothErrors or None
-
-    Notes
-    -----
-    Trajectories are not simulated again: positions change by tenths of a millimetre, over which they are linear.
+    """Fit the smooth errors of position along with the parameters of a fit, to first order; None where
+    there are none.
     """
     grown = [
         trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
@@ -160,10 +126,9 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
 
 
 def _sensitive(solution: Solution) -> NDArray[np.bool_]:
-    """Free parameters that influence some trajectory.
-
-    The column of a parameter without influence is rounding error. With fixed columns, a step along it would be millions
-    of scales long and predict a likelihood that no trajectory confirms.
+    """Free parameters that influence some trajectory. The column of a parameter without influence is rounding error.
+    With fixed columns, a step along it would be millions of scales long and predict a likelihood that no trajectory
+    confirms.
     """
     part = marginal(solution.cross_products, solution.problem, solution.state)
     information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
@@ -179,7 +144,6 @@ def _newton_on_fixed_columns(
     held: FixedTerms,
 ) -> tuple[FitState, Floats, Floats, float]:
     """Newton steps at fixed sensitivities: state, cross products there, total change of each trial's unknowns, ln L.
-
     Steps are taken as long as they raise ln L. Two parameters that only rounding separates may get a step of any length
     along the direction in which they cancel; no trajectory is simulated here that would reject it.
     """
@@ -214,18 +178,7 @@ def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> lis
 
 
 def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
-    """The problem with the sizes of the shapes as further free parameters, each with a standard normal prior.
-
-    Parameters
-    ----------
-    problem : of the fit.
-    count : int
-        Number of shapes.
-
-    Returns
-    -------
-    MixedProblem
-    """
+    """The problem with the sizes of the shapes as further free parameters, each with a standard normal prior."""
     places = problem.prior_mean.size + np.arange(count)
     # A column that belongs to no free parameter has index −1, the appended zero.
     index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
@@ -249,9 +202,8 @@ def _variances(
     solution: Solution,
     held: FixedTerms,
 ) -> FitState:
-    """Estimate noise and between-trial standard deviations, unless they are fixed.
-
-    The noise correlation may not exceed that of the fit: noise of correlation near 1 would make anything likely.
+    """Estimate noise and between-trial standard deviations, unless they are fixed. The noise correlation may not exceed
+    that of the fit: noise of correlation near 1 would make anything likely.
     """
     estimable = solution.estimable
     if held.noise is None:
@@ -267,9 +219,8 @@ def _variances(
 
 
 def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
-    """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1).
-
-    The residual becomes r − C·change, the other columns stay.
+    """Cross products after a change of the unknowns of each trial, shape (n_trials, n_columns − 1). The residual
+    becomes r − C·change, the other columns stay.
     """
     transformation = np.broadcast_to(
         np.eye(cross_products.shape[-1]), (len(cross_products), *cross_products.shape[-2:])
@@ -279,15 +230,6 @@ def _products_after_step(cross_products: Floats, change: Floats) -> Floats:
 
 
 def with_smooth_errors(fit: Fit) -> Solution:
-    """The solution of a fit, with the smooth errors of position among its parameters where there are any.
-
-    Parameters
-    ----------
-    fit : Fit
-
-    Returns
-    -------
-    Solution
-    """
+    """The solution of a fit, with the smooth errors of position among its parameters where there are any."""
     smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
     return smooth.solution if smooth else fit.solution

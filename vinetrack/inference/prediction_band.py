@@ -9,14 +9,10 @@ its deviations of pressure and B, s errors that replicates do not show (smooth e
 pressure) and ε noise of covariance K, which includes the misfit of the model along each trial, since the noise of a fit
 is that of its residuals. The variance at a time is the diagonal of
 
-    M (X (C + T) Xᵀ + Z D Zᵀ + S Sᵀ) Mᵀ + K − A (AᵀK⁻¹A)⁻¹ Aᵀ + δ² ℓ²
-
 with ℓ the travel of the trial. δ is the discrepancy of the model between trials (Kennedy & O'Hagan, J. R. Stat. Soc. B
 63, 425, 2001), one standard deviation along the whole motion. It is chosen so that the trials of the fit, each left out
 in turn to first order, have the residuals that their bands predict (Paule & Mandel, J. Res. NBS 87, 377, 1982); 0 where
-they have less. With it a misfit that differs between trials widens the band of the next. The half width is so many of
-these standard deviations that nine positions in ten lie within, for 95 % of trials with these deviations and for 95 %
-of the left-out trials (jackknife prediction intervals: Barber et al., Ann. Stat. 49, 486, 2021); at least Student's t.
+they have less.
 """
 
 from __future__ import annotations
@@ -42,19 +38,15 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, 
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
 
+# Part of the information on a parameter that must come from other trials to predict a trial from them (chosen)
 LEAST_INFORMATION_OF_OTHERS = 1e-6
-"""Part of the information on a parameter that must come from other trials to predict a trial from them. Chosen: far
-below the share of one of a hundred trials, far above rounding."""
 
+# A trial counts as covered where this part of its positions is, and a band has to cover this part of trials (chosen)
 COVERED_POSITIONS, COVERAGE = 0.9, 0.95
-"""A trial counts as covered where this part of its positions is, and a band has to cover this part of trials. Chosen:
-bands are not judged by the few positions at which release and origin leave them no width."""
 
-DRAWS = 1000
-"""Curves drawn for a simultaneous band. Chosen: its 95 % quantile is then known to 3 %."""
+DRAWS = 1000  # Curves drawn for a simultaneous band (chosen)
 
-NORMAL_95 = 1.96
-"""Derived: standard normal quantile of 0.975."""
+NORMAL_95 = 1.96  # Derived: standard normal quantile of 0.975
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
@@ -62,10 +54,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of the bands by the trials of a fit, each predicted from the others.
-
-    `discrepancy` is δ, relative to the travel; `reach` the half width of the band in standard deviations; `degrees` are
-    Student's; `trials` is the number of trials that could be predicted.
+    """Calibration of the bands by the trials of a fit, each predicted from the others. `discrepancy` is δ, relative to
+    the travel; `reach` the half width of the band in standard deviations; `degrees` are Student's; `trials` is the
+    number of trials that could be predicted.
     """
 
     discrepancy: float
@@ -77,7 +68,6 @@ class Calibration:
 @dataclass(frozen=True)
 class _Basis:
     """The fit as predictions use it: scaled parameters, including smooth errors of position where there are any.
-
     `information` and `scores` are those of the trials, `between` is the between-trial covariance of the parameters.
     """
 
@@ -88,19 +78,7 @@ class _Basis:
 
 
 def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
-    """Predicted trials with the half width of their 95 % bands.
-
-    Parameters
-    ----------
-    fit : the fit, in which the trials were not
-    data : the data of the trials
-    predicted : in the same order
-
-    Returns
-    -------
-    list of TrialFit
-        With `band_m`, array, shape (n_points,); None where the perturbed trajectories cannot be simulated.
-    """
+    """Predicted trials with the half width of their 95 % bands. Shape (n_points,)."""
     basis = _pooled_basis(fit)
     calibration_of_fit = _calibrated(fit, basis)
     banded = []
@@ -118,10 +96,8 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
 
 
 def _simultaneous(loadings: Floats, degrees: float) -> float:
-    """Standard deviations within which COVERED_POSITIONS of the positions of COVERAGE of trials lie.
-
-    For a single way to deviate that is Student's t; for several, more, since a trial may deviate by one early and by
-    another late.
+    """Standard deviations within which COVERED_POSITIONS of the positions of COVERAGE of trials lie. For a single way
+    to deviate that is Student's t; for several, more, since a trial may deviate by one early and by another late.
     """
     draw = np.random.default_rng(1)
     scale = np.ones(DRAWS) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, DRAWS))
@@ -131,16 +107,7 @@ def _simultaneous(loadings: Floats, degrees: float) -> float:
 
 
 def calibration(fit: Fit) -> Calibration:
-    """Calibration of the prediction bands by the trials of a fit, each predicted from the others.
-
-    Parameters
-    ----------
-    fit : the fit
-
-    Returns
-    -------
-    Calibration
-    """
+    """Calibration of the prediction bands by the trials of a fit, each predicted from the others."""
     return _calibrated(fit, _pooled_basis(fit))
 
 
@@ -193,9 +160,8 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
 
 
 def _leave_one_out(basis: _Basis, trial_data: FitTrial, i: int, fit_correlation: float) -> tuple[Floats, Floats] | None:
-    """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order.
-
-    None where the other trials do not determine all parameters on which it depends.
+    """Residual of a trial of the fit once left out of it, m, and its variance, m², to first order. None where the other
+    trials do not determine all parameters on which it depends.
     """
     solution = basis.solution
     problem, state = solution.problem, solution.state
@@ -272,22 +238,8 @@ def _loadings_of_new_trial(fit: Fit, basis: _Basis, trial_data: FitTrial, trial:
 
 
 def values_for_trial(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
-    """The parameters of a fit as the layout of one trial holds them.
-
-    Parameters
-    ----------
-    fit : Fit
-    layout : ParameterMap
-        Of that trial alone.
-    trial_data : FitTrial
-        The trial, in the fit or not.
-
-    Returns
-    -------
-    theta : array, shape (n_free,)
-        Scaled; those of its vine and its day where each has its own.
-    places : array of int, shape (n_free,)
-        Indices among the numbers of the fit, -1 for new ones.
+    """The parameters of a fit as the layout of one trial holds them. Returns theta (scaled; those of its vine and its
+    day where each has its own), places (indices among the numbers of the fit, -1 for new ones). Shape (n_free,).
     """
     theta, places = layout.start, np.full(len(layout.free), -1)
     trial = trial_data.trial
@@ -324,10 +276,9 @@ def _with_release_and_origin_fitted(
     state: FitState,
     noise: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """Loadings, noise variance at each point, and residual after release and origin are fitted to the trial.
-
-    `design` holds the columns of release and origin, `fit_correlation` is the noise correlation with which predictions
-    fit them, `noise` the variance of a position, m².
+    """Loadings, noise variance at each point, and residual after release and origin are fitted to the trial. `design`
+    holds the columns of release and origin, `fit_correlation` is the noise correlation with which predictions fit them,
+    `noise` the variance of a position, m².
     """
     white = whiten(design, trial_data.first, fit_correlation, trial_data.relative_sd)
     fixed = np.array([not trial_data.pressurised_in_recording, True])

@@ -18,19 +18,8 @@ from vinetrack.tracks.smoothed_positions import detect_smoothing
 
 
 def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
-    """Data of the trials that can be fitted, and the reason for each that cannot, by name.
-
-    Parameters
-    ----------
-    pairs : iterable of (Trial, Track)
-    weighted : bool
-        Whether points are weighted where the noise of positions varies from point to point.
-
-    Returns
-    -------
-    data : list of FitTrial
-    left_out : dict
-        Reason by name of trial.
+    """Data of the trials that can be fitted, and the reason for each that cannot, by name. Returns data, left_out
+    (reason by name of trial).
     """
     data, left_out = [], {}
     pairs = list(pairs)
@@ -48,9 +37,8 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
 
 
 def _with_weighted_points(data: list[FitTrial]) -> list[FitTrial]:
-    """The trials with weighted points, where the noise of imported positions varies from point to point.
-
-    Points of this package's tracker keep equal weights: it states the error of each and leaves out the worst.
+    """The trials with weighted points, where the noise of imported positions varies from point to point. Points of this
+    package's tracker keep equal weights: it states the error of each and leaves out the worst.
     """
     imported = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
     shape = noise_shape(

@@ -1,4 +1,5 @@
-"""Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
+"""Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take
+cross products.
 
 A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was three
 quarters of the time of a fit that continues from another.
@@ -26,31 +27,11 @@ def products_at_releases(
     curves: Floats,
     rho: float,
 ) -> Floats:
-    """Whitened cross products of the columns and residual of a trial for each candidate release.
-
-    Equivalent to `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and
-    constant beyond the ends of the grid.
-
-    Parameters
-    ----------
-    time_s, position_m : arrays, shape (n_points,)
-        The trial, s and m; positions relative to the origin.
-    first : array of bool, shape (n_points,)
-        Points that begin a stretch.
-    relative_sd : array, shape (n_points,)
-        Noise of each point relative to that of the trial.
-    releases_s : array, shape (n_releases,), s
-    grid_s : array, shape (n_grid,), s
-        Times since release, increasing from 0.
-    curves : array, shape (n_columns, n_grid)
-        Sensitivities at these times; the last row is the position itself.
-    rho : float
-        Lag-one correlation of the noise.
-
-    Returns
-    -------
-    array, shape (n_releases, n_columns, n_columns)
-        The last column is the residual.
+    """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to
+    `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
+    ends of the grid. Returns the last column is the residual. Shapes: time_s, position_m, first, relative_sd
+    (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns,
+    n_columns).
     """
     count, size, last = len(curves), len(time_s), len(grid_s) - 1
     begins = math.sqrt(1 - rho**2)

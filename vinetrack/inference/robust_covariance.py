@@ -23,34 +23,17 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.systematics import Systematics, systematics_of
 from vinetrack.inference.whitening import products
 
-FEWEST_CLUSTERS = 8
-"""Trials from which the sandwich is better than the model of the noise. Chosen: with fewer clusters a sandwich variance
-is known to worse than 50 %."""
+FEWEST_CLUSTERS = 8  # Trials from which the sandwich is better than the model of the noise (chosen)
 
-FEWEST_DEGREES = 4
-"""Trials beyond the number of parameters that a sandwich needs. Chosen: with four the variance is known to a factor of
-about 1.7."""
+FEWEST_DEGREES = 4  # Trials beyond the number of parameters that a sandwich needs (chosen)
 
+# Share of the information on a direction from which one trial is practically the only one to determine it (chosen)
 LARGEST_SHARE = 0.99
-"""Share of the information on a direction from which one trial is practically the only one to determine it. Chosen: at
-0.98 its score is enlarged by 7 instead of 10; beyond, what remains of it is rounding more than scatter."""
 
 
 def cluster_variance(single: Floats, degrees: float) -> Floats:
-    """Variance of sums over trials, estimated from the scatter of single trials; 0 where they are too few.
-
-    The contributions of priors belong to no trial: the mean is subtracted.
-
-    Parameters
-    ----------
-    single : array, shape (n_trials, n)
-        Contribution of each trial.
-    degrees : float
-        Degrees of freedom of the scatter.
-
-    Returns
-    -------
-    array, shape (n,)
+    """Variance of sums over trials, estimated from the scatter of single trials; 0 where they are too few. The
+    contributions of priors belong to no trial: the mean is subtracted. Shapes: single (n_trials, n) → (n,).
     """
     trials = len(single)
     if trials < FEWEST_CLUSTERS:
@@ -59,17 +42,7 @@ def cluster_variance(single: Floats, degrees: float) -> Floats:
 
 
 def too_few_clusters(predictor: Predictor, solution: Solution) -> bool:
-    """Whether there are too few trials for a sandwich covariance.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : at the end of the fit.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether there are too few trials for a sandwich covariance."""
     spare = len(predictor.data) - np.count_nonzero(solution.problem.free)
     return len(predictor.data) < FEWEST_CLUSTERS or bool(spare < FEWEST_DEGREES)
 
@@ -82,23 +55,8 @@ def widened_covariance(
     extended: Solution | None = None,
     pooled: Pooled | None = None,
 ) -> Precision:
-    """Covariance and degrees of freedom at the end of a fit, widened by the scatter of trials and by systematic errors.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    trials : sequence of TrialFit
-        In the order of the fit.
-    model_precision : covariance by the model of noise and between-trial variation.
-    extended : Solution, optional
-        The fit with smooth errors of position among its parameters, to which `model_precision` then belongs.
-    pooled : Pooled, optional
-        The fit with trials weighted by their disagreement; its covariance is then widened.
-
-    Returns
-    -------
-    Precision
+    """Covariance and degrees of freedom at the end of a fit, widened by the scatter of trials and by
+    systematic errors.
     """
     systematics = systematics_of(predictor, solution, trials, positions=extended is None)
     plain, robust, moved = _sandwich(predictor, extended or solution, systematics)
@@ -131,17 +89,8 @@ def widened_covariance(
 
 
 def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
-    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    plain, robust : arrays, shape (n_free, n_free)
-        Of scaled parameters.
+    """Covariance of the free parameters by the noise model, and cluster-robust, from the scatter of trials. Returns
+    plain, robust : arrays, shape (n_free, n_free).
     """
     no_errors = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
     plain, robust, _ = _sandwich(predictor, solution, no_errors)
@@ -149,19 +98,8 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
 
 
 def parameter_shifts(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
-    """Change of each free parameter by one standard deviation of each systematic error, to first order.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    systematics : Systematics
-        Effect of each error on positions.
-
-    Returns
-    -------
-    array, shape (n_free, count)
-        Of scaled parameters.
+    """Change of each free parameter by one standard deviation of each systematic error, to first order. Shape (n_free,
+    count).
     """
     return _sandwich(predictor, solution, systematics)[2]
 
@@ -170,20 +108,10 @@ def _few_trial_variances(
     information: Floats, scores: Floats, solution: Solution, plain: Floats
 ) -> tuple[Floats, Floats]:
     """Variances of the free parameters from the disagreement of few trials, without bias, and their degrees of freedom.
-
     Each trial pulls the fit towards itself, by its share K_i of the information, and so shows less than its error: in
     units of the errors of the model its score has the variance K_i(1 − K_i), and is divided by √(1 − K_i) (CR2: Bell &
-    McCaffrey, Survey Methodology 28, 169, 2002). A direction that only one trial determines has no scatter: there the
-    model's variance is used. Degrees of freedom are Satterthwaite's; two trials have one.
-
-    Parameters
-    ----------
-    information, scores : of the trials, see `trial_information`
-    plain : array, shape (n_free, n_free), covariance by the model
-
-    Returns
-    -------
-    variance, degrees : arrays, shape (n_free,), of scaled parameters
+    McCaffrey, Survey Methodology 28, 169, 2002). Returns variance, degrees : arrays, shape (n_free,), of scaled
+    parameters. Shapes: plain (n_free, n_free).
     """
     variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
     estimated = np.flatnonzero(np.diag(plain) > 0)
@@ -215,17 +143,7 @@ def _few_trial_variances(
 
 
 def matrix_root(square: Floats) -> Floats:
-    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix.
-
-    Parameters
-    ----------
-    square : array, shape (n, n)
-        Symmetric, no eigenvalue below zero except by rounding.
-
-    Returns
-    -------
-    array, shape (n, n)
-    """
+    """A matrix R with R Rᵀ equal to a symmetric positive semidefinite matrix. Shapes: square (n, n) → (n, n)."""
     values, vectors = np.linalg.eigh(square)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -239,9 +157,8 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
 
 
 def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and `parameter_shifts`.
-
-    Parameters at a bound are fixed there.
+    """Model-based and cluster-robust covariance, shape (n_free, n_free) each, and `parameter_shifts`. Parameters at a
+    bound are fixed there.
     """
     problem, state = solution.problem, solution.state
     cross_products = solution.cross_products
@@ -276,18 +193,7 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
-    """The clusters of trials whose errors may be correlated: specimens, else days, else single trials.
-
-    Parameters
-    ----------
-    trials : in the order of the fit.
-
-    Returns
-    -------
-    list
-        A name for each trial. With fewer than `FEWEST_CLUSTERS` specimens or days, their scatter is too uncertain and
-        the next finer groups are used.
-    """
+    """The clusters of trials whose errors may be correlated: specimens, else days, else single trials."""
     for column in ("specimen", "day"):
         names = [f"{trial.vine}, {trial.specimen}" if column == "specimen" else trial.day for trial in trials]
         if all(getattr(trial, column) for trial in trials) and len(set(names)) >= FEWEST_CLUSTERS:
@@ -296,19 +202,9 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
 
 
 def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
-    """Variance of the sum of scores from the scatter of sums over groups, corrected for few groups.
-
-    The correction is G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015).
-
-    Parameters
-    ----------
-    single : scores of single trials, shape (n_trials, n_free), their mean subtracted.
-    groups : name of the group of each trial.
-    fitted : number of fitted parameters, p.
-
-    Returns
-    -------
-    array, shape (n_free, n_free)
+    """Variance of the sum of scores from the scatter of sums over groups, corrected for few groups. The correction is
+    G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015). Shapes: single
+    (n_trials, n_free) → (n_free, n_free).
     """
     names = list(dict.fromkeys(groups))
     sums = np.array([single[[group == name for group in groups]].sum(axis=0) for name in names])

@@ -27,35 +27,22 @@ from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Mo
 from vinetrack.inference.whitening import all_products
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
-N_TRIAL_EFFECTS = 4
-"""Trial effects of each trial: release, s; origin, m; relative deviation of pressure; deviation of ln B. Defined by the
-model."""
+N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relative deviation of pressure (defined)
 
-TARGET_RESPONSE = 2e-3
-"""Finite differences use steps that move a trajectory by this fraction of its travel: 1000 times the integrator's
-error, yet small enough to neglect curvature. Derived: with an integrator error of 1e-6 the optimum between truncation
-and rounding error lies between 1e-3 and 1e-2."""
+TARGET_RESPONSE = 2e-3  # Finite differences use steps that move a trajectory by this fraction of its travel (derived)
 
-SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1
-"""Least and largest relative step of a finite difference. Derived: below 1e-5 the integrator's error dominates, above
-0.1 the curvature."""
+SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1  # Least and largest relative step of a finite difference (derived)
 
-RELEASE_STEP_FRAMES = 0.1
-"""Step of the release. Chosen: over a tenth of a frame every trajectory is straight."""
+RELEASE_STEP_FRAMES = 0.1  # Step of the release (chosen)
 
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
-DAMPING_STEP = 1e-3
-"""Relative step of B. Derived as TARGET_RESPONSE is: the response is of the order of the step."""
+DAMPING_STEP = 1e-3  # Relative step of B (derived)
 
 
 class Predictor:
-    """Simulates the trials of a fit and differentiates their positions.
-
-    `has_pressure_deviation`, shape (n_trials,), tells which trials have a pressure that may deviate: one that was set,
-    or measured by a noisy gauge. `has_damping_deviation` tells which have a B. `host` is a larger model whose compiled
-    form serves this one. `separable` tells whether a predictor of a subset of the trials gives the same results.
-    `release_is_shift` tells where a later release only shifts the trajectory in time, so that its sensitivity is minus
-    the speed; a recorded pressure and a transformed time or position need a finite difference.
+    """Simulates the trials of a fit and differentiates their positions. `has_pressure_deviation`, shape (n_trials,),
+    tells which trials have a pressure that may deviate: one that was set, or measured by a noisy gauge.
+    `has_damping_deviation` tells which have a B.
     """
 
     separable = True
@@ -102,34 +89,11 @@ class Predictor:
         self.steps = np.full(len(layout.keys), 1e-3)
 
     def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate at the times of each job's trial, or at `times_s`.
-
-        Parameters
-        ----------
-        jobs : sequence of Job
-        times_s : sequence of arrays, optional
-            Times on the clock of the recording, s, one array per job.
-
-        Returns
-        -------
-        list of Trajectory
-        """
+        """Simulate at the times of each job's trial, or at `times_s`."""
         return self.run_as(self.layout.model, Jobs.of(jobs), times_s)
 
     def run_as(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate another model for the same trials.
-
-        Parameters
-        ----------
-        model : simulated in place of the fit's.
-        jobs : with the parameters of that model.
-        times_s : sequence of arrays, optional
-            Times, s, one array per job.
-
-        Returns
-        -------
-        list of Trajectory
-        """
+        """Simulate another model for the same trials."""
         return self._simulated(model, jobs, times_s).trajectories()
 
     def _simulated(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> Motions:
@@ -169,34 +133,13 @@ class Predictor:
         ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
-        """Simulation jobs at given parameters and trial effects.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, 4)
-
-        Returns
-        -------
-        list of Job
-            One per trial.
+        """Simulation jobs at given parameters and trial effects. Shapes: theta (n_free,); trial_effects
+        (n_trials, 4).
         """
         return self.job_arrays(theta, trial_effects).as_list()
 
     def job_arrays(self, theta: Floats, trial_effects: Floats) -> Jobs:
-        """As `jobs`, in the form of arrays.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, 4)
-
-        Returns
-        -------
-        Jobs
-        """
+        """As `jobs`, in the form of arrays. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
         trial_effects = self._total_deviations(theta, trial_effects)
         if self.damping_column >= 0:
@@ -214,49 +157,18 @@ class Predictor:
         return whole
 
     def trajectories_at(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
-        """Trajectories at given parameters and trial effects.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, 4)
-
-        Returns
-        -------
-        list of Trajectory
-            One per trial.
-        """
+        """Trajectories at given parameters and trial effects. Shapes: theta (n_free,); trial_effects (n_trials, 4)."""
         return self.run_as(self.layout.model, self.job_arrays(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of every trial.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, 4)
-
-        Returns
-        -------
-        list of arrays, shape (n_points,), m
+        """Measured minus predicted positions of every trial. Shapes: theta (n_free,); trial_effects (n_trials, 4) →
+        (n_points,).
         """
         return self.residuals_of_each(theta, [trial_effects])[0]
 
     def residuals_of_each(self, theta: Floats, effect_sets: Sequence[Floats]) -> list[list[Floats]]:
-        """As `residuals`, for several sets of trial effects, simulated in one call.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        effect_sets : sequence of arrays, shape (n_trials, 4)
-
-        Returns
-        -------
-        list of lists of arrays, shape (n_points,), m
-            One list per set.
+        """As `residuals`, for several sets of trial effects, simulated in one call. Shapes: theta (n_free,);
+        effect_sets (n_trials, 4) → (n_points,).
         """
         count = len(self.data)
         motions = self._simulated(
@@ -273,15 +185,8 @@ class Predictor:
         return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
 
     def by_trial(self, values: Floats) -> list[Floats]:
-        """Split an array over the points of all trials into one per trial.
-
-        Parameters
-        ----------
-        values : array, shape (n_points_of_all, …)
-
-        Returns
-        -------
-        list of arrays, shape (n_points, …)
+        """Split an array over the points of all trials into one per trial. Shapes: values (n_points_of_all, …) →
+        (n_points, …).
         """
         edges = self.starts.tolist()
         return [values[a:b] for a, b in itertools.pairwise(edges)]
@@ -289,25 +194,8 @@ class Predictor:
     def linearise(
         self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
     ) -> list[Floats]:
-        """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, 4)
-        trial_effects_only : bool
-            Leave the columns of the keys zero, except that of B.
-        past_end : bool
-            Differentiate as `position_change` does, across the end of growth, for tests that compare columns with each
-            other; step sizes are then not adapted. The iterations of a fit need the actual change, including the jump
-            at the end of growth, and converge elsewhere without it.
-
-        Returns
-        -------
-        list of arrays, shape (n_points, 4 + n_keys + 1)
-            Derivatives of the predicted position, m per unit of the column (trial effects SI, keys scaled); the last
-            column is the residual, m.
+        """Sensitivities [trial effects, keys of the layout] and residual of every trial, as columns. Shapes: theta
+        (n_free,); trial_effects (n_trials, 4) → (n_points, 4 + n_keys + 1).
         """
         unperturbed, total = self.job_arrays(theta, trial_effects), self._total_deviations(theta, trial_effects)
         perturbations = list(self._perturbations(unperturbed, theta, total, trial_effects_only))
@@ -359,15 +247,8 @@ class Predictor:
                 clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=perturbed_end[0] == ENDED)
 
     def products(self, columns: Sequence[Floats]) -> Floats:
-        """Cross products of the columns of every trial under its noise, see `whitening`.
-
-        Parameters
-        ----------
-        columns : sequence of arrays, shape (n_points, k)
-
-        Returns
-        -------
-        array, shape (n_trials, 3, k, k)
+        """Cross products of the columns of every trial under its noise, see `whitening`. Shapes: columns (n_points, k)
+        → (n_trials, 3, k, k).
         """
         return all_products(
             columns,

@@ -24,57 +24,27 @@ from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
 
-MOST_STARTS = 3
-"""Maximum number of starting values. Chosen for time: a fit that needs more is restarted by the search for a better
-minimum."""
+MOST_STARTS = 3  # Maximum number of starting values (chosen)
 
+# Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks (chosen)
 CONTINUATION_ITERATIONS, TRACK_CORRELATION_ITERATIONS = 25, 40
-"""Maximum number of steps of a fit that is continued, and of one at the noise correlation of the tracks. Chosen for
-time: most converge in half of them; at half some do not converge and say so, at twice hopeless starts cost twice the
-time."""
 
-BAD_START_CHI2 = 1.5
-"""χ² per point, at the noise of the previous fit, above which starting values are bad. Chosen: below it ln L is nearly
-quadratic in the parameters and one descent suffices; it is meant to affect time, not results."""
+BAD_START_CHI2 = 1.5  # χ² per point, at the noise of the previous fit, above which starting values are bad (chosen)
 
-SLOW_NOISE = 0.99
-"""Noise correlation above which a fit has absorbed misfit as noise. Chosen: a correlation time of a hundred frames."""
+SLOW_NOISE = 0.99  # Noise correlation above which a fit has absorbed misfit as noise (chosen)
 
+# Steps at the noise of the tracks, and χ² per degree of freedom after them above which the attempt is given up (chosen)
 TRACK_NOISE_ITERATIONS, GIVE_UP_CHI2 = 8, 30.0
-"""Steps at the noise of the tracks, and χ² per degree of freedom after them above which the attempt is given up. Chosen
-for time; a fit given up here is started from other values."""
 
+# Between-trial standard deviations of pressure and ln B that are fixed while the noise is (chosen)
 TRACK_CORRELATION_SD, TRACK_NOISE_SD = (5e-4, 1e-3), (0.01, 0.03)
-"""Between-trial standard deviations of pressure and ln B that are fixed while the noise is: nearly zero where only the
-correlation is fixed, those of a typical batch of vines (1 % of pressure, 3 % of B) where the noise is. Chosen: they
-only steer the descent and are estimated afterwards, unless the fit ends there."""
 
 
 def solve_from_scratch(
     predictor: Predictor, fixed_terms: FixedTerms, watch: Watch | None, *, thorough: bool
 ) -> Solution:
-    """Solve from the starting values of least misfit and return the best solution.
-
-    Later starting values are tried only until a fit converges; a poor best solution is repeated at the noise
-    correlation of the tracks.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    fixed_terms : variance components that are not estimated.
-    watch : callable or None
-        Called with every step.
-    thorough : bool
-        Whether a poor solution is repeated from all starting values.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    FitError
-        If the model cannot be simulated from any starting values.
+    """Solve from the starting values of least misfit and return the best solution. Later starting values are tried only
+    until a fit converges; a poor best solution is repeated at the noise correlation of the tracks.
     """
     solutions: list[Solution] = []
     reason = ""
@@ -107,11 +77,9 @@ def solve_from_scratch(
 def _with_noise_refitted(
     predictor: Predictor, best: Solution, fixed_terms: FixedTerms, watch: Watch | None
 ) -> Solution:
-    """The solution, or a better one found at the noise of the tracks if its noise is slow.
-
-    As long as parameters are slightly wrong, all trials share a smooth misfit of a fraction of a per cent. Taken for
-    slow noise, it stops the parameters from moving on. The likelihood decides: it is far higher where no misfit is
-    left.
+    """The solution, or a better one found at the noise of the tracks if its noise is slow. As long as parameters are
+    slightly wrong, all trials share a smooth misfit of a fraction of a per cent. Taken for slow noise, it stops the
+    parameters from moving on.
     """
     if best.state.rho < SLOW_NOISE:
         return best
@@ -120,11 +88,9 @@ def _with_noise_refitted(
 
 
 def _best_unabsorbed(predictor: Predictor, free: Solution, at_track_correlation: list[Solution]) -> Solution:
-    """The best solution at track correlation, preferably one that is not poor; without any, the one at free noise.
-
-    A poor solution at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any
-    misfit has a high likelihood. So it never competes by likelihood with those whose noise is as correlated as that of
-    the tracks.
+    """The best solution at track correlation, preferably one that is not poor; without any, the one at free noise. A
+    poor solution at free noise may have absorbed its misfit as slow noise, and with a noise correlation near 1 any
+    misfit has a high likelihood.
     """
     good = [solution for solution in at_track_correlation if not is_poor_fit(predictor, solution)]
     return min(good or at_track_correlation or [free], key=_deviance)
@@ -141,11 +107,8 @@ def _solve_at_track_correlation(
     goal: float = -math.inf,
 ) -> Solution | None:
     """Solve with the noise correlation fixed at that of the tracks, then, with `then_free`, from there with free noise.
-
     Between-trial standard deviations are fixed near zero: a misfit far above the noise would otherwise distort the
-    pressure and B of each trial until n is meaningless. If the fit is poor again with free noise, the first solution is
-    returned. The first solve stops as soon as it can no longer reach `goal`, a ln L. None if the caller fixes the
-    noise, or a simulation fails.
+    pressure and B of each trial until n is meaningless.
     """
     if fixed_terms.noise is not None:
         return None
@@ -206,11 +169,9 @@ def _solve_at_track_noise(
     *,
     search: bool = False,
 ) -> Solution | None:
-    """Solve with the noise fixed at that of the tracks, so that misfit cannot enlarge it, then with all terms free.
-
-    For parameters that are nearly right: otherwise trials whose pressure or B is far from the set value would be
-    treated as noise altogether. None if the fit stays poor. A `search` stops as soon as its steps can no longer reach
-    an acceptable χ².
+    """Solve with the noise fixed at that of the tracks, so that misfit cannot enlarge it, then with all terms free. For
+    parameters that are nearly right: otherwise trials whose pressure or B is far from the set value would be treated as
+    noise altogether. None if the fit stays poor.
     """
     if fixed_terms.noise is not None:
         return None
@@ -260,25 +221,7 @@ def solve_from(
     search: bool = False,
 ) -> Solution:
     """Solve from given parameters and trial effects, with the initial noise and standard deviations of `first_state`.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    theta : array, shape (n_free,)
-        Starting values of the parameters, scaled.
-    trial_effects : array, shape (n_trials, 4)
-        Starting values of the trial effects.
-    fixed_terms : variance components that are not estimated.
-    most_iterations : int
-        Maximum number of steps.
-    watch : callable, optional
-        Called with every step.
-    search : bool
-        Whether the fit is one of many candidates, see `optimiser.solve`.
-
-    Returns
-    -------
-    Solution
+    Shapes: theta (n_free,); trial_effects (n_trials, 4).
     """
     state = first_state(predictor.data, theta, trial_effects)
     problem = make_problem(predictor, trial_effects)
@@ -295,30 +238,8 @@ def solve_onward(
     watch: Watch | None = None,
     search: bool = False,
 ) -> Solution:
-    """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution.
-
-    Parameters
-    ----------
-    predictor : simulates the same trials.
-    before : the previous solution, of the same model or of another.
-    theta : array, shape (n_free,)
-        Starting values of the parameters, scaled.
-    fixed_terms : variance components that are not estimated.
-    most_iterations : int
-        Maximum number of steps.
-    watch : callable, optional
-        Called with every step.
-    search : bool
-        Whether the fit is one of many candidates, see `optimiser.solve`.
-
-    Returns
-    -------
-    Solution
-
-    Raises
-    ------
-    SimulationError
-        If the model cannot be simulated.
+    """Solve from given parameters and the trial effects, noise and standard deviations of a previous solution. Shapes:
+    theta (n_free,).
     """
     problem = replace(
         make_problem(predictor, before.state.trial_effects), release_origin_mean=before.problem.release_origin_mean
@@ -338,24 +259,7 @@ def solve_again(
     thorough: bool,
     goal: float = -math.inf,
 ) -> Solution:
-    """The solution, or, if it is poor, one found from its parameters with the noise of the tracks.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    solution : where the iterations ended.
-    fixed_terms : variance components that are not estimated.
-    watch : callable or None
-        Called with every step.
-    thorough : bool
-        Whether a fit at the noise correlation of the tracks is continued with free noise.
-    goal : float
-        ln L; a fit at track correlation ends as soon as it can no longer reach it.
-
-    Returns
-    -------
-    Solution
-    """
+    """The solution, or, if it is poor, one found from its parameters with the noise of the tracks."""
     if not is_poor_fit(predictor, solution):
         return solution
     theta = solution.state.theta
@@ -380,22 +284,8 @@ def _deviance(solution: Solution) -> float:
 def start_at_fixed_noise(
     predictor: Predictor, problem: MixedProblem, state: FitState, fixed_terms: FixedTerms, *, search: bool = False
 ) -> FitState:
-    """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed.
-
-    With free noise, the misfit of bad starting values would be absorbed as noise and stall the optimiser.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    problem : the constant part of the fit.
-    state : the proposed starting values.
-    fixed_terms : variance components that are not estimated.
-    search : bool
-        Whether the fit is one of many candidates, see `optimiser.solve`.
-
-    Returns
-    -------
-    FitState
+    """Starting values of a warm fit; where they are bad, the result of a descent with the noise fixed. With free noise,
+    the misfit of bad starting values would be absorbed as noise and stall the optimiser.
     """
     if fixed_terms.noise is not None or cost(predictor, problem, state) < BAD_START_CHI2 * float(
         np.sum(problem.points)

@@ -13,28 +13,16 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Predictor
 
-EXPONENTS = (0.15, 0.37, 0.65, 1.0)
-"""Exponents of the grid. Chosen around the published 0.37, from nearly constant friction to linear damping."""
+EXPONENTS = (0.15, 0.37, 0.65, 1.0)  # Exponents of the grid (chosen)
 
+# Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
 DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
-"""Factors of the grid, relative to the B that would balance the drive at the observed speed; a vine that still
-accelerates has less. Chosen: the grid only has to come within a factor of two."""
 
-POINTS_USED = 60
-"""Points of each trial that the grid search uses. Chosen for time."""
+POINTS_USED = 60  # Points of each trial that the grid search uses (chosen)
 
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
-    """Release and origin of every trial from its frames at rest; zero deviations.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    array, shape (n_trials, 4)
-    """
+    """Release and origin of every trial from its frames at rest; zero deviations. Shape (n_trials, 4)."""
     trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
     for i, trial_data in enumerate(data):
         if trial_data.n_rest > 0:
@@ -56,21 +44,9 @@ def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
 def candidates(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor
 ) -> list[tuple[float, Floats, Floats]]:
-    """Starting values, best first: misfit, scaled parameters and trial effects.
-
-    For each exponent and each further starting value, every vine takes the B with the least misfit of its trials; the
-    release of each trial is scanned at the same time.
-
-    Parameters
-    ----------
-    layout : free parameters of the fit.
-    data : sequence of FitTrial
-    predictor : of these trials.
-
-    Returns
-    -------
-    list of (misfit, theta, trial_effects)
-        Shapes (), (n_free,), (n_trials, 4).
+    """Starting values, best first: misfit, scaled parameters and trial effects. For each exponent and each further
+    starting value, every vine takes the B with the least misfit of its trials; the release of each trial is scanned at
+    the same time.
     """
     trial_effects = initial_trial_effects(data)
     start_values = [
@@ -94,16 +70,7 @@ def candidates(
 
 
 def one_trial_per_condition(data: Sequence[FitTrial]) -> list[int]:
-    """Indices of one trial of every condition, the one with the most points.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    list of int
-    """
+    """Indices of one trial of every condition, the one with the most points."""
     best: dict[str, int] = {}
     for i, trial_data in enumerate(data):
         condition = trial_data.trial.condition
@@ -155,17 +122,7 @@ def _fixed_exponent(layout: ParameterMap) -> float:
 
 
 def middle_speed(trial_data: FitTrial) -> float:
-    """Mean speed of the tail from 40 to 85 % of the observed growth.
-
-    Parameters
-    ----------
-    trial_data : of one trial.
-
-    Returns
-    -------
-    float, m/s
-        Above 0.
-    """
+    """Mean speed of the tail from 40 to 85 % of the observed growth. Returns above 0."""
     y = trial_data.lead_position_m - trial_data.lead_position_m[: max(trial_data.n_rest, 1)].mean()
     total = float(np.max(y))
     low, high = (int(np.argmax(y >= part * total)) for part in (0.4, 0.85))
@@ -186,23 +143,9 @@ def align(
     data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> tuple[Floats, Floats]:
     """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
-
-    One trajectory per trial is simulated, at a subset of its frames, and shifted in time by interpolation.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-    predictor : of these trials.
-    theta : array, shape (n_free,)
-        Free parameters, scaled.
-    trial_effects : array, shape (n_trials, 4)
-        Centre of the scan.
-
-    Returns
-    -------
-    trial_effects : array, shape (n_trials, 4)
-    misfit : array, shape (n_trials,)
-        ln of the root mean square relative to the travel.
+    One trajectory per trial is simulated, at a subset of its frames, and shifted in time by interpolation. Returns
+    trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,); trial_effects
+    (n_trials, 4) → (n_trials, 4).
     """
     subsets = [_thinned(trial_data) for trial_data in data]
     jobs = predictor.jobs(theta, trial_effects)

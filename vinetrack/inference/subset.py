@@ -36,29 +36,7 @@ def fit_subset(
     hold_noise: bool = False,
     most_iterations: int = MOST_ITERATIONS,
 ) -> Fit:
-    """Fit the same model to some of the trials of a fit, starting from its solution.
-
-    Parameters
-    ----------
-    fit : the fit to all trials.
-    keep : iterable of str, or mask
-        Names of trials, or a mask over `fit.trials`.
-    held : iterable of str
-        Names of numbers (`Number.name`) or of parameters (`effect.parameter`) that stay at their values.
-    hold_spreads, hold_noise : bool
-        Whether spreads and noise stay those of `fit`.
-    most_iterations : int
-        Steps at most.
-
-    Returns
-    -------
-    Fit
-
-    Raises
-    ------
-    FitError
-        If no trial is kept, one is unknown, or the model cannot be followed.
-    """
+    """Fit the same model to some of the trials of a fit, starting from its solution."""
     rows = _rows(fit, keep)
     places = parameters_of_trials(fit.predictor.layout, rows)
     predictor = subset_predictor(fit.predictor, rows, places)

@@ -13,18 +13,7 @@ from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
 
 
 def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
-    """The summary of a fit.
-
-    Parameters
-    ----------
-    fit : the fit.
-    warnings : of the audit.
-    further_messages : in addition to those of the fit.
-
-    Returns
-    -------
-    FitSummary
-    """
+    """The summary of a fit."""
     keys = [entry.name for entry in fields(TrialEstimates)]
     moved = film_influence(fit)
     return FitSummary(

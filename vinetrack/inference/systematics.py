@@ -22,57 +22,28 @@ from vinetrack.inference.position_change import position_change
 from vinetrack.inference.position_errors import position_shapes
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
 
-PAYLOAD_ERROR = 0.005
-"""Standard deviation of a payload's mass in addition to that of the sheet, relative: a gram in two hundred."""
+PAYLOAD_ERROR = 0.005  # Standard deviation of a payload's mass in addition to that of the sheet, relative
 
-PRESSURE_ERROR_PA = 30.0
-"""Standard deviation of a set pressure in addition to that of the sheet: a gauge read to a tenth of a kilopascal."""
+PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
 
-FILM_ERROR = 0.02
-"""Least standard deviation of the mass of a vine's film, relative. Chosen: a micrometer reads 50 to 150 µm to one or
-two. Film that is 4 % off costs a hypothesis 4 in −2 ln L; at half this 16, at twice 1. Measured on a drag with film 1.5
-% off (`film_air_drag` 20712 of the laboratories): it gains 42, 49 and 49 at a quarter of this, at this and at five
-times."""
+FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
 
-PAYLOAD_STEP = 1e-2
-"""Relative step of a payload's mass for its derivative. Derived: positions are linear in it to 1e-4."""
+PAYLOAD_STEP = 1e-2  # Relative step of a payload's mass for its derivative (derived)
 
+# Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
 HALF_WAVES = 6
-"""Largest number of half waves along the growth in the slow error of a tracker that all trials share. Each has the full
-size, √3 times as much together, since a vine is not exactly in the plane of its board either. Chosen: six half waves
-describe what lens and pixel texture leave; more look like noise, half leave the steps at a door. Measured: with the
-slow error divided among the six, a vine nearer to the camera at one end was taken for `quadratic_length_friction`
-(`perspective` 959 of `benchmarks/filmed_verdicts.py`)."""
 
-START_FRACTION = 0.015
-"""Fraction of the growth over which a slow error that is larger at the start may decay. Chosen: the tip passes a door
-within it. At half or twice, a door is assumed to hide it for so long."""
+START_FRACTION = 0.015  # Fraction of the growth over which a slow error that is larger at the start may decay (chosen)
 
+# Fractions of the growth before its end (measured)
 END_SHAPES = ((0.1, 2.0), (0.03, 4.0))
-"""Fractions of the growth before its end, and how many times the usual slow error the error at the end may be over
-each. Measured: in the last 5 per cent 2.2 times as much as in the middle, in the 15 before 1.9 (37 recordings of the
-tuning seeds of `benchmarks/tracking_accuracy.py`; 0.8 and 1.8 in 15 of another renderer); in the last two frames, in
-which film stops dead, several times. Without the second, `perspective` 959 of `benchmarks/filmed_verdicts.py` is called
-`quadratic_length_friction`."""
 
 
 @dataclass(frozen=True)
 class Systematics:
-    """Displacement of the positions of each trial by one standard deviation of each systematic error.
-
-    An error of one payload or of one set pressure affects its own trials alone, and there are as many as conditions: a
-    trial has columns only for those that affect it.
-
-    Parameters
-    ----------
-    columns : list of arrays, shape (n_points, n_columns), m
-        One per trial.
-    places : array of int, shape (n_trials, n_columns)
-        Which error each column belongs to, `count` for a column without error.
-    count : int
-        Number of errors of the campaign.
-    estimated_m : list of arrays, shape (n_points,), m
-        Displacement of each trial by errors that the fit has estimated already.
+    """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
+    payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
+    columns only for those that affect it.
     """
 
     columns: list[Floats]
@@ -82,30 +53,12 @@ class Systematics:
 
     @classmethod
     def none(cls, points: Sequence[int]) -> Systematics:
-        """No systematic errors.
-
-        Parameters
-        ----------
-        points : sequence of int
-            Points of each trial.
-
-        Returns
-        -------
-        Systematics
-        """
+        """No systematic errors."""
         return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
 
     def at_zero_errors(self, columns: Sequence[Floats]) -> list[Floats]:
         """Columns of a fit with the residual, the last column, taken at zero errors instead of the estimated ones.
-
-        Parameters
-        ----------
-        columns : sequence of arrays, shape (n_points, k), m
-            As `Predictor.linearise`.
-
-        Returns
-        -------
-        list of arrays, of the same shapes
+        Shapes: columns (n_points, k).
         """
         if self.estimated_m is None:
             return list(columns)
@@ -128,23 +81,7 @@ def systematics_of(
     positions: bool = True,
     film: bool = False,
 ) -> Systematics:
-    """All systematic errors of a fit.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    trials : sequence of TrialFit
-        In the order of the fit.
-    positions : bool
-        Whether to include smooth errors of position; a fit may estimate those along with its parameters.
-    film : bool
-        Whether to include the mass of film, which otherwise is a hypothesis of its own.
-
-    Returns
-    -------
-    Systematics
-    """
+    """All systematic errors of a fit."""
     points = [trial.time_s.size for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     dense = [_tracker_errors(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
@@ -194,20 +131,7 @@ def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[T
 
 
 def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
-    """Error of the film mass of each vine, `FILM_ERROR`.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    trials : sequence of TrialFit
-        In the order of the fit.
-
-    Returns
-    -------
-    Systematics
-        Without errors if the film affects no trial, or one cannot be simulated with another film mass.
-    """
+    """Error of the film mass of each vine, `FILM_ERROR`."""
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     with_film = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
@@ -246,19 +170,7 @@ def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematic
 
 
 def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
-    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    curves_only : bool
-        Whether traces that consist of local lines are left out.
-
-    Returns
-    -------
-    Systematics
-    """
+    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
     data = predictor.data
     counts = [
         0
@@ -318,10 +230,9 @@ def _tracker_errors(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Fl
 
 
 def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
-    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m.
-
-    Waves along the growth have the usual error of the trial each. What is stated beyond that, near a door or at low
-    contrast, is one error at the very start and one after it; two more grow towards the end.
+    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m. Waves along the growth
+    have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
+    the very start and one after it; two more grow towards the end.
     """
     if slow_m is None:
         return np.zeros((part.size, HALF_WAVES + 2 + len(END_SHAPES)))

@@ -31,11 +31,8 @@ from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures
 
+# Maximum number of rounds (measured)
 MOST_ROUNDS, CONVERGED_SIGMAS = 4, 0.1
-"""Maximum number of rounds, and the change of an error, in its standard deviations, at which they have converged.
-Measured: nine fits converge after one to three rounds (`trace_clock` of the laboratories, tuning seed 20600); at half
-some would not, twice as many are never used. Chosen: −2 ln L is quadratic about its minimum, and 0.1 in one error is
-0.01 of it; at half a further round is needed now and then, at twice 0.04."""
 
 
 def with_fitted_trace_errors(
@@ -47,26 +44,9 @@ def with_fitted_trace_errors(
     watch: Watch | None = None,
     search: bool = False,
 ) -> tuple[Predictor, Solution]:
-    """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures.
-
-    A poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve:
-    the errors of local lines are not known in detail.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-    held : variance components that are not estimated.
-    most_iterations : int
-        Maximum number of steps of each fit.
-    watch : callable, optional
-        Called with every step.
-    search : bool
-        Whether the fit is one of many candidates, see `optimiser.solve`.
-
-    Returns
-    -------
-    Predictor, Solution
+    """A solution with the errors of the recorded pressures estimated, and the predictor of the corrected pressures. A
+    poor model would distort the pressures: its trials keep the recorded ones. So do trials whose trace is no curve: the
+    errors of local lines are not known in detail. Returns predictor, Solution.
     """
     if not any(_has_errors(trial_data) for trial_data in predictor.data):
         return predictor, solution
@@ -90,16 +70,7 @@ def with_fitted_trace_errors(
 
 
 def trace_error_penalty(data: Sequence[FitTrial]) -> float:
-    """Contribution of the priors of the estimated errors to −2 ln L.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-
-    Returns
-    -------
-    float
-    """
+    """Contribution of the priors of the estimated errors to −2 ln L."""
     return sum(
         float(np.sum(trial_data.trace_error_sizes**2))
         for trial_data in data
@@ -108,17 +79,7 @@ def trace_error_penalty(data: Sequence[FitTrial]) -> float:
 
 
 def trace_correction_Pa(trial_data: FitTrial) -> Floats:
-    """Correction of the recorded pressure of a trial by a fit.
-
-    Parameters
-    ----------
-    trial_data : FitTrial
-        With a recorded pressure.
-
-    Returns
-    -------
-    array, shape (n_samples,), Pa
-    """
+    """Correction of the recorded pressure of a trial by a fit. Shape (n_samples,)."""
     assert trial_data.trace is not None
     if trial_data.trace_errors_Pa is None or trial_data.trace_error_sizes is None:
         return np.zeros(trial_data.trace[0].size)
@@ -126,16 +87,7 @@ def trace_correction_Pa(trial_data: FitTrial) -> Floats:
 
 
 def as_recorded(trial_data: FitTrial) -> FitTrial:
-    """A trial with its pressure as recorded, without the correction by a fit.
-
-    Parameters
-    ----------
-    trial_data : FitTrial
-
-    Returns
-    -------
-    FitTrial
-    """
+    """A trial with its pressure as recorded, without the correction by a fit."""
     if trial_data.trace_error_sizes is None:
         return trial_data
     return replace(_corrected(trial_data, -trial_data.trace_error_sizes), trace_error_sizes=None)
@@ -160,17 +112,8 @@ def _corrected(trial_data: FitTrial, step: Floats) -> FitTrial:
 
 
 def trace_error_step(predictor: Predictor, solution: Solution) -> Floats:
-    """Gauss–Newton step of the errors, in standard deviations, from their current estimates.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    array, shape (n_trials, n_errors)
-        0 for errors that a trial does not have, and everywhere if a trial cannot be simulated with one of them.
+    """Gauss–Newton step of the errors, in standard deviations, from their current estimates. Returns 0 for errors that
+    a trial does not have, and everywhere if a trial cannot be simulated with one of them. Shape (n_trials, n_errors).
     """
     errors = recorded_pressures(predictor, solution, curves_only=True)
     if not errors.n_columns:

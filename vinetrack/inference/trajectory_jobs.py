@@ -15,8 +15,7 @@ from vinetrack.dynamics.batch import Batch, starts_of
 from vinetrack.dynamics.simulate import Trajectory, check_completed, trajectories
 from vinetrack.inference.fit_data import FitTrial
 
-OBSERVED = 3
-"""Column of `Motions.rows` with the position of the edge as the camera reports it. Defined by the kernel."""
+OBSERVED = 3  # Column of `Motions.rows` with the position of the edge as the camera reports it (defined)
 
 
 class Job(NamedTuple):
@@ -43,73 +42,31 @@ class Jobs:
 
     @classmethod
     def of(cls, jobs: Sequence[Job]) -> Jobs:
-        """Combine single jobs.
-
-        Parameters
-        ----------
-        jobs : sequence of Job
-
-        Returns
-        -------
-        Jobs
-        """
+        """Combine single jobs."""
         trials, rows, *values = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
         others = [np.array(column, dtype=float) for column in values]
         return cls(np.array(trials, dtype=int), np.array(rows).reshape(len(jobs), -1), *others)
 
     def with_effect(self, values: Sequence[float]) -> Jobs:
-        """The same trajectories for a model with one more effect.
-
-        Parameters
-        ----------
-        values : sequence of float
-            Its parameters, SI, the same for all.
-
-        Returns
-        -------
-        Jobs
-        """
+        """The same trajectories for a model with one more effect."""
         return replace(self, row=np.hstack([self.row, np.tile(np.asarray(values, dtype=float), (len(self), 1))]))
 
     def __len__(self) -> int:
         return self.trial.size
 
     def take(self, places: NDArray[np.int_]) -> Jobs:
-        """A copy of some of the jobs.
-
-        Parameters
-        ----------
-        places : array of int, shape (n_taken,)
-
-        Returns
-        -------
-        Jobs
-        """
+        """A copy of some of the jobs. Shapes: places (n_taken,)."""
         trial, *numbers = self._columns
         return Jobs(trial[places], *(values[places] for values in numbers))
 
     def as_list(self) -> list[Job]:
-        """The jobs as a list.
-
-        Returns
-        -------
-        list of Job
-        """
+        """The jobs as a list."""
         rows, *columns = self.row, *(values.tolist() for values in self._columns[2:])
         return [Job(i, row, *numbers) for i, row, *numbers in zip(self.trial.tolist(), rows, *columns, strict=True)]
 
     @classmethod
     def concatenated(cls, parts: Sequence[Jobs]) -> Jobs:
-        """Concatenate several sets of jobs.
-
-        Parameters
-        ----------
-        parts : sequence of Jobs
-
-        Returns
-        -------
-        Jobs
-        """
+        """Concatenate several sets of jobs."""
         trial, *numbers = (np.concatenate(values) for values in zip(*(part._columns for part in parts), strict=True))
         return cls(trial, *numbers)
 
@@ -118,17 +75,8 @@ class Jobs:
         return tuple(vars(self).values())
 
     def distinct(self, identical_trials: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Indices of distinct jobs, and for each job its index among the distinct ones.
-
-        Parameters
-        ----------
-        identical_trials : array of int, shape (n_trials,)
-            For each trial the first one with the same settings and times.
-
-        Returns
-        -------
-        first : array of int, shape (n_distinct,)
-        inverse : array of int, shape (n_jobs,)
+        """Indices of distinct jobs, and for each job its index among the distinct ones. Returns first, inverse. Shapes:
+        identical_trials (n_trials,) → (n_distinct,).
         """
         numbers = np.column_stack([identical_trials[self.trial].astype(float), *self._columns[1:]])
         first: dict[bytes, int] = {}
@@ -139,17 +87,8 @@ class Jobs:
 def first_identical_trials(
     data: Sequence[FitTrial], inputs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
 ) -> NDArray[np.int_]:
-    """For each trial the first one with the same settings and times.
-
-    Parameters
-    ----------
-    data : sequence of FitTrial
-    inputs : array, shape (n_trials, n_fields of `TrialInputs`), SI
-    bends : of each trial
-
-    Returns
-    -------
-    array of int, shape (n_trials,)
+    """For each trial the first one with the same settings and times. Shapes: inputs (n_trials, n_fields of
+    `TrialInputs`) → (n_trials,).
     """
     first: dict[tuple[object, ...], int] = {}
     identical_trials = np.arange(len(data))
@@ -161,10 +100,8 @@ def first_identical_trials(
 
 
 class Average(NamedTuple):
-    """Weighted averages of positions over times around each point.
-
-    `instants_s` are all times needed, increasing; `place`, shape (n_points, n_weights), are the indices of those that
-    each average uses; `weights` are the weights.
+    """Weighted averages of positions over times around each point. `instants_s` are all times needed, increasing;
+    `place`, shape (n_points, n_weights), are the indices of those that each average uses; `weights` are the weights.
     """
 
     instants_s: Floats
@@ -173,18 +110,7 @@ class Average(NamedTuple):
 
     @classmethod
     def of(cls, time_s: Floats, offsets_s: Floats, weights: Floats) -> Average:
-        """Averages around points at these times.
-
-        Parameters
-        ----------
-        time_s : array, shape (n_points,)
-        offsets_s, weights : array, shape (n_weights,)
-            An odd number, the middle one at the point itself.
-
-        Returns
-        -------
-        Average
-        """
+        """Averages around points at these times. Shapes: time_s (n_points,); offsets_s, weights (n_weights,)."""
         instants_s = np.add.outer(time_s, offsets_s)
         order = np.argsort(instants_s, axis=None, kind="stable")
         place = np.empty(order.size, dtype=int)
@@ -195,7 +121,6 @@ class Average(NamedTuple):
 @dataclass(frozen=True)
 class Motions:
     """Simulated trajectories of jobs: `out` and `ends` as `Batch.run` returns them, one entry per distinct trajectory.
-
     `ratios` are the travel ratios of their trials; `trajectory_of`, shape (n_jobs,), is the trajectory of each job.
     """
 
@@ -207,42 +132,13 @@ class Motions:
 
     @classmethod
     def of(cls, batch: Batch, trials: Sequence[Trial], trajectory_of: NDArray[np.int_]) -> Motions:
-        """Integrate a batch.
-
-        Parameters
-        ----------
-        batch : Batch
-            Distinct trajectories.
-        trials : sequence of Trial
-            One per trajectory.
-        trajectory_of : array of int, shape (n_jobs,)
-            Trajectory of each job.
-
-        Returns
-        -------
-        Motions
-
-        Raises
-        ------
-        SimulationError
-            If an integration fails.
-        """
+        """Integrate a batch. Shapes: trajectory_of (n_jobs,)."""
         out, ends = batch.run()
         check_completed(ends, [trial.name for trial in trials])
         return cls(batch, out, ends, [trial.travel_ratio for trial in trials], trajectory_of)
 
     def averaged(self, averages: Sequence[Average]) -> Motions:
-        """The motions at the requested points, their reported positions averaged over the times around them.
-
-        Parameters
-        ----------
-        averages : sequence of Average
-            One per trajectory, which was simulated at its times.
-
-        Returns
-        -------
-        Motions
-        """
+        """The motions at the requested points, their reported positions averaged over the times around them."""
         out, stamps, times = [], [], []
         for (first, last), average in zip(itertools.pairwise(self.batch.starts), averages, strict=True):
             middle = average.place[:, average.weights.size // 2]
@@ -256,16 +152,8 @@ class Motions:
         return replace(self, batch=batch, out=np.concatenate(out))
 
     def rows(self, first: int, last: int) -> Floats:
-        """Rows of `out` of jobs `first` up to `last`, concatenated.
-
-        Parameters
-        ----------
-        first, last : int
-
-        Returns
-        -------
-        array, shape (n_times, 4)
-            Position, velocity and acceleration of the tail, position of the edge as the camera reports it.
+        """Rows of `out` of jobs `first` up to `last`, concatenated. Returns position, velocity and acceleration of the
+        tail, position of the edge as the camera reports it. Shape (n_times, 4).
         """
         starts, trajectory_of = self.batch.starts, self.trajectory_of[first:last]
         if (
@@ -277,26 +165,12 @@ class Motions:
         return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in trajectory_of])
 
     def stamps(self, job: int) -> Floats:
-        """Times of a job since its release, s, on the camera's clock.
-
-        Parameters
-        ----------
-        job : int
-
-        Returns
-        -------
-        array, shape (n_times,)
-        """
+        """Times of a job since its release, s, on the camera's clock. Shape (n_times,)."""
         return self.batch.stamps[
             self.batch.starts[self.trajectory_of[job]] : self.batch.starts[self.trajectory_of[job] + 1]
         ]
 
     def trajectories(self) -> list[Trajectory]:
-        """One trajectory per job.
-
-        Returns
-        -------
-        list of Trajectory
-        """
+        """One trajectory per job."""
         distinct_trajectories = trajectories(self.batch, self.out, self.ends, self.ratios)
         return [distinct_trajectories[k] for k in self.trajectory_of]

@@ -30,40 +30,19 @@ from vinetrack.inference.sensitivity import (
 from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import at_correlation, whiten
 
-LARGEST_DEVIATION_STEP = 0.3
-"""Largest step of a trial's deviations of pressure and ln B. Chosen as a trust region: beyond it the linear model is
-inaccurate; the between-trial standard deviations have much smaller bounds."""
+LARGEST_DEVIATION_STEP = 0.3  # Largest step of a trial's deviations of pressure and ln B (chosen)
 
-LARGEST_DEVIATION = 0.9
-"""Largest deviation of pressure and ln B. Chosen: a pressure or B off by 90 % is an error in the sheet, not a
-deviation. At half, such errors stall the fit at the limit; at twice, exp(1.8) multiplies B by six."""
+LARGEST_DEVIATION = 0.9  # Largest deviation of pressure and ln B (chosen)
 
-LARGEST_RELEASE_STEP_FRAMES = 2.0
-"""Largest step of a release, frames. Chosen with the two above as a trust region; at half, releases take more steps; at
-twice, they overshoot."""
+LARGEST_RELEASE_STEP_FRAMES = 2.0  # Largest step of a release, frames (chosen)
 
 
 def optimise_trial_effects(
     predictor: Predictor, problem: MixedProblem, state: FitState, largest_useful_cost: float = math.inf
 ) -> tuple[FitState, Floats]:
-    """One Gauss–Newton step of the trial effects at fixed parameters, and the resulting cost of each trial.
-
-    The trial effects are determined so precisely that a step of the shared parameters leaves the curved valley; this
-    step returns to it. Each trial takes the best of no step, the full step, and a step at fixed release: where a
-    release crosses a frame, the cost has a corner at which no full step helps.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    largest_useful_cost : float
-        If the linear model predicts a total cost that is not below this, nothing is simulated and no step is taken.
-
-    Returns
-    -------
-    state : FitState
-    costs : array, shape (n_trials,)
+    """One Gauss–Newton step of the trial effects at fixed parameters, and the resulting cost of each trial. The trial
+    effects are determined so precisely that a step of the shared parameters leaves the curved valley; this step returns
+    to it. Returns state, costs. Shape (n_trials,).
     """
     columns = predictor.linearise(state.theta, state.trial_effects, trial_effects_only=True)
     cross_products = predictor.products(columns)
@@ -99,18 +78,8 @@ def _predicted_decrease(cross_products: Floats, problem: MixedProblem, state: Fi
 
 
 def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
-    """Trial effects after a step, within the trust region: two frames for the release, 0.3 for a deviation.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    trial_effects : array, shape (n_trials, 4)
-        Before the step.
-    step : array, shape (n_trials, 4)
-
-    Returns
-    -------
-    array, shape (n_trials, 4)
+    """Trial effects after a step, within the trust region: two frames for the release, 0.3 for a deviation. Shapes:
+    trial_effects, step (n_trials, 4) → (n_trials, 4).
     """
     largest_release_step = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
     effects = trial_effects + step
@@ -129,19 +98,8 @@ def limited_step(predictor: Predictor, trial_effects: Floats, step: Floats) -> F
 def trial_costs(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
 ) -> Floats:
-    """Penalised sum of squares of each trial: its whitened residuals plus the priors of its effects.
-
-    Parameters
-    ----------
-    predictor : simulates the trials of the fit.
-    problem : the constant part of the fit.
-    state : where the fit stands.
-    residuals : sequence of arrays, shape (n_points,), m, optional
-        Residuals at this state, if already computed; then nothing is simulated.
-
-    Returns
-    -------
-    array, shape (n_trials,)
+    """Penalised sum of squares of each trial: its whitened residuals plus the priors of its effects. Shapes: residuals
+    (n_points,) → (n_trials,).
     """
     if residuals is None:
         residuals = predictor.residuals(state.theta, state.trial_effects)
@@ -151,68 +109,40 @@ def trial_costs(
 
 
 def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
-    """The residuals among the columns of a linearisation.
-
-    Parameters
-    ----------
-    columns : sequence of arrays, shape (n_points, k), m
-        From `Predictor.linearise`.
-
-    Returns
-    -------
-    list of arrays, shape (n_points,), m
-    """
+    """The residuals among the columns of a linearisation. Shapes: columns (n_points, k) → (n_points,)."""
     return [np.ascontiguousarray(column[:, -1]) for column in columns]
 
 
-N_RELEASES = 60
-"""Candidate releases of a trial recorded only in motion. Chosen for time; Gauss–Newton steps refine the best one."""
+N_RELEASES = 60  # Candidate releases of a trial recorded only in motion (chosen)
 
+# Candidate releases of a trial recorded at rest, relative to the current one (chosen)
 NEARBY_RELEASES_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
-"""Candidate releases of a trial recorded at rest, relative to the current one. Close by, the release may lie on the
-other side of a frame at which the edge jumps. Chosen: slow starts recorded at rest were off by up to nine frames;
-fractions resolve a frame."""
 
-GRID_POINTS = 600
-"""Points of the time grid of a trajectory that is shifted. Derived: linear interpolation then errs by less than 1e-6 of
-the travel."""
+GRID_POINTS = 600  # Points of the time grid of a trajectory that is shifted (derived)
 
-LEAST_DECREASE = 0.5
-"""Decrease of a trial's −2 ln L for which its release jumps to another minimum. Derived: 0.5 of −2 ln L is 0.7 standard
-errors; less is left to the next step."""
+LEAST_DECREASE = 0.5  # Decrease of a trial's −2 ln L for which its release jumps to another minimum (derived)
 
+# Mean squared residual of a trial, in variances of its noise, up to which its release is searched (chosen)
 MOST_MISFIT = 30.0
-"""Mean squared residual of a trial, in variances of its noise, up to which its release is searched. Chosen for time: a
-trial with a larger misfit is not improved by its release alone."""
 
+# Steps of the trial effects at another release before it is compared with the current one (chosen)
 TRIAL_EFFECT_STEPS = 3
-"""Steps of the trial effects at another release before it is compared with the current one. Chosen: Gauss–Newton steps
-of four effects converge in two or three."""
 
+# Least and largest change of origin and deviations
 STEP_LIMITS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
-"""Least and largest change of origin and deviations."""
 
-DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
-"""Finite-difference steps of ln B and of pressure. Derived: 1 % moves a trajectory ten thousand times the integrator's
-error and bends it by 1e-4."""
+DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2  # Finite-difference steps of ln B and of pressure (derived)
 
 
-RETURNED_FRACTION = 0.25
-"""Part of a jump within which a release counts as returned to where the jump began. Chosen: a cycle of jumps and steps
-returns to a tenth and less. At half, some cycles go unnoticed; at twice, trials that converge in between are restricted
-to jumps that lower the misfit."""
+RETURNED_FRACTION = 0.25  # Part of a jump within which a release counts as returned to where the jump began (chosen)
 
-SAME_PARAMETERS = 1e-3
-"""Largest change of a shared parameter, scaled, that counts as no change. Chosen: a tenth of a per cent of B, far below
-its error. At half, cycles are noticed a step later; at twice, a step still in progress may count as none."""
+SAME_PARAMETERS = 1e-3  # Largest change of a shared parameter, scaled, that counts as no change (chosen)
 
 
 class ReleaseSearch:
-    """Global search for the releases during a fit, with a safeguard against cycling.
-
-    A release jumps where the trial's likelihood, its effects integrated out, is higher. The steps of the fit minimise
-    the misfit instead, and return to the old release where the jump only gained volume of the likelihood. Such a trial
-    is recorded in `returned`; it then jumps only if its misfit falls too, since jumps and steps would otherwise cycle.
+    """Global search for the releases during a fit, with a safeguard against cycling. A release jumps where the trial's
+    likelihood, its effects integrated out, is higher. The steps of the fit minimise the misfit instead, and return to
+    the old release where the jump only gained volume of the likelihood.
     """
 
     def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
@@ -222,20 +152,9 @@ class ReleaseSearch:
         self.theta_at_jump = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
     def likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
-        """The state with likelier releases; None if there are none.
-
-        The search leaves out trials pressurised during the recording, whose release the trace shows, and trials
-        recorded at rest with a misfit far above noise, which another release would only compensate.
-
-        Parameters
-        ----------
-        state : where the fit stands.
-        residuals : sequence of arrays, shape (n_points,), m
-            Residuals of each trial there.
-
-        Returns
-        -------
-        FitState or None
+        """The state with likelier releases; None if there are none. The search leaves out trials pressurised during the
+        recording, whose release the trace shows, and trials recorded at rest with a misfit far above noise, which
+        another release would only compensate. Shapes: residuals (n_points,).
         """
         release_s = state.trial_effects[:, RELEASE]
         came_back = np.abs(release_s - self.jumped_from) < RETURNED_FRACTION * np.abs(self.jumped_to - self.jumped_from)
@@ -281,9 +200,8 @@ class ReleaseSearch:
         return replace(state, trial_effects=trial_effects) if any_moved else None
 
     def _confirmed(self, state: FitState, proposed: FitState) -> FitState:
-        """The state with those proposed effects that remain better after a few steps on simulated trajectories.
-
-        Trials without a proposal stay as they are.
+        """The state with those proposed effects that remain better after a few steps on simulated trajectories. Trials
+        without a proposal stay as they are.
         """
         rows = np.flatnonzero((proposed.trial_effects != state.trial_effects).any(axis=1))
         predictor, problem, current = self.predictor, self.problem, state
@@ -328,9 +246,8 @@ def _best_release(
     plain: Floats,
     sensitivities: Floats,
 ) -> tuple[Floats, float]:
-    """Effects of one trial at its likeliest release, and the decrease of −2 ln L from the last of the releases.
-
-    `prior` are mean and precision of its effects, `noise` the correlation and the variance of the innovations.
+    """Effects of one trial at its likeliest release, and the decrease of −2 ln L from the last of the releases. `prior`
+    are mean and precision of its effects, `noise` the correlation and the variance of the innovations.
     """
     centre, precision = prior
     rho, variance = noise
@@ -370,10 +287,7 @@ def _release_sensitivities(
     predictor: Predictor, plain: Sequence[Job], releases: Sequence[Floats]
 ) -> list[tuple[Floats, Floats, Floats]]:
     """For each trial times since release, shape (n,), positions there, m, and their sensitivities to its effects.
-
-    Sensitivities have shape (4, n), zero for an effect that the trial does not have. A recorded pressure is shifted
-    along with the release: a settled trace hardly changes by that, and accepted releases are simulated with the
-    unshifted trace.
+    Sensitivities have shape (4, n), zero for an effect that the trial does not have.
     """
     jobs: list[Job] = []
     perturbations: list[tuple[int, float]] = []

@@ -1,4 +1,5 @@
-"""Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some thousand times.
+"""Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some
+thousand times.
 
 Each trial has only a handful of columns, so that with array operations most of the time would go into calling them.
 """
@@ -13,22 +14,16 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 
-RIDGE = 1e-13
-"""Added to the diagonal of systems with a unit diagonal before they are solved. Derived: a few hundred roundings of a
-double."""
+RIDGE = 1e-13  # Added to the diagonal of systems with a unit diagonal before they are solved (derived)
 
+# Least pivot of a factorised system of unit diagonal, the part of its information that a parameter keeps once the
+# previous ones are eliminated; below it the system is left to least squares, which drop what is singular (derived)
 LEAST_PIVOT = 1e-9
-"""Least pivot of a factorised system of unit diagonal, the part of its information that a parameter keeps once the
-previous ones are eliminated; below it the system is left to least squares, which drop what is singular. Derived: a step
-is then good to 1e-7, and the decrease by it, of second order, to 1e-14."""
 
-LEAST_RELEASE_DECREASE = 1e-6
-"""Decrease of −2 ln L, by leaving its bound, from which a parameter is released. Derived: a ten thousandth of the
-decrease at which a fit has converged, and far above rounding; at half and at twice nothing that is reported changes."""
+LEAST_RELEASE_DECREASE = 1e-6  # Decrease of −2 ln L, by leaving its bound, from which a parameter is released (derived)
 
+# Bounds met or released per parameter, at most, in the search for the minimum within bounds (chosen)
 ACTIVE_SET_CHANGES = 10
-"""Bounds met or released per parameter, at most, in the search for the minimum within bounds. Chosen as a safeguard:
-the sum of squares falls with every release, so that no set of bounds comes back, and a few changes suffice."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -36,24 +31,9 @@ def decrease_within_bounds(
     matrix: Floats, slope: Floats, below: Floats, above: Floats, free: NDArray[np.bool_]
 ) -> tuple[bool, float, float]:
     """Decrease of a quadratic form by the step to its minimum within bounds, found as in `gauss_newton.bounded_solve`.
-
-    Parameters
-    ----------
-    matrix : array, shape (n, n)
-        Information.
-    slope : array, shape (n,)
-    below, above : arrays, shape (n,)
-        Distances to the bounds.
-    free : array of bool, shape (n,)
-        Parameters that are estimated.
-
-    Returns
-    -------
-    solved : bool
-        Whether every pivot is large enough; if not, the other two values are meaningless.
-    decrease : float
-    log_det : float
-        Of the information of the parameters that are not at a bound.
+    Returns solved (whether every pivot is large enough; if not, the other two values are meaningless), decrease,
+    log_det (of the information of the parameters that are not at a bound). Shapes: matrix (n, n); slope, below, above,
+    free (n,).
     """
     size = len(slope)
     moving, step, outward = np.empty(size, np.bool_), np.zeros(size), np.zeros(size)
@@ -126,26 +106,9 @@ def normal_equations_without_deviations(
     blocks: Floats, places: NDArray[np.int_], deviation_sd: Floats, size: int
 ) -> tuple[Floats, Floats, float, float]:
     """Normal equations of the free parameters with the two deviations of each trial integrated out, summed over trials.
-
-    Parameters
-    ----------
-    blocks : array, shape (n_trials, 2 + n_keys + 1, 2 + n_keys + 1)
-        Cross products of deviations, keys, residual.
-    places : array of int, shape (n_trials, n_keys)
-        Free parameter of each key; `size` for one that a trial does not depend on.
-    deviation_sd : array, shape (n_trials, 2)
-        Standard deviations of pressure and ln B, 0 where a trial has no such deviation.
-    size : int
-        Number of free parameters.
-
-    Returns
-    -------
-    information : array, shape (size, size)
-    slope : array, shape (size,)
-    square : float
-        Residual sum of squares.
-    log_det : float
-        Sum over trials of ln det(I + S Z S), S the standard deviations and Z the cross products of deviations.
+    Returns information, slope, square (residual sum of squares), log_det (sum over trials of ln det(I + S Z S), S the
+    standard deviations and Z the cross products of deviations). Shapes: blocks (n_trials, 2 + n_keys + 1, 2 + n_keys +
+    1); places (n_trials, n_keys); deviation_sd (n_trials, 2) → (size, size).
     """
     last = blocks.shape[1] - 1
     information, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
@@ -188,26 +151,9 @@ def noise_at_correlations(
     least_residual_part: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Restricted likelihood and residual sums of squares of all trials at each noise correlation, trial effects fitted.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, m + 1, m + 1)
-        Of the trial effects and the residual, see `whitening`.
-    prior_precision, prior_gradient : arrays, shape (n_trials, m)
-        Precision of the trial effects, and that times their distance from the prior mean, in units of the noise.
-    points : array, shape (n_trials,)
-    rhos : array, shape (n_rhos,)
-    shared : float
-        Degrees of freedom that the shared parameters take from each trial.
-    least_residual_part : float
-        Least part of the sum of squares that remains as residual.
-
-    Returns
-    -------
-    scores : array, shape (n_rhos,)
-        −2 ln of the restricted likelihood, profiled over the variances, without the term of the gaps.
-    squares, degrees : arrays, shape (n_rhos, n_trials)
-        Residual sums of squares and their degrees of freedom.
+    Returns scores (−2 ln of the restricted likelihood, profiled over the variances, without the term of the gaps),
+    squares, degrees (residual sums of squares and their degrees of freedom). Shapes: cross_products (n_trials, 3, m +
+    1, m + 1); prior_precision, prior_gradient (n_trials, m); points (n_trials,); rhos (n_rhos,) → (n_rhos,).
     """
     trials, m = prior_precision.shape
     scores = np.zeros(len(rhos))

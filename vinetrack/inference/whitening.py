@@ -7,9 +7,6 @@ With noise e_k = ρ e_{k−1} + s ε_k, the columns c_k enter every quantity of 
 so three small matrices per trial replace all its points, for any ρ. `first` marks the points that begin a stretch
 without gaps; the noise of different stretches is independent. Where the noise varies from point to point, columns are
 first divided by the relative standard deviation of each point, which leaves AR(1) noise of constant variance.
-
-A long step of a fit may give a trajectory that overflows. Its cross products are then infinite or NaN and the step is
-rejected, so no warning is raised.
 """
 
 from __future__ import annotations
@@ -24,20 +21,7 @@ from vinetrack.core.records import Floats
 
 @np.errstate(over="ignore", invalid="ignore")
 def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | None = None) -> Floats:
-    """G₀, G₁, G₂ of one trial.
-
-    Parameters
-    ----------
-    columns : array, shape (n_points, k)
-    first : array of bool, shape (n_points,)
-        Points that begin a stretch.
-    relative_sd : array, shape (n_points,), optional
-        Noise of each point relative to that of the trial, see `FitTrial`.
-
-    Returns
-    -------
-    array, shape (3, k, k)
-    """
+    """G₀, G₁, G₂ of one trial. Shapes: columns (n_points, k); first, relative_sd (n_points,) → (3, k, k)."""
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
     if np.count_nonzero(first) == 1:
@@ -63,57 +47,22 @@ def all_products(
     first: Sequence[NDArray[np.bool_]],
     relative_sd: Sequence[Floats | None] | None = None,
 ) -> Floats:
-    """`products` of every trial.
-
-    Parameters
-    ----------
-    columns : sequence of arrays, shape (n_points, k)
-    first : sequence of arrays of bool
-    relative_sd : sequence of arrays or None, optional
-
-    Returns
-    -------
-    array, shape (n_trials, 3, k, k)
-    """
+    """`products` of every trial. Shapes: columns (n_points, k) → (n_trials, 3, k, k)."""
     relative = [None] * len(columns) if relative_sd is None else relative_sd
     return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def at_correlation(cross_products: Floats, rho: float) -> Floats:
-    """Whitened cross products at a given correlation, for innovations of variance 1.
-
-    Parameters
-    ----------
-    cross_products : array, shape (n_trials, 3, k, k)
-        From `all_products`.
-    rho : float
-        Lag-one correlation.
-
-    Returns
-    -------
-    array, shape (n_trials, k, k)
+    """Whitened cross products at a given correlation, for innovations of variance 1. Shapes: cross_products (n_trials,
+    3, k, k) → (n_trials, k, k).
     """
     return np.asarray(cross_products[:, 0] - rho * cross_products[:, 1] + rho**2 * cross_products[:, 2])
 
 
 def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: Floats | None = None) -> Floats:
     """Whiten residuals or columns under AR(1) noise; the first point of a stretch has the same variance as others.
-
-    Parameters
-    ----------
-    residual : array, shape (n_points,), (n_points, k) or (m, n_points, k)
-    first : array of bool, shape (n_points,)
-        Points that begin a stretch.
-    rho : float
-        Lag-one correlation.
-    relative_sd : array, shape (n_points,), optional
-        Noise of each point relative to that of the trial.
-
-    Returns
-    -------
-    array
-        Of the shape of `residual`.
+    Shapes: residual, first, relative_sd (n_points,).
     """
     if relative_sd is not None:
         residual = residual / (relative_sd if residual.ndim == 1 else relative_sd[:, None])

@@ -189,16 +189,7 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
 
 
 def named_model(given: TrialSource) -> Model:
-    """Return the model that the experiment of a source names, including the user's own effects.
-
-    Parameters
-    ----------
-    given : trials with their experiment; without one, the base model is returned.
-
-    Returns
-    -------
-    Model
-    """
+    """Return the model that the experiment of a source names, including the user's own effects."""
     from vinetrack.effects import own_effects
 
     if given.experiment is None:

@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 
 
 class LoadedResults:
-    """A results folder, whose files are read on first access.
-
-    Tables are pandas DataFrames whose columns carry their units, as in the files (`docs/results.md`).
+    """A results folder, whose files are read on first access. Tables are pandas DataFrames whose columns carry their
+    units, as in the files (`docs/results.md`).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -130,23 +129,7 @@ class LoadedResults:
         return whole[["trial", *(name for name in whole.columns if name != "trial")]]
 
     def plot(self, name: str = "", **options: Any) -> Figure:
-        """Return a figure of the report.
-
-        Parameters
-        ----------
-        name : name of the figure as in `figures/`, such as `damping_law`, `ladder`, `model_comparison`, `candidates`;
-            `trial_motion` takes `trial=`. Blank: the ladder of errors if there is one, else the damping law.
-        options : `trial`, the name of a trial.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ResultsError
-            If there is no such figure, or it has no content.
-        """
+        """Return a figure of the report."""
         return plot(self, name, **options)
 
     def __repr__(self) -> str:

@@ -15,15 +15,14 @@ from vinetrack.inference.fit_data import Pairs
 from vinetrack.interface.data_frames import tracks_from_frame
 from vinetrack.interface.loaded import LoadedResults
 
+# Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track
 Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
-"""Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track."""
 
 
 @dataclass(frozen=True)
 class TrialSource:
-    """Trials with their tracks, their experiment, and the reasons why trials were left out.
-
-    `experiment` is None for a frame and for pairs; `kinematics` are those of a results folder, by name of trial.
+    """Trials with their tracks, their experiment, and the reasons why trials were left out. `experiment` is None for a
+    frame and for pairs; `kinematics` are those of a results folder, by name of trial.
     """
 
     pairs: list[tuple[Trial, Track]]
@@ -38,23 +37,7 @@ class TrialSource:
 
 
 def read_source(source: Source) -> TrialSource:
-    """Read trials and tracks from any source.
-
-    Parameters
-    ----------
-    source : see `Source`; for the columns of a frame see `tracks_from_frame`.
-
-    Returns
-    -------
-    TrialSource
-
-    Raises
-    ------
-    ExperimentError
-        If an experiment or a frame cannot be read.
-    ResultsError
-        If a stage of a results folder has not run, or its experiment has moved.
-    """
+    """Read trials and tracks from any source."""
     from vinetrack.inference.fit_data import pairs_of
     from vinetrack.pipeline.model_stage import measured_trials
     from vinetrack.pipeline.source_experiment import read_source_experiment

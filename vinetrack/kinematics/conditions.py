@@ -54,21 +54,7 @@ CONDITION_COLUMNS = (
 def condition_table(
     trials: pd.DataFrame, known: Sequence[Trial], *, final_at_fraction: float, efficiency_at_mm: float
 ) -> pd.DataFrame:
-    """Return a row for each condition, columns `CONDITION_COLUMNS`, in the order of the sheet.
-
-    Parameters
-    ----------
-    trials : as in `trials.csv`; trials that failed or were left out do not count.
-    known : the trials of the experiment, for their sizes.
-    final_at_fraction, efficiency_at_mm : where the final speed and the efficiency of `trials` were evaluated.
-
-    Returns
-    -------
-    DataFrame
-        `x_ss_m_s` is NaN where less than half of a condition's trials are steady, since those are the slower ones.
-        `efficiency` is ½ m(x) ẋ² / (P₀ A y), `efficiency_payload` that of the payload's motion alone, and
-        `efficiency_with_weight` adds the work of the weight to that of the gas; `weight_share` is their ratio.
-    """
+    """Return a row for each condition, columns `CONDITION_COLUMNS`, in the order of the sheet."""
     import pandas as pd
 
     measured = trials[trials["status"].isin(["ok", "warning"])]
@@ -128,16 +114,8 @@ def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, objec
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
-    """Return the mean of the known values, its standard error, and their number.
-
-    Parameters
-    ----------
-    values : shape (n,), any unit; NaN where unknown.
-    sigmas : errors of single values, shape (n,); the error of the mean where only one value is known.
-
-    Returns
-    -------
-    mean, standard error, number; NaN, NaN, 0 without known values, and an error of NaN for a single value without one.
+    """Return the mean of the known values, its standard error, and their number. Returns mean, standard error, number;
+    NaN, NaN, 0 without known values, and an error of NaN for a single value without one. Shapes: values, sigmas (n,).
     """
     known = np.isfinite(values)
     count = int(known.sum())
@@ -151,16 +129,7 @@ def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float
 
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
     """Return the velocity with which the leading edge first passes a position, interpolated linearly in position.
-
-    Parameters
-    ----------
-    lead_position_m : travel from rest, shape (n,), m.
-    lead_velocity_m_s : shape (n,), m/s.
-    target_m : travel from rest, m.
-
-    Returns
-    -------
-    m/s; NaN where the edge never gets there, or is beyond it at the first point.
+    Shapes: lead_position_m, lead_velocity_m_s (n,).
     """
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
@@ -172,20 +141,9 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 
 
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
-    """Return the ratio of kinetic energy to work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth.
-
-    m(x) is the moving mass of tail and payload, ẋ = r·ẏ. NaN where there is no work. Source: Alvarez et al. (2025),
-    section IV-D, with the moving mass of their Eq. (1).
-
-    Parameters
-    ----------
-    trial : its pressure, size and payload.
-    lead_travel_m : growth y since release, m.
-    lead_velocity_m_s : ẏ there, m/s.
-
-    Returns
-    -------
-    a fraction.
+    """Return the ratio of kinetic energy to work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth. m(x) is
+    the moving mass of tail and payload, ẋ = r·ẏ. NaN where there is no work. Source: Alvarez et al. (2025), section
+    IV-D, with the moving mass of their Eq. (1).
     """
     work_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     if not work_J > 0:
@@ -195,10 +153,9 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
 
 
 class EfficiencyShares(NamedTuple):
-    """Factors that turn an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants.
-
-    `payload` is the payload's fraction of the moving mass: efficiency × `payload` is that of the payload alone.
-    `weight` is the work of the weight over that of the gas: efficiency / (1 + `weight`) counts both as work.
+    """Factors that turn an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants. `payload` is the payload's fraction of
+    the moving mass: efficiency × `payload` is that of the payload alone. `weight` is the work of the weight over that
+    of the gas: efficiency / (1 + `weight`) counts both as work.
     """
 
     payload: float
@@ -206,19 +163,9 @@ class EfficiencyShares(NamedTuple):
 
 
 def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
-    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas.
-
-    The weight does work on tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq.
-    (2) of Alvarez et al. (2025). NaN where there is no mass, or no work.
-
-    Parameters
-    ----------
-    trial : its pressure, size, payload and angle.
-    lead_travel_m : growth y since release, m.
-
-    Returns
-    -------
-    two fractions.
+    """Return the payload's fraction of the moving mass, and the work of the weight over that of the gas. The weight
+    does work on tail and payload along the travel of the tail x = r·y: g cosθ ∫ m dx, the third term of Eq. (2) of
+    Alvarez et al. (2025). NaN where there is no mass, or no work.
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m

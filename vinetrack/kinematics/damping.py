@@ -7,12 +7,6 @@ error to the variable where it arises: the error of a measured pressure to F; to
 the scatter between vines, and the scatter of a pressure that was set, since there the true force deviates from the
 stated one and takes the speed with it (Berkson error). York's estimator then gives n (D. York et al., Am. J. Phys. 72,
 367, 2004). The scatter is estimated as what the stated errors do not explain.
-
-Intervals come from resampling whole trials within each vine, without assumptions about the scatter. The bootstrap does
-not include two effects. One is the bias of `log_log`: its intervals are shifted by the bias that its own scatter
-implies (its estimates are not: they are the published method). The other are errors that trials share: the `…_total`
-intervals add that of the yield pressure, common to a vine, and that of the scale, common to all trials. A scale error
-of ε changes every ln x_ss by ε and every ln B by −n·ε, and does not change n.
 """
 
 from __future__ import annotations
@@ -28,33 +22,22 @@ from vinetrack.core.records import Floats
 if TYPE_CHECKING:
     import pandas as pd
 
-FEWEST_PER_VINE = 3
-"""Fewest points of a vine in the fit of a shared exponent. Derived: two determine its line exactly and show no
-scatter."""
+FEWEST_PER_VINE = 3  # Fewest points of a vine in the fit of a shared exponent (derived)
 
-LEAST_FORCE_RATIO = 1.2
-"""Least ratio of largest to smallest force of a vine. Derived: an error of 1 % in one force changes the slope d ln
-F/d ln v, n, by about 0.01 n/ln 1.2 = 0.05 n at each end, together 0.1 n; at 1.1 it would be 0.2 n, at 1.4 0.06 n."""
+LEAST_FORCE_RATIO = 1.2  # Least ratio of largest to smallest force of a vine (derived)
 
-LEAST_STEADY_SHARE = 0.5
-"""Fraction of a condition's trials that must be steady for any of them to enter a fit. Chosen: the majority, since the
-steady trials of a condition in which most are not are a biased selection. At 0.25 such conditions count, at 1 every
-trial must be steady."""
+LEAST_STEADY_SHARE = 0.5  # Fraction of a condition's trials that must be steady for any of them to enter a fit (chosen)
 
-FEWEST_FOR_RESAMPLING = 10
-"""Fewest points for bootstrap intervals; with fewer, intervals come from Student's t. Chosen: at 5 the bootstrap of few
-points is too narrow (its variance is (N − p)/N of the true one), at 20 more intervals are Student's."""
+FEWEST_FOR_RESAMPLING = 10  # Fewest points for bootstrap intervals (chosen)
 
-NO_SLOPE = "its vine carries no slope: "
-"""Start of the reason of a point whose vine is left out of the law."""
+NO_SLOPE = "its vine carries no slope: "  # Start of the reason of a point whose vine is left out of the law
 
 
 @dataclass(frozen=True)
 class Points:
-    """Steady points in logarithms, shape (n_points,); errors are relative, `yield_error` is in N.
-
-    `vine` is the index of the vine of each point in `names`. `force_error` is the error of a measured pressure,
-    `set_error` that of a set one, `scale_error` that of the scale, shared by all points.
+    """Steady points in logarithms, shape (n_points,); errors are relative, `yield_error` is in N. `vine` is the index
+    of the vine of each point in `names`. `force_error` is the error of a measured pressure, `set_error` that of a set
+    one, `scale_error` that of the scale, shared by all points.
     """
 
     log_speed: Floats
@@ -75,20 +58,8 @@ class Points:
 
 
 def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Fit the law to the steady windows by both methods, and exactly as published.
-
-    Parameters
-    ----------
-    points : one row for each trial, from `vinetrack.kinematics.summary`. Rows with `used` enter `log_log` and
-        `both_axes`, which also name the vines that `mark_left_out` left out. Every eligible trial with a window by the
-        published rule enters `paper`, with set pressure, without weight, and fitted as published.
-    resamples : number of bootstrap resamples of whole trials.
-    seed : of the bootstrap.
-
-    Returns
-    -------
-    dict
-        `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
+    """Fit the law to the steady windows by both methods, and exactly as published. Returns `log_log`, `both_axes`,
+    `paper`, each as `fit_damping` describes.
     """
     in_law = points["used"]
     if "reason" in points:
@@ -101,18 +72,9 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
 
 
 def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
-    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`.
-
-    At a pressure where a vine barely reaches a steady speed within its length, only the slower trials are steady. Their
-    B is larger than average, which would bias the upper end of the fit.
-
-    Parameters
-    ----------
-    points : one row for each trial, with `condition`, `eligible`, `used` and `reason`.
-
-    Returns
-    -------
-    a copy in which `used` is False and `reason` set for those conditions.
+    """Exclude conditions of which less than half of the trials are steady, in `used` and `reason`. At a pressure where
+    a vine barely reaches a steady speed within its length, only the slower trials are steady. Their B is larger than
+    average, which would bias the upper end of the fit.
     """
     eligible = points[points["eligible"]]
     share = eligible.groupby("condition", sort=False)["used"].mean()
@@ -128,16 +90,7 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
-    """Exclude the points of half-steady conditions and of vines without a slope, in `used` and `reason`.
-
-    Parameters
-    ----------
-    points : as those of `mark_half_steady`, with `vine`, `x_ss_m_s` and `force_N`.
-
-    Returns
-    -------
-    a copy in which `used` is False and `reason` set where the law leaves a point out.
-    """
+    """Exclude the points of half-steady conditions and of vines without a slope, in `used` and `reason`."""
     marked = mark_half_steady(points)
     for vine, why in _admit(marked[marked["used"]])[1].items():
         of_vine = marked["used"] & (marked["vine"] == vine)
@@ -147,24 +100,10 @@ def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Fit the law by both methods.
-
-    Parameters
-    ----------
-    points : one row for each trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N,
-        force_sigma_N,
-        yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`) and
-        `scale_rel_sigma` (relative error of the scale, which all trials share). Vines with fewer than three trials, or
-        a span of forces below 1.2, are left out and named.
-    resamples, seed : number of resamples, and the seed that makes them repeatable.
-
-    Returns
-    -------
-    dict
-        `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
-        errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number
-        of trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (its
-        method), `left_out`, and `refused`: None, or why there is no fit.
+    """Fit the law by both methods. Returns `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole
+    trials), `n_95_total` (with the stated errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of
+    ln F, diameter, thickness, number of trials), `covariance` of n and ln B, `scatter` (relative, of a single force),
+    `n_trials`, `interval` (its method), `left_out`, and `refused`: None, or why there is no fit.
     """
     kept, left_out = _admit(points)
     if kept.empty:
@@ -243,20 +182,8 @@ def _logarithms(points: pd.DataFrame) -> Points:
 def slope(
     log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
 ) -> tuple[Floats, Floats]:
-    """York's slope with one intercept for each vine, for many resamples at once.
-
-    Parameters
-    ----------
-    log_force : shape (n_resamples, n_points) or (1, n_points).
-    counts : how often each point is drawn, shape (n_resamples, n_points).
-    data : the points.
-    speed_variance, force_variance : of the logarithms, shape (n_points,); with a speed variance of 0 this is least
-        squares in ln F.
-
-    Returns
-    -------
-    n : array, shape (n_resamples,)
-    log_B : array, shape (n_resamples, n_vines)
+    """York's slope with one intercept for each vine, for many resamples at once. Returns n, log_B. Shapes: log_force,
+    counts (n_resamples, n_points); speed_variance, force_variance (n_points,) → (n_resamples,).
     """
     member = data.member
     n = np.full(counts.shape[0], 0.4)
@@ -390,7 +317,6 @@ def _resample(
     data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_shared: bool
 ) -> Floats:
     """Fits to trials drawn with replacement within each vine, columns n and ln B; draws without a slope are dropped.
-
     `with_shared` also draws the errors that trials share: of the yield pressure for each vine, of the scale for all.
     """
     random = np.random.default_rng(seed)
@@ -410,10 +336,9 @@ def _resample(
 
 
 def _widening(data: Points, dof: int) -> Floats:
-    """Factor by which percentile intervals must be widened, shape (1 + n_vines,).
-
-    Resampling N points about p fitted parameters reduces their variance by (N − p)/N, and an estimated scatter requires
-    Student's t instead of the normal distribution.
+    """Factor by which percentile intervals must be widened, shape (1 + n_vines,). Resampling N points about p fitted
+    parameters reduces their variance by (N − p)/N, and an estimated scatter requires Student's t instead of the normal
+    distribution.
     """
     n_points = data.log_force.size
     sizes = np.array([n_points / (1 + len(data.names)), *np.bincount(data.vine)])

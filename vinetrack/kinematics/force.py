@@ -25,7 +25,6 @@ from vinetrack.kinematics.release import Release
 @dataclass(frozen=True)
 class SteadyForce:
     """Force in a steady window, N, its random standard error, and `yield_sigma_N`, the error due to the yield pressure.
-
     The latter is shared by all trials of a vine. `paper_N` is the force by the published rule: set pressure, no weight.
     """
 
@@ -40,23 +39,7 @@ class SteadyForce:
 def steady_force(
     trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model
 ) -> SteadyForce:
-    """Compute the force of a trial in one window.
-
-    Parameters
-    ----------
-    trial, track, kinematics, release : of one trial.
-    window : where it is steady or quasi-steady.
-    model : gives the pressure in the window where none was measured.
-
-    Returns
-    -------
-    force, errors, pressure and its source.
-
-    Raises
-    ------
-    EffectError
-        If the trial lacks what an effect of the model needs.
-    """
+    """Compute the force of a trial in one window."""
     inside = (kinematics.time_s >= window.from_s) & (kinematics.time_s <= window.to_s)
     travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
     pressure_Pa, sigma_Pa, source = _window_pressure(trial, track, kinematics, release, window, model, inside)
@@ -75,32 +58,13 @@ def steady_force(
 
 
 def paper_force_N(trial: Trial) -> float:
-    """Return the force by the published rule, (P − P_y)A with the set pressure and without weight.
-
-    Parameters
-    ----------
-    trial : its pressures and diameter.
-
-    Returns
-    -------
-    N.
-    """
+    """Return the force by the published rule, (P − P_y)A with the set pressure and without weight."""
     return (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
 
 
 def known_pressure(trial: Trial, track: Track, kinematics: Kinematics, release: Release, model: Model) -> Floats | None:
-    """Return the gauge pressure at the points of the kinematics; None where only the set pressure is known.
-
-    It is the measured pressure, else that of a model with an effect on the pressure.
-
-    Parameters
-    ----------
-    trial, track, kinematics, release : of one trial.
-    model : used where no pressure was measured.
-
-    Returns
-    -------
-    shape (n,), Pa, or None.
+    """Return the gauge pressure at the points of the kinematics; None where only the set pressure is known. It is the
+    measured pressure, else that of a model with an effect on the pressure. Shape (n,).
     """
     if track.pressure_Pa is not None and np.isfinite(track.pressure_Pa).sum() > 1:
         measured = np.isfinite(track.pressure_Pa)
@@ -146,16 +110,7 @@ def _mean_error(measured_Pa: Floats) -> float:
 
 
 def why_not_in_fit(trial: Trial) -> str:
-    """Return why a trial cannot enter the damping fit whatever its motion; blank if it can.
-
-    Parameters
-    ----------
-    trial : as the sheet states it.
-
-    Returns
-    -------
-    half a sentence, or blank.
-    """
+    """Return why a trial cannot enter the damping fit whatever its motion; blank if it can."""
     if trial.travel_ratio != 2:
         return "a body that moves as a whole has no eversion damping"
     if trial.payload_kg > 0:
@@ -164,16 +119,7 @@ def why_not_in_fit(trial: Trial) -> str:
 
 
 def why_not_force(force: SteadyForce | None) -> str:
-    """Return why a force cannot enter the damping fit; blank if it can.
-
-    Parameters
-    ----------
-    force : None where the trial has no steady window.
-
-    Returns
-    -------
-    half a sentence, or blank.
-    """
+    """Return why a force cannot enter the damping fit; blank if it can."""
     if force is None:
         return "no steady window"
     if not force.force_N > 0:

@@ -15,11 +15,9 @@ Bounds = Callable[[Indices, Indices], tuple[Floats, Floats]]
 
 
 class WindowMoments:
-    """Quadratic fits to the raw positions of any window in constant time.
-
-    A window consists of two stretches that meet at a middle. Level k has a middle every 2^(k + 1) points and the sums
-    outwards from it, of moments about its own time and position (a disjoint sparse table). No sum is a small difference
-    of large ones, so a short window late in a long track is as accurate as any other in double precision.
+    """Quadratic fits to the raw positions of any window in constant time. A window consists of two stretches that meet
+    at a middle. Level k has a middle every 2^(k + 1) points and the sums outwards from it, of moments about its own
+    time and position (a disjoint sparse table).
     """
 
     def __init__(self, time_s: Floats, position_m: Floats, noise_m: float, correlation: float) -> None:
@@ -43,15 +41,8 @@ class WindowMoments:
 
     def drift(self, first: Indices, last: Indices) -> tuple[Floats, Floats, Floats]:
         """Fit a parabola to the positions in many windows at once: mean speed, relative change of speed, and its error.
-
-        Parameters
-        ----------
-        first, last : first and last point of each window, both included, shape (n_windows,); first below last.
-
-        Returns
-        -------
-        mean lead speed, m/s; relative change of speed from end to end; standard error of that. Each of shape
-            (n_windows,).
+        Returns mean lead speed, m/s; relative change of speed from end to end; standard error of that. Each of shape:
+        (n_windows,). Shapes: first, last (n_windows,).
         """
         # The level of a window is the highest bit in which its ends differ, and its middle is there.
         level = np.frexp((first ^ last).astype(float))[1] - 1
@@ -122,36 +113,16 @@ class RangeExtremes:
         self.table = np.array(rows)
 
     def maximum(self, first: Indices, last: Indices) -> Floats:
-        """Return the maximum over ranges of points.
-
-        Parameters
-        ----------
-        first, last : first and last point of each range, both included, shape (n_ranges,).
-
-        Returns
-        -------
-        shape (n_ranges,), in the unit of the values.
-        """
+        """Return the maximum over ranges of points. Shapes: first, last (n_ranges,) → (n_ranges,)."""
         level = np.frexp((last - first + 1).astype(float))[1] - 1
         return np.maximum(self.table[level, first], self.table[level, last - (1 << level) + 1])
 
 
 def chord_bounds(time_s: Floats, position_m: Floats, noise_m: float, rho: float, sigmas: float) -> list[Bounds]:
     """Return functions for the highest lower and lowest upper limit of chord speeds in a window, by length of chord.
-
     Chords span 1, 2, 4 … frames of the raw positions; the speed of one has the error σ√(2(1 − ρ^k))/Δt. Nothing is
     smoothed, so a window may extend right up to the start-up or the end of growth without being affected by them.
-
-    Parameters
-    ----------
-    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
-    noise_m : standard deviation σ of a position, m.
-    rho : correlation of the noise from frame to frame.
-    sigmas : half-width of a limit in standard errors.
-
-    Returns
-    -------
-    one function for each length of chord, shortest first; speeds in m/s.
+    Shapes: time_s, position_m (n,).
     """
     bounds: list[Bounds] = []
     span = 1
@@ -180,10 +151,9 @@ def _bounds_of(low: RangeExtremes, high: RangeExtremes, span: int) -> Bounds:
 
 @dataclass(frozen=True)
 class LineFit:
-    """Legendre polynomials fitted to the raw positions of one window: speed, its change, and the cubic term.
-
-    Lead speeds, m/s. `drift` is the relative change of speed across the window; `bend_m_s` is the mean speed of the
-    cubic minus that of the straight line, `bend_sigma_m_s` its standard error.
+    """Legendre polynomials fitted to the raw positions of one window: speed, its change, and the cubic term. Lead
+    speeds, m/s. `drift` is the relative change of speed across the window; `bend_m_s` is the mean speed of the cubic
+    minus that of the straight line, `bend_sigma_m_s` its standard error.
     """
 
     speed_m_s: float
@@ -200,19 +170,9 @@ class LineFit:
 
 
 def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -> LineFit:
-    """Fit the raw positions of one window of at least three points by least squares, with errors for AR(1) noise.
-
-    Where the points scatter about their cubic significantly more than `noise_m`, the errors are those of the scatter.
-
-    Parameters
-    ----------
-    time_s, position_m : raw positions of the leading edge in the window, shape (n,), s and m.
-    noise_m : standard deviation of a position, m.
-    rho : correlation of the noise from frame to frame.
-
-    Returns
-    -------
-    speed of the line, drift from the parabola, bend from the cubic, with standard errors.
+    """Fit the raw positions of one window of at least three points by least squares, with errors for AR(1) noise. Where
+    the points scatter about their cubic significantly more than `noise_m`, the errors are those of the scatter. Shapes:
+    time_s, position_m (n,).
     """
     n = time_s.size
     half = float(time_s[-1] - time_s[0]) / 2
@@ -248,21 +208,9 @@ def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> fl
 
 
 def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
-    """Measure speed, its standard error, drift and variation in a window; the rule decides about acceptance.
-
-    The standard error of x_ss includes the noise and, where the speed is curved within the window, the difference of
-    the mean speeds of a cubic and of the line.
-
-    Parameters
-    ----------
-    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
-    kinematics : at the same points.
-    first, last : first and last point of the window, both included.
-    rule : its name, as `Window.rule`.
-
-    Returns
-    -------
-    the window, not accepted.
+    """Measure speed, its standard error, drift and variation in a window; the rule decides about acceptance. The
+    standard error of x_ss includes the noise and, where the speed is curved within the window, the difference of the
+    mean speeds of a cubic and of the line. Shapes: time_s, position_m (n,).
     """
     inside = slice(first, last + 1)
     t = time_s[inside]
@@ -287,23 +235,10 @@ def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int
 def trim(
     time_s: Floats, position_m: Floats, kinematics: Kinematics, window: tuple[int, int], band: float, drift_limit: float
 ) -> tuple[int, int]:
-    """Trim the ends of a steady window that deviate from its speed line.
-
-    The first and last 1, 2, 4 … frames must move within `band` (a fraction of the mean speed) plus `TRIM_SIGMAS`
-    standard errors of the speed that the window's parabola has there. Trimming stops where the rest would no longer be
-    shown to be steady.
-
-    Parameters
-    ----------
-    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
-    kinematics : at the same points.
-    window : first and last point, both included.
-    band : fraction of the mean speed.
-    drift_limit : largest bound of the 95 % interval of the relative change of speed.
-
-    Returns
-    -------
-    first and last point of the trimmed window, both included.
+    """Trim the ends of a steady window that deviate from its speed line. The first and last 1, 2, 4 … frames must move
+    within `band` (a fraction of the mean speed) plus `TRIM_SIGMAS` standard errors of the speed that the window's
+    parabola has there. Returns first and last point of the trimmed window, both included. Shapes: time_s, position_m
+    (n,).
     """
     first, last = window
     while last - first >= 4:
@@ -325,9 +260,7 @@ def trim(
     return first, last
 
 
-TRIM_SIGMAS = 2.5
-"""Standard errors by which an end of a window must deviate from its speed line to be trimmed. Chosen: 1.2 % by chance;
-at half steady windows are shortened by noise, at twice a start-up of twice the size stays in."""
+TRIM_SIGMAS = 2.5  # Standard errors by which an end of a window must deviate from its speed line to be trimmed
 
 
 def _points_to_trim(

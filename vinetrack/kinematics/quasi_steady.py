@@ -18,32 +18,18 @@ from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
 from vinetrack.kinematics.plateau import fit_window, judge
 from vinetrack.kinematics.release import Release
 
-INERTIA_LIMIT = 0.1
-"""Largest inertia as a fraction of the force, at the end of its 95 % interval.
+INERTIA_LIMIT = 0.1  # Largest inertia as a fraction of the force, at the end of its 95 % interval (chosen)
 
-Chosen: inertia is included in the force, but the mass of film is known only to a few per cent, which leaves an error of
-0.3 % of the force at this limit."""
+LARGEST_CHANGE = 0.3  # Largest relative change of speed across a window (derived)
 
-LARGEST_CHANGE = 0.3
-"""Largest relative change of speed across a window.
-
-Derived: the mean of ẋⁿ then differs from the power of the mean by n(n−1)/24 of its square, 0.09 %.
-"""
-
+# Fraction of the length up to which the moving mass of a vine without payload is known well enough (chosen)
 LAST_FRACTION = 0.95
-"""Fraction of the length up to which the moving mass of a vine without payload is known well enough. Chosen: its film
-has 5 % of the whole mass there, and the gas, which is known less well, up to 10 %; nearer to the end the gas would have
-more mass than the film."""
 
-PARTS = 3
-"""Parts of a window in which inertia is fitted separately. Chosen: beginning, middle and end."""
+PARTS = 3  # Parts of a window in which inertia is fitted separately (chosen)
 
-FEWEST_POINTS = 4 * PARTS
-"""Fewest points of a window. Derived: a quadratic in each part, with one degree of freedom."""
+FEWEST_POINTS = 4 * PARTS  # Fewest points of a window (derived)
 
-SECTIONS = 6
-"""Sections between whose ends all windows are tried. Chosen: 21 windows; at 3 a window may be a third shorter than
-possible, at 12 there are 78 to fit."""
+SECTIONS = 6  # Sections between whose ends all windows are tried (chosen)
 
 
 def quasi_steady_window(
@@ -55,18 +41,8 @@ def quasi_steady_window(
     *,
     start_fraction: float = 0.2,
 ) -> Window:
-    """Find the longest window after the highest speed in which inertia is a small part of the force.
-
-    Parameters
-    ----------
-    trial, track, kinematics, release : of one trial.
-    pressure_Pa : known gauge pressure at the points of `kinematics`, shape (n,).
-    start_fraction : the window ends where the speed is below this fraction of the highest.
-
-    Returns
-    -------
-    Window
-        Rule `quasi_steady`; where there is none, `accepted` is False and `reason` says why.
+    """Find the longest window after the highest speed in which inertia is a small part of the force. Shapes:
+    pressure_Pa (n,).
     """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]

@@ -10,26 +10,18 @@ import numpy as np
 from vinetrack.core.records import Floats, Kinematics, Track, join_flags
 from vinetrack.tracks.position_noise import rest_points
 
-FEWEST_REST_POINTS = 3
-"""Fewest points at rest that define a resting position. Chosen: two equal frames may be a slow start."""
+FEWEST_REST_POINTS = 3  # Fewest points at rest that define a resting position (chosen)
 
-LIFTED_SIGMAS = 5.0
-"""Standard deviations of a position by which the track must leave its start to count as moving. Chosen: 6e-7 by chance
-for one point; at half it is 1 %, at twice small creeping motions count as rest."""
+LIFTED_SIGMAS = 5.0  # Standard deviations of a position by which the track must leave its start to count as moving
 
-CLEAR_SIGMAS = 15.0
-"""Travel, in standard deviations of a position, at which motion is certain; the onset is searched backwards from there.
-Chosen: three times `LIFTED_SIGMAS`, so that points lie between; half and twice were not tried."""
+CLEAR_SIGMAS = 15.0  # Travel, in standard deviations of a position, at which motion is certain (chosen)
 
-LONGEST_EXTRAPOLATION_FRAMES = 20
-"""Frames by which an extrapolated release may precede the first frame. Chosen: the first acceleration tells little
-about earlier motion. At half and at twice, fewer or more tracks without rest get an onset; all of them are marked."""
+LONGEST_EXTRAPOLATION_FRAMES = 20  # Frames by which an extrapolated release may precede the first frame (chosen)
 
 
 @dataclass(frozen=True)
 class Release:
     """Onset of motion and resting position of the leading edge; `time_s` is NaN where nothing moves.
-
     `moving_from_start` marks tracks without rest, whose zeros are extrapolated or those of the first point; `reason`
     says which.
     """
@@ -42,18 +34,7 @@ class Release:
 
 
 def find_release(track: Track, kinematics: Kinematics) -> Release:
-    """Find the resting position of the leading edge and the time of its release.
-
-    Parameters
-    ----------
-    track : the track from which `kinematics` was made.
-    kinematics : its motion; the noise is taken from here.
-
-    Returns
-    -------
-    Release
-        Origin and onset, with a sentence on how they were determined.
-    """
+    """Find the resting position of the leading edge and the time of its release."""
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
     n_rest = rest_points(position_m)
@@ -69,17 +50,7 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
 
 
 def flag_rest(track: Track, release: Release) -> Track:
-    """Flag every row before the release with `before_release`.
-
-    Parameters
-    ----------
-    track : of one trial.
-    release : of that trial.
-
-    Returns
-    -------
-    a copy; the track itself where the release is unknown or the track moves from the start.
-    """
+    """Flag every row before the release with `before_release`."""
     if not math.isfinite(release.time_s) or release.moving_from_start:
         return track
     resting = track.time_s < release.time_s
@@ -131,7 +102,6 @@ def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
 
 def _onset(time_s: Floats, position_m: Floats, n_rest: int, origin_m: float, kinematics: Kinematics) -> float:
     """Time at which the edge leaves rest, by the best least-squares fit of y = y₀ + b·(t − t₀)^p with p = 1, 3/2 or 2.
-
     A vine of small mass reaches full speed within a frame (p = 1), a heavy one has constant acceleration (p = 2). The
     fit uses the points around the onset and on until the edge has clearly left its resting position, at least three.
     """

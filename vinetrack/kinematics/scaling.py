@@ -1,8 +1,8 @@
 """Dependence of damping coefficient, steady speed and efficiency on the size of the vine.
 
 B against diameter is described by a power law (a straight line on log axes) and by a straight line; both are reported,
-because neither is known to be right. For the published vines (R = 1…4) the power is 1.80, and the straight line has
-R² = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
+because neither is known to be right. For the published vines (R = 1…4) the power is 1.80, and the straight line has R²
+= 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
 
 Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. Each size
 counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number. Slopes are
@@ -23,31 +23,17 @@ from vinetrack.core.records import Floats
 if TYPE_CHECKING:
     import pandas as pd
 
-ISOMETRIC_WITHIN = 0.05
-"""Vines whose t/D agree within this fraction count as scaled copies of each other. Chosen: films are sold to ±5 %."""
+ISOMETRIC_WITHIN = 0.05  # Vines whose t/D agree within this fraction count as scaled copies of each other (chosen)
 
-SAME_WITHIN = 0.02
-"""Vines whose diameters agree within this fraction count as equal in diameter. Chosen: well below the steps between
-sizes; half and twice were not tried."""
+SAME_WITHIN = 0.02  # Vines whose diameters agree within this fraction count as equal in diameter (chosen)
 
-FEWEST_VINES = 3
-"""Fewest vines of a regression with an error. Derived: two determine a line exactly."""
+FEWEST_VINES = 3  # Fewest vines of a regression with an error (derived)
 
 
 def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_axes") -> dict[str, Any]:
-    """Regress B on diameter for isometric vines, and on thickness for vines of one diameter.
-
-    Parameters
-    ----------
-    damping : both fits as `vinetrack.kinematics.damping.fit_damping` returns them.
-    method : the fit whose coefficients are used.
-
-    Returns
-    -------
-    dict
-        `isometric` and `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`,
-        `sizes`, `B`, `power` and `line` (see `regress`), and `refused` (None, or why there is no regression). Where
-        no vines are comparable the list is empty and `reason` says why.
+    """Regress B on diameter for isometric vines, and on thickness for vines of one diameter. Returns `isometric` and
+    `thickness`, each a list of families: `along` (`diameter_mm` or `thickness_um`), `vines`, `sizes`, `B`, `power` and
+    `line` (see `regress`), and `refused` (None, or why there is no regression).
     """
     vines = damping[method]["vines"]
     isometric = _families(vines, "diameter_mm", lambda v: v["thickness_um"] / v["diameter_mm"], ISOMETRIC_WITHIN)
@@ -103,15 +89,8 @@ def _family(group: list[str], sizes: Floats, vines: Mapping[str, Any], along: st
 
 
 def regress(x: Floats, y: Floats) -> dict[str, Any]:
-    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope.
-
-    Parameters
-    ----------
-    x, y : shape (n,), n ≥ 3.
-
-    Returns
-    -------
-    `slope, slope_95, intercept, intercept_95, R2, p, n`.
+    """Fit a straight line: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope. Returns
+    `slope, slope_95, intercept, intercept_95, R2, p, n`. Shapes: x, y (n,).
     """
     from scipy.stats import linregress, t
 
@@ -131,43 +110,23 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
     }
 
 
-SAME_SETTING_WITHIN = 0.01
-"""Pressures and payloads that agree within this fraction count as equal. Chosen: gauges are read to a per cent."""
+SAME_SETTING_WITHIN = 0.01  # Pressures and payloads that agree within this fraction count as equal (chosen)
 
 SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
 EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")
 
 
 def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
-    """Find families of conditions that differ only in size, and the trends of speed and efficiency with size.
-
-    Parameters
-    ----------
-    conditions : as `vinetrack.kinematics.conditions.condition_table` returns them.
-
-    Returns
-    -------
-    dict
-        `steady_speed`: scaled copies without payload at one pressure, each family with `sizes` (mm), `x_ss_m_s`,
-        `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second
-        in `over_diameter`), `monotonic`, and `refused`. `efficiency`: conditions of one pressure, payload and length,
-        each family with sizes, efficiencies in three variants and, for each variant, its `trend` (see `planes`).
+    """Find families of conditions that differ only in size, and the trends of speed and efficiency with size. Returns
+    `steady_speed`: scaled copies without payload at one pressure, each family with `sizes` (mm), `x_ss_m_s`,
+    `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second in
+    `over_diameter`), `monotonic`, and `refused`.
     """
     return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
 
 
 def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
-    """Group rows that agree in all given columns within a fraction of the group's first row.
-
-    Parameters
-    ----------
-    table : one row for each condition.
-    within : largest relative difference, by column.
-
-    Returns
-    -------
-    groups, each in the order of the table.
-    """
+    """Group rows that agree in all given columns within a fraction of the group's first row."""
     groups: list[pd.DataFrame] = []
     left = table
     while len(left):
@@ -251,20 +210,10 @@ def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:
 
 
 def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
-    """Fit powers of all sizes jointly: ln value = a + Σ pᵢ ln sizeᵢ, by least squares.
-
-    Sizes that do not vary are left out. Where diameter and thickness both vary, each power is the partial one at
-    constant other size, which a regression on one of them alone would confound.
-
-    Parameters
-    ----------
-    sizes : by name, shape (n,), in any unit, on which powers do not depend.
-    values : shape (n,); values that are unknown or not positive are left out.
-
-    Returns
-    -------
-    dict
-        By size `power, power_95, p`; `R2`, `n`; and `refused`: None, or why there is no trend.
+    """Fit powers of all sizes jointly: ln value = a + Σ pᵢ ln sizeᵢ, by least squares. Sizes that do not vary are left
+    out. Where diameter and thickness both vary, each power is the partial one at constant other size, which a
+    regression on one of them alone would confound. Returns by size `power, power_95, p`; `R2`, `n`; and `refused`:
+    None, or why there is no trend. Shapes: sizes, values (n,).
     """
     from scipy.stats import t
 

@@ -21,37 +21,25 @@ from vinetrack.kinematics.plateau import RangeExtremes, WindowMoments, chord_bou
 
 __all__ = ["gated_window", "paper_window", "user_window"]
 
-GRID_POINTS = 56
-"""Starts and ends tried in the first pass; the best is then refined point by point. Chosen: all pairs of 56 are 1500
-windows; at half a short window may be missed, at twice it takes four times as long."""
+GRID_POINTS = 56  # Starts and ends tried in the first pass; the best is then refined point by point (chosen)
 
-BAND = 0.5
-"""Half width of the band that contains every velocity, in drift limits. Derived: a drift of the limit is half of it on
-each side."""
+BAND = 0.5  # Half width of the band that contains every velocity, in drift limits (derived)
 
-SHORTEST_SHARE = 0.1
-"""Shortest steady window, as a fraction of the motion. Derived: a motion with constant acceleration changes speed by 3
-% within 3–4 % of its duration, so a short enough piece of any motion looks steady."""
+SHORTEST_SHARE = 0.1  # Shortest steady window, as a fraction of the motion (derived)
 
-SHORTEST_FALL, FALLING = 0.02, 1 / 3
-"""Shortest window where the speed falls by more than a third of the limit. Chosen: a vine that slows down with its
-supply or weight is in quasi-steady balance, one that speeds up is not."""
+SHORTEST_FALL, FALLING = 0.02, 1 / 3  # Shortest window where the speed falls by more than a third of the limit (chosen)
 
+# Deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed (derived)
 TRIM_BAND = 1 / 6
-"""Deviation of the ends of a window from its speed line, in drift limits, above which they are trimmed. Derived: a
-start-up of 1.5 % that decays over a tenth of the window would shift the mean by 0.15 %."""
 
+# Fraction of the growth after which no window lies, if the end was recorded or follows from the length of the vine: the
+# moving mass vanishes there, or the vine is stopped (chosen)
 END_FRACTION = 0.95
-"""Fraction of the growth after which no window lies, if the end was recorded or follows from the length of the vine:
-the moving mass vanishes there, or the vine is stopped. Chosen as the fit's own END_FRACTION; at 0.9 a tenth of every
-window is lost, at 0.975 windows of the demonstration still ran into the stop."""
 
+# A vine counts as moving where its speed exceeds this fraction of the highest, and this many standard errors (chosen)
 START_FRACTION, START_SIGMAS = 0.2, 5.0
-"""A vine counts as moving where its speed exceeds this fraction of the highest, and this many standard errors. Chosen
-as the defaults of the run's settings; half or twice moves the beginning of a slow start."""
 
-BAND_SIGMAS = 4.0
-"""Standard errors by which a single velocity may lie outside the band. Chosen: 1 in 16 000 by chance."""
+BAND_SIGMAS = 4.0  # Standard errors by which a single velocity may lie outside the band
 
 
 def gated_window(
@@ -63,22 +51,7 @@ def gated_window(
     start_fraction: float = START_FRACTION,
     start_sigmas: float = START_SIGMAS,
 ) -> Window:
-    """Find the longest window in which the speed is shown to be constant within the drift limit.
-
-    Parameters
-    ----------
-    track, kinematics : the track and the motion computed from it.
-    length_m : of the vine, m; NaN where unknown or where nothing grows: then only a recorded end counts.
-    drift_limit : largest change of speed across the window, and of any velocity in it from the mean, as a fraction of
-        the mean.
-    start_fraction, start_sigmas : the search begins where the velocity exceeds this fraction of its maximum and this
-        many of its standard errors.
-
-    Returns
-    -------
-    Window
-        Rule `gated`. Where nothing is steady, `accepted` is False and `reason` describes the nearest window.
-    """
+    """Find the longest window in which the speed is shown to be constant within the drift limit."""
     time_s, position_m = _points(track, kinematics)
     first, last, why = _gate(kinematics, start_fraction, start_sigmas)
     if why:
@@ -103,23 +76,7 @@ def gated_window(
 def user_window(
     track: Track, kinematics: Kinematics, window_s: tuple[float, float], length_m: float = math.nan
 ) -> Window:
-    """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady.
-
-    Parameters
-    ----------
-    track, kinematics : of one trial.
-    window_s : start and end on the clock of the track, s.
-    length_m : see `gated_window`.
-
-    Returns
-    -------
-    the window, accepted.
-
-    Raises
-    ------
-    ValueError
-        Fewer than three usable points between the two times.
-    """
+    """Evaluate a window chosen by hand, which is always used; `reason` warns where it is not steady."""
     time_s, position_m = _points(track, kinematics)
     inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
     if inside.size < 3:
@@ -275,21 +232,7 @@ def _with(window: Window, accepted: bool, reason: str) -> Window:
 
 def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, min_points: int = 3) -> Window:
     """Find the window of the published rule: the longest run whose velocities vary by less than 3 %, wherever it is.
-
-    Velocities are central differences of the raw positions, as Physics Tracker computes them. The run has at least
-    `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`. x_ss is their mean and
-    its error s/√n, as the rule implies, although neighbouring differences are correlated.
-
-    Parameters
-    ----------
-    track : of one trial.
-    travel_ratio : r; speeds of the lead are multiplied by it.
-    cv_limit : largest coefficient of variation.
-    min_points : velocities in a row at least.
-
-    Returns
-    -------
-    the window; not accepted where there is no such run.
+    Velocities are central differences of the raw positions, as Physics Tracker computes them.
     """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
@@ -320,7 +263,6 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
 
 def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
     """First and last index of the longest run with coefficient of variation below the limit; the lowest of ties.
-
     Lengths are tried in descending order, octave by octave. A run of 2b to 4b values contains an aligned block of b
     values whose squared deviations cannot exceed those of the run, so only runs around quiet blocks are evaluated.
     """
@@ -350,9 +292,8 @@ def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[in
 
 
 def _near_quiet_blocks(velocity: Floats, block: int, cv_limit: float) -> NDArray[np.int_]:
-    """Starts from which a run of 2 to 4 blocks can contain a block that is quiet enough for the run.
-
-    The run's mean m lies within 2·cv·|m| of the block's, and the block's squares sum to no more than 4·block·(cv·m)².
+    """Starts from which a run of 2 to 4 blocks can contain a block that is quiet enough for the run. The run's mean m
+    lies within 2·cv·|m| of the block's, and the block's squares sum to no more than 4·block·(cv·m)².
     """
     n = velocity.size
     if 2 * cv_limit >= 1 or block < 2:

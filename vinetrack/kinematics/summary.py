@@ -35,8 +35,7 @@ from vinetrack.tracks.frame_timing import correct_frames
 if TYPE_CHECKING:
     import pandas as pd
 
-FEWEST_POINTS = 5
-"""Fewest usable points of a track. Derived: the narrowest window of `vinetrack.kinematics.velocity`."""
+FEWEST_POINTS = 5  # Fewest usable points of a track (derived)
 
 
 class TrialError(ValueError):
@@ -45,9 +44,8 @@ class TrialError(ValueError):
 
 @dataclass(frozen=True)
 class TrialResult:
-    """Results of one trial: its corrected track, motion, windows by rule, and its rows of results.
-
-    `row` has the columns of `trials.csv`, `point` those of the damping fit, with `used` and the `reason` if not.
+    """Results of one trial: its corrected track, motion, windows by rule, and its rows of results. `row` has the
+    columns of `trials.csv`, `point` those of the damping fit, with `used` and the `reason` if not.
     """
 
     track: Track
@@ -79,23 +77,7 @@ class Steadiness:
 
 
 def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMotion:
-    """Find velocity, release and the windows that do not depend on a model.
-
-    Parameters
-    ----------
-    trial : as the sheet states it.
-    track : its positions.
-    settings : of the run.
-
-    Returns
-    -------
-    track with its frames corrected and its rest flagged, kinematics, release, windows.
-
-    Raises
-    ------
-    TrialError
-        If the track has fewer than five usable points.
-    """
+    """Find velocity, release and the windows that do not depend on a model."""
     usable = int(track.usable.sum())
     if usable < FEWEST_POINTS:
         raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
@@ -109,22 +91,7 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
 
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
-    """Find the steady window of a trial and the force in it, with the pressure of a model.
-
-    Parameters
-    ----------
-    motion : from `look_at_motion`.
-    model : gives the pressure during growth where none was measured.
-
-    Returns
-    -------
-    all windows, the chosen one (None where no rule finds one), and the force in it.
-
-    Raises
-    ------
-    EffectError
-        If the trial lacks what an effect of the model needs.
-    """
+    """Find the steady window of a trial and the force in it, with the pressure of a model."""
     trial, track, kinematics, release = motion.trial, motion.track, motion.kinematics, motion.release
     windows = dict(motion.windows)
     chosen = _chosen(windows)
@@ -138,24 +105,7 @@ def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
 
 
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
-    """Compute velocity, steady windows by every rule, force, final speed and efficiency of one trial.
-
-    Parameters
-    ----------
-    trial : as the sheet states it.
-    track : its positions.
-    settings : of the run.
-    model : the model in use; it gives the pressure in the window where none was measured.
-
-    Returns
-    -------
-    track, kinematics, windows, its row of results and its point of the damping fit.
-
-    Raises
-    ------
-    TrialError
-        If the track has fewer than five usable points, or the trial lacks what an effect of the model needs.
-    """
+    """Compute velocity, steady windows by every rule, force, final speed and efficiency of one trial."""
     motion = look_at_motion(trial, track, settings)
     try:
         steady = steadiness_under(motion, model)
@@ -256,17 +206,7 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
 
 
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
-    """Return the row of a trial in the damping fit, with `used` and the `reason` if not.
-
-    Parameters
-    ----------
-    trial : as the sheet states it.
-    steady : from `steadiness_under`.
-
-    Returns
-    -------
-    dict from column, with its unit in the name, to value.
-    """
+    """Return the row of a trial in the damping fit, with `used` and the `reason` if not."""
     window, paper, force = steady.chosen, steady.windows["paper"], steady.force
     reason = why_not_in_fit(trial) or why_not_force(force)
     nan = math.nan
@@ -297,9 +237,8 @@ LAW_COLUMNS = ("model", "method", "vine", "n", "n_low_95", "n_high_95", "B", "B_
 
 @dataclass(frozen=True)
 class DampingLaw:
-    """The damping law under one model: `points` as in `damping_points.csv`, `laws` as in `damping.json`.
-
-    `left_out` maps trials that cannot be analysed under the model to the reason.
+    """The damping law under one model: `points` as in `damping_points.csv`, `laws` as in `damping.json`. `left_out`
+    maps trials that cannot be analysed under the model to the reason.
     """
 
     points: pd.DataFrame
@@ -308,17 +247,7 @@ class DampingLaw:
 
 
 def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings | None = None) -> list[TrialMotion]:
-    """Find velocity, release and windows of every track; trials with too few points are skipped.
-
-    Parameters
-    ----------
-    pairs : trial and its track.
-    settings : of the run; defaults if None.
-
-    Returns
-    -------
-    motions, in the order of `pairs`.
-    """
+    """Find velocity, release and windows of every track; trials with too few points are skipped."""
     settings, motions = settings or RunSettings(), []
     for trial, track in pairs:
         try:
@@ -329,23 +258,7 @@ def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings 
 
 
 def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSettings | None = None) -> DampingLaw:
-    """Find steady windows and the damping law with the pressure of a model.
-
-    Parameters
-    ----------
-    model : a fitted model (`Fit.model`), whose effects on the pressure have their fitted sizes.
-    motions : from `look_at_motions`.
-    settings : of the run; defaults if None.
-
-    Returns
-    -------
-    the points of the fit, the laws by method, and the trials left out with the reason.
-
-    Raises
-    ------
-    ValueError
-        If no trial can be analysed under this model.
-    """
+    """Find steady windows and the damping law with the pressure of a model."""
     import pandas as pd
 
     settings = settings or RunSettings()
@@ -365,15 +278,8 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
 
 
 def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Return laws under several models as one table: a row for each model, method and vine, columns `LAW_COLUMNS`; SI.
-
-    Parameters
-    ----------
-    laws : `DampingLaw.laws`, or the content of `damping.json`, by name of model. A refused fit has no row.
-
-    Returns
-    -------
-    the table.
+    """Return laws under several models as one table: a row for each model, method and vine, columns
+    `LAW_COLUMNS`; SI.
     """
     import pandas as pd
 

@@ -15,51 +15,24 @@ from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
 from vinetrack.kinematics.windows import WindowFits, fit_all_windows
 from vinetrack.tracks.position_noise import track_noise
 
-WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)
-"""Widths of windows, in points. Chosen: each about 1.45 times the one before, so that the best width is missed by less
-than a factor of 1.2; with half as many widths by less than 1.45."""
+WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
 
-SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)
-"""Positions of the point in its window. Chosen: 0 in the middle, −1 at the beginning, 1 at the end, and halfway."""
+SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)  # Positions of the point in its window (chosen)
 
+# Largest misfit of a window that fits its points, by number of terms (derived)
 MISFIT_LIMITS = {0: np.inf, 1: 12.0, 2: 15.3, 3: 18.0, 4: 20.5}
-"""Largest misfit of a window that fits its points, by number of terms. Derived: χ² with a p-value of 5 in 10 000, and a
-tenth more."""
 
-KINK_GAIN = 2.5
-"""Factor on the misfit, taken as noise, for the error of the velocity where no window fits. Derived: a kink within five
-points causes an error of 0.7 to 3.5 times that."""
+KINK_GAIN = 2.5  # Factor on the misfit, taken as noise, for the error of the velocity where no window fits (derived)
 
-TRUSTED_GAIN = 0.5
-"""Least standard error of a one-sided window, relative to that of the centred ones. Chosen: curvature within its first
-points cannot be detected."""
+TRUSTED_GAIN = 0.5  # Least standard error of a one-sided window, relative to that of the centred ones (chosen)
 
 
+# Window, velocity and error for unit noise at every point, of centred windows of one width
 Centred = tuple[Indices, Floats, Floats]
-"""Window, velocity and error for unit noise at every point, of centred windows of one width."""
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
-    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track.
-
-    Parameters
-    ----------
-    track : at least two usable points, in order of time.
-    travel_ratio : ratio of tail speed to lead speed.
-    order : order of the polynomial.
-    kappa : standard errors by which two windows may differ and still agree.
-
-    Returns
-    -------
-    Kinematics
-        `lead_velocity_sigma_m_s` is the standard error of the velocity in the window used, from the correlated noise of
-        position; where no window fits the points, from their misfit.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two usable points, or times that do not increase.
-    """
+    """Estimate position, velocity and acceleration of the leading edge at the usable points of a track."""
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
     if time_s.size < 2:
@@ -85,23 +58,11 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
 def smooth(
     time_s: Floats, position_m: Floats, noise_m: float, rho: float, *, order: int = 3, kappa: float = 3.0
 ) -> tuple[Floats, Floats, Indices]:
-    """Estimate position, velocity and acceleration at every point for known noise.
-
-    A window is used only if the next wider one at the same position agrees too: the widest that agrees is about to
-    disagree, and its bias may be several times its error. Each step in width changes their ratio by 1.45^5.5 = 8.
-
-    Parameters
-    ----------
-    time_s, position_m : shape (n,), s and m, finite, in order of time.
-    noise_m : standard deviation of a position, m.
-    rho : correlation of the noise from frame to frame.
-    order : of the polynomial.
-    kappa : standard errors by which two windows may differ and still agree.
-
-    Returns
-    -------
-    position, velocity and acceleration, shape (3, n), SI; standard error of the velocity, shape (n,), m/s; points in
-        the window used, shape (n,).
+    """Estimate position, velocity and acceleration at every point for known noise. A window is used only if the next
+    wider one at the same position agrees too: the widest that agrees is about to disagree, and its bias may be several
+    times its error. Each step in width changes their ratio by 1.45^5.5 = 8. Returns position, velocity and
+    acceleration, shape (3, n), SI; standard error of the velocity, shape (n,), m/s; points in: the window used, shape
+    (n,). Shapes: time_s, position_m (n,).
     """
     n = time_s.size
     least = min(n, max(WINDOWS[0], order + 2))
@@ -142,7 +103,6 @@ def _agreement(
     centred: list[Centred], fits_points: list[Bools], noise_m: float, kappa: float
 ) -> tuple[Floats, Floats, Floats]:
     """Range of velocities on which the centred windows agree, from the narrowest up, and the least error; (n,) each.
-
     Unbounded where not even the narrowest window fits its points: then one-sided windows decide.
     """
     n = centred[0][0].size

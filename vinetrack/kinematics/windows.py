@@ -13,22 +13,15 @@ import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Indices
 
-EVEN_TOLERANCE = 0.01
-"""Spacings within this fraction of their median count as even. Chosen: printed times are rounded."""
+EVEN_TOLERANCE = 0.01  # Spacings within this fraction of their median count as even (chosen)
 
-MISFIT_TERMS = 4
-"""Orthogonal polynomials of the next higher orders that are tested in the residuals. Chosen: a kink or an unresolved
-oscillation shows in these."""
+MISFIT_TERMS = 4  # Orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
 
 
 @dataclass(frozen=True)
 class WindowFits:
     """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
-
-    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,). The covariance of the coefficients for noise of unit
-    standard deviation is `even_covariance` (order + 1, order + 1), and for windows of uneven spacing, marked in `odd`
-    (m,), `odd_covariance` (order + 1, order + 1, m). `misfit` (m,), m², is the sum of squares of the next
-    `misfit_terms` orthogonal polynomials, each divided by its variance for noise of unit variance.
+    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,).
     """
 
     width: int
@@ -42,17 +35,8 @@ class WindowFits:
     misfit_terms: int
 
     def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
-        """Evaluate the polynomials of given windows at given times.
-
-        Parameters
-        ----------
-        time_s : shape (k,), s.
-        window : number of the window for each time, shape (k,).
-
-        Returns
-        -------
-        position, velocity, acceleration, shape (3, k), SI; standard error of the velocity for noise of 1 m, shape (k,),
-            1/s.
+        """Evaluate the polynomials of given windows at given times. Returns position, velocity, acceleration, shape (3,
+        k), SI; standard error of the velocity for noise of 1 m, shape (k,),: 1/s. Shapes: time_s, window (k,).
         """
         half = self.half_s[window]
         u = (time_s - self.middle_s[window]) / half
@@ -66,17 +50,9 @@ class WindowFits:
         return values, np.sqrt(np.maximum(variance, 0.0)) / half
 
     def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
-        """Evaluate the velocity at every point, from the window in which the point has a given position.
-
-        Parameters
-        ----------
-        time_s : of all points, shape (n,), s.
-        side : position of the point in its window: −1 beginning, 0 middle, 1 end; near the ends of the track the
-            nearest possible.
-
-        Returns
-        -------
-        number of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,).
+        """Evaluate the velocity at every point, from the window in which the point has a given position. Returns number
+        of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,). Shapes: time_s
+        (n,).
         """
         n, m = time_s.size, self.coefficients.shape[1]
         offset = _window_offset(self.width, side)
@@ -101,18 +77,7 @@ def _window_offset(width: int, side: float) -> int:
 
 
 def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:
-    """Fit a polynomial to every window of `width` consecutive points.
-
-    Parameters
-    ----------
-    time_s, position_m : shape (n,), s and m, n ≥ width.
-    width, order : number of points in a window, and order of the polynomial, below `width`.
-    rho : lag-one correlation of the noise.
-
-    Returns
-    -------
-    the fits of n − width + 1 windows, in order.
-    """
+    """Fit a polynomial to every window of `width` consecutive points. Shapes: time_s, position_m (n,)."""
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
@@ -175,18 +140,8 @@ def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
 
 
 def correlated(weights: Floats, rho: float) -> Floats:
-    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis.
-
-    w·(R·w) is the variance of Σ w_i e_i for noise e of variance 1.
-
-    Parameters
-    ----------
-    weights : shape (…, n).
-    rho : lag-one correlation.
-
-    Returns
-    -------
-    R·w, shape (…, n).
+    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis. w·(R·w) is the
+    variance of Σ w_i e_i for noise e of variance 1. Shapes: weights (…, n) → (…, n).
     """
     from scipy.signal import lfilter
 

@@ -29,12 +29,7 @@ DEMO = Path(__file__).with_name("demo.yaml")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command described above.
-
-    Parameters
-    ----------
-    arguments : of the command line; `sys.argv` if None.
-    """
+    """Run the command described above."""
     parser = argparse.ArgumentParser(prog="python -m vinetrack.laboratory", description="Grow the trials of a sheet.")
     parser.add_argument("experiment", type=Path)
     parser.add_argument("--nature", type=Path)

@@ -1,8 +1,8 @@
 """Camera model of the laboratory: projection of the plane of growth to the picture, and its inverse.
 
-A pinhole with radial distortion looks at a plane that may be tilted. Pixel centres have whole-number coordinates,
-x to the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the origin of the plane at
-the centre of the picture: without tilt and distortion they are the pixels of the picture.
+A pinhole with radial distortion looks at a plane that may be tilted. Pixel centres have whole-number coordinates, x to
+the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the origin of the plane at the
+centre of the picture: without tilt and distortion they are the pixels of the picture.
 """
 
 from __future__ import annotations
@@ -15,18 +15,13 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 
-UNDISTORT_STEPS = 10
-"""Newton steps of the inverse of the distortion. Chosen: about six are exact to rounding for usual lenses; half might
-not suffice for a wide lens, twice only costs time."""
+UNDISTORT_STEPS = 10  # Newton steps of the inverse of the distortion (chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Size of the picture, scale, lens and pose.
-
-    `m_per_px` is the scale at the picture's centre before tilt; the camera stands `focal_px · m_per_px` away from the
-    plane of growth. `k1`, `k2` are radial distortion as OpenCV defines it; `tilt_x_deg`, `tilt_y_deg` turn the plane
-    about the picture's horizontal and vertical, x first.
+    """Size of the picture, scale, lens and pose. `m_per_px` is the scale at the picture's centre before tilt; the
+    camera stands `focal_px · m_per_px` away from the plane of growth.
     """
 
     width_px: int = 960
@@ -63,16 +58,7 @@ class Camera:
         return np.asarray(about_y @ about_x, dtype=float)
 
     def picture_from_plane(self, plane_px: Floats) -> Floats:
-        """Map points of the plane of growth to the picture.
-
-        Parameters
-        ----------
-        plane_px : plane pixels (x, y), shape (..., 2).
-
-        Returns
-        -------
-        picture pixels, shape (..., 2).
-        """
+        """Map points of the plane of growth to the picture. Shapes: plane_px (..., 2) → (..., 2)."""
         offset = np.asarray(plane_px, dtype=float) - self.centre_px
         spatial = offset @ self.rotation[:, :2].T + np.array([0.0, 0.0, self.focal_px])
         ray = spatial[..., :2] / spatial[..., 2:]
@@ -81,16 +67,7 @@ class Camera:
         return np.asarray(distorted * self.focal_px + self.centre_px)
 
     def plane_from_picture(self, picture_px: Floats) -> Floats:
-        """Map points of the picture to the plane of growth.
-
-        Parameters
-        ----------
-        picture_px : picture pixels (x, y), shape (..., 2).
-
-        Returns
-        -------
-        plane pixels, shape (..., 2).
-        """
+        """Map points of the picture to the plane of growth. Shapes: picture_px (..., 2) → (..., 2)."""
         distorted = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
         ray = np.concatenate([self._undistorted(distorted), np.ones((*distorted.shape[:-1], 1))], axis=-1)
         normal = self.rotation[:, 2]

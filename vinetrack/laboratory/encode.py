@@ -28,18 +28,7 @@ class Renderer(Protocol):
     exposure_s: float
 
     def frame(self, frame: int, *, low: float = ..., span: float | None = ...) -> Frame:
-        """Render the grey levels of one frame.
-
-        Parameters
-        ----------
-        frame : index of the frame.
-        low : black level.
-        span : levels from black to full scale; None for the full bit depth.
-
-        Returns
-        -------
-        shape (height, width).
-        """
+        """Render the grey levels of one frame. Shape (height, width)."""
         ...
 
 
@@ -48,32 +37,15 @@ STACK_ENDINGS = (".tif", ".tiff")
 PICTURE_FORMATS = ("png", "tiff", "jpg", "dng")
 CODECS = {"h264": "libx264", "ffv1": "ffv1", "mjpeg": "mjpeg", "raw": "rawvideo"}
 GREY_FORMATS = {8: "gray", 10: "gray10le", 12: "gray12le", 16: "gray16le"}
-LIMITED_RANGE, FULL_RANGE = 1, 2
-"""Codes of the H.264 stream for 16…235 and 0…255. Defined by FFmpeg (AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG)."""
-HEADER_FRACTION = 0.15
-"""Fraction of a file that is spared when bytes are damaged: it contains the index at the front. Chosen: 85 % of the
-file can then be damaged."""
-TINT = (12, -8)
-"""Offsets (U, V) of a colour recording from grey: a warm wall and bluish film under LED lamps. Chosen by eye;
-brightness, which is what trackers read, does not depend on it."""
+LIMITED_RANGE, FULL_RANGE = 1, 2  # Codes of the H.264 stream for 16…235 and 0…255 (defined)
+HEADER_FRACTION = 0.15  # Fraction of a file that is spared when bytes are damaged (chosen)
+TINT = (12, -8)  # Offsets (U, V) of a colour recording from grey: a warm wall and bluish film under LED lamps (chosen)
 
 
 def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> None:
-    """Write frames `order` of `renderer` to `path`, completely or not at all, then apply the scene's file faults.
-
-    A path without ending becomes a folder of numbered images, `frame_000000.png` and so on, in the format of
-    `encoding.codec` if that is png, tiff, jpg or dng.
-
-    Parameters
-    ----------
-    renderer : renders the frames.
-    order : frame of the renderer that each frame of the file shows, shape (n_frames,); −1 for garbage.
-    path : its ending sets the form.
-
-    Raises
-    ------
-    ValueError
-        If the codec cannot hold the scene's bit depth, or the ending is unknown.
+    """Write frames `order` of `renderer` to `path`, completely or not at all, then apply the scene's file faults. A
+    path without ending becomes a folder of numbered images, `frame_000000.png` and so on, in the format of
+    `encoding.codec` if that is png, tiff, jpg or dng. Shapes: order (n_frames,).
     """
     scene, suffix = renderer.scene, path.suffix.lower()
     path.parent.mkdir(parents=True, exist_ok=True)

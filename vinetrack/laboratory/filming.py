@@ -27,9 +27,7 @@ from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.laboratory.targets import Target, render_target
 from vinetrack.laboratory.tracks import VirtualTrial
 
-FINE_STEPS = 8
-"""Samples per frame of the true motion. Chosen: at 500 m/s² and 1000 frames per second even linear interpolation
-between them errs by only 1 µm (a·h²/8)."""
+FINE_STEPS = 8  # Samples per frame of the true motion (chosen)
 
 
 @dataclass(frozen=True)
@@ -43,16 +41,7 @@ class Filming:
 
 
 def make_filming(content: dict[str, Any]) -> Filming:
-    """Read how trials are filmed from a YAML mapping.
-
-    Parameters
-    ----------
-    content : `scene`, `exposure_fraction`, and the fields of `camera` and `target`; defaults where absent.
-
-    Returns
-    -------
-    scene, camera, exposure and target.
-    """
+    """Read how trials are filmed from a YAML mapping."""
     target = dict(content.get("target", {}))
     if "squares" in target:
         target["squares"] = tuple(target["squares"])
@@ -65,17 +54,7 @@ def make_filming(content: dict[str, Any]) -> Filming:
 
 
 def scene_of(stated: Trial, filming: Filming) -> Scene:
-    """Return the scene with a tube of the size that the sheet states for the trial.
-
-    Parameters
-    ----------
-    stated : the trial as the sheet states it.
-    filming : scene, camera and exposure.
-
-    Returns
-    -------
-    the scene.
-    """
+    """Return the scene with a tube of the size that the sheet states for the trial."""
     base = preset(filming.scene)
     subject = base.subject
     if isinstance(subject, Tube):
@@ -89,19 +68,7 @@ def scene_of(stated: Trial, filming: Filming) -> Scene:
 
 
 def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -> Truth:
-    """Film one simulated trial; its truth is returned and not written.
-
-    Parameters
-    ----------
-    trial : from `tracks.grow`.
-    filming : scene, camera and exposure.
-    out_path : the recording; its suffix determines the format.
-    seed : of noise and textures.
-
-    Returns
-    -------
-    the truth of every frame.
-    """
+    """Film one simulated trial; its truth is returned and not written."""
     capture_fps = trial.stated.capture_fps
     n_frames = int(trial.track.time_s.size)
     return render_recording(
@@ -121,14 +88,7 @@ def _motion(trial: VirtualTrial, duration_s: float, steps: int) -> tuple[Floats,
 
 
 def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
-    """Write a picture of the calibration target in the plane of growth as PNG.
-
-    Parameters
-    ----------
-    filming : scene, camera and target.
-    path : of the picture, PNG.
-    seed : of the noise.
-    """
+    """Write a picture of the calibration target in the plane of growth as PNG."""
     import cv2
 
     picture = render_target(filming.target, replace(preset(filming.scene), camera=filming.camera), seed=seed)
@@ -142,25 +102,7 @@ TARGET = "calibration/board.png"
 
 
 def recording_experiment(experiment: Experiment, trials: Sequence[str], filming: Filming, folder: Path) -> Experiment:
-    """Write sheet and settings of an experiment of recordings of these trials; nothing is filmed yet.
-
-    Parameters
-    ----------
-    experiment : one whose trials are tracks.
-    trials : names of those to film.
-    filming : camera and target, for the settings.
-    folder : where the new experiment goes; its recordings will lie in `videos/`.
-
-    Returns
-    -------
-    the new experiment, read back.
-
-    Raises
-    ------
-    ValueError
-        If the experiment already has recordings or a calibration, the target is not a ChArUco board, or `folder` is the
-        experiment itself.
-    """
+    """Write sheet and settings of an experiment of recordings of these trials; nothing is filmed yet."""
     if experiment.settings.calibration is not None or any(trial.video for trial in experiment.trials):
         raise ValueError(f"{experiment.folder} is an experiment of recordings already")
     if folder.exists() and folder.samefile(experiment.folder):

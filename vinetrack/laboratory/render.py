@@ -6,9 +6,6 @@ constant speed, the half-way point of the blurred step is therefore the tip at m
 `lead_position_m` is the tip's travel in the plane of growth, `lead_px` its distance from the start of the path in plane
 pixels, and `tip_x_px`, `tip_y_px` its position in the picture as recorded, including shake, tilt and distortion. For a
 body that moves as a whole, the same holds for its foremost point.
-
-Everted film stays in place; the tail inside moves at twice the tip's speed and is blurred accordingly; the texture of a
-body moves with it.
 """
 
 from __future__ import annotations
@@ -29,17 +26,14 @@ from vinetrack.laboratory.targets import lay_target, plane_seen
 
 Image = NDArray[np.float32]
 
-TONE_STEPS = 4096
-"""Entries of the lookup table of a sensor's gamma. Derived: 4096/256 = 16 entries per 8-bit level."""
+TONE_STEPS = 4096  # Entries of the lookup table of a sensor's gamma (derived)
 
 
 @dataclass(frozen=True)
 class Truth:
     """True positions in a recording. Arrays have shape (n_frames,), one entry per frame of the file, in order.
-
     `source_frame` is the frame of the undisturbed recording that is shown, `time_s` its mid-exposure; `in_frame` tells
-    whether the tip is inside the picture. Frames that show nothing have −1 and NaN. The module docstring defines the
-    positions.
+    whether the tip is inside the picture. Frames that show nothing have −1 and NaN.
     """
 
     source_frame: NDArray[np.int_]
@@ -55,12 +49,7 @@ class Truth:
     exposure_s: float
 
     def write_csv(self, path: Path) -> None:
-        """Write one row per frame.
-
-        Parameters
-        ----------
-        path : path of the table; its folder is created if missing.
-        """
+        """Write one row per frame."""
         names = ("source_frame", "time_s", "lead_position_m", "lead_px", "tip_x_px", "tip_y_px", "in_frame")
         table = np.column_stack([np.asarray(getattr(self, name), dtype=float) for name in names])
         formats = ["%d", "%.9f", "%.9f", "%.6f", "%.6f", "%.6f", "%d"]
@@ -71,17 +60,7 @@ class Truth:
 
 
 class FrameRenderer:
-    """Renders any frame of a recording, in any order; the same frame always comes out the same.
-
-    Parameters
-    ----------
-    scene, motion
-        What is filmed; how the tip (or the body) moves.
-    n_frames, capture_fps, exposure_s
-        Frame i is exposed from i/capture_fps on for `exposure_s` (None: the scene's share of the frame time).
-    seed
-        Of everything random: surfaces, shake, noise.
-    """
+    """Renders any frame of a recording, in any order; the same frame always comes out the same."""
 
     def __init__(
         self,
@@ -155,16 +134,7 @@ class FrameRenderer:
         self._tone = (np.linspace(0, 1, steps + 1) ** (1 / sensor.gamma)).astype(np.float32)
 
     def radiance(self, frame: int) -> Image:
-        """Return the radiance at the sensor, before lamps, gain and noise.
-
-        Parameters
-        ----------
-        frame : index of the frame.
-
-        Returns
-        -------
-        fraction of full scale, shape (height, width).
-        """
+        """Return the radiance at the sensor, before lamps, gain and noise. Shape (height, width)."""
         shake = self.scene_motion.shake_px(float(self.scene_motion.mid_exposure_s(frame)))
         light = self._still.copy()
         if shake != (0.0, 0.0):
@@ -180,34 +150,14 @@ class FrameRenderer:
         return self._still.copy()
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
-        """Render the grey levels of one frame.
-
-        Parameters
-        ----------
-        frame : index of the frame.
-        low : black level.
-        span : levels from black to full scale; None for the full bit depth.
-
-        Returns
-        -------
-        shape (height, width).
-        """
+        """Render the grey levels of one frame. Shape (height, width)."""
         return self.expose(self.radiance(frame), frame, low=low, span=span)
 
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None
     ) -> NDArray[np.uint8 | np.uint16]:
-        """Convert radiance to grey levels with the lamps, gain and noise of one frame.
-
-        Parameters
-        ----------
-        light : radiance, fraction of full scale, shape (height, width).
-        frame : index of the frame.
-        low, span : as in `frame`.
-
-        Returns
-        -------
-        shape (height, width).
+        """Convert radiance to grey levels with the lamps, gain and noise of one frame. Shapes: light (height, width) →
+        (height, width).
         """
         sensor = self.scene.sensor
         out = np.empty(light.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
@@ -220,16 +170,7 @@ class FrameRenderer:
         return out
 
     def truth(self, source_frame: NDArray[np.int_]) -> Truth:
-        """Return the true positions in given frames.
-
-        Parameters
-        ----------
-        source_frame : frame of the renderer for each frame of the file, shape (n,); −1 for none.
-
-        Returns
-        -------
-        the truth, one entry per frame; NaN where nothing is shown.
-        """
+        """Return the true positions in given frames. Shapes: source_frame (n,)."""
         shown = source_frame >= 0
         blank = np.where(shown, 0.0, np.nan)
         time_s = self.scene_motion.mid_exposure_s(np.maximum(source_frame, 0))
@@ -253,16 +194,8 @@ class FrameRenderer:
 
 
 def frame_order(scene: Scene, n_frames: int) -> NDArray[np.int_]:
-    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a corrupt frame.
-
-    Parameters
-    ----------
-    scene : its `faults` drop, repeat and corrupt frames.
-    n_frames : number of frames of the undisturbed recording.
-
-    Returns
-    -------
-    frame indices, shape (n_frames of the file,).
+    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a corrupt frame. Shape
+    (n_frames of the file,).
     """
     faults = scene.faults
     order: list[int] = []
@@ -287,31 +220,9 @@ def render_recording(
     seed: int = 0,
     truth_path: Path | None = None,
 ) -> Truth:
-    """Film `motion` in `scene` and write the recording to `out_path`.
-
-    The ending sets the form: .mp4, .mov, .mkv, .avi a film with the scene's codec; .tif, .tiff one stack; no ending a
-    folder of numbered images (see `encode.write_recording`). `truth_path`, a CSV, should lie outside the folder that
-    the analysis of the experiment is given.
-
-    Parameters
-    ----------
-    scene : the scene in front of the camera.
-    motion : position of the leading edge, m: a function of time, s, or samples (time, position).
-    n_frames : number of frames of the undisturbed recording.
-    capture_fps : capture rate, frames per second.
-    out_path : path of the recording.
-    exposure_s : exposure time, s; None for the scene's fraction of the frame period.
-    seed : seed of noise and textures.
-    truth_path : path of a CSV of the truth; None to write none.
-
-    Returns
-    -------
-    the truth, one entry per frame of the file.
-
-    Raises
-    ------
-    ValueError
-        If the exposure is longer than the frame period, or the scene cannot be written in that form.
+    """Film `motion` in `scene` and write the recording to `out_path`. The ending sets the form: .mp4, .mov, .mkv, .avi
+    a film with the scene's codec; .tif, .tiff one stack; no ending a folder of numbered images (see
+    `encode.write_recording`).
     """
     from vinetrack.laboratory.encode import write_recording
 

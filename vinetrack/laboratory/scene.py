@@ -15,15 +15,8 @@ from vinetrack.laboratory.targets import Target
 
 @dataclass(frozen=True, kw_only=True)
 class Tube:
-    """An everting tube, seen from the side.
-
-    `opacity` is that of the everted wall, both layers, at the middle of the tube; `brightness` that of opaque film.
-    `texture` and `tail_texture` are the relative contrasts (standard deviations) of wrinkles on the everted wall and on
-    the tail. `tail_width` is the width of the tail as a fraction of the diameter; `tip_roundness` the corner radius of
-    the tip over the radius of the tube (1: a hemisphere, 0.5: the torus of a folded film, always flat around the axis).
-    `tip_glow` is extra brightness of the fold; `reflection` the strength of the tube's mirror image in a panel behind
-    it; `wobble_px` the sideways sway of the tip after `length_m` of growth. The payload rides on the end of the tail
-    (diameter 0: none) and flies on at the speed of the tail once that end comes out.
+    """An everting tube, seen from the side. `opacity` is that of the everted wall, both layers, at the middle of the
+    tube; `brightness` that of opaque film.
     """
 
     diameter_m: float = 0.024
@@ -56,9 +49,8 @@ class Ball:
 
 @dataclass(frozen=True, kw_only=True)
 class Door:
-    """The latched door in front of the tip.
-
-    It starts to swing `lead_s` before the tip moves and is open after `swing_s`.
+    """The latched door in front of the tip. It starts to swing `lead_s` before the tip moves and is open after
+    `swing_s`.
     """
 
     brightness: float = 0.55
@@ -105,10 +97,9 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Encoding:
-    """How the file is written; the ending of the path sets the container or image format.
-
-    `codec`: h264, ffv1, mjpeg or raw. With `bitrate_Mbit_s` the bit rate is held near that value at `container_fps`, as
-    in cameras; without it `crf` applies. `limited_range` maps full scale to 16…235, as is usual for video.
+    """How the file is written; the ending of the path sets the container or image format. `codec`: h264, ffv1, mjpeg or
+    raw. With `bitrate_Mbit_s` the bit rate is held near that value at `container_fps`, as in cameras; without it `crf`
+    applies. `limited_range` maps full scale to 16…235, as is usual for video.
     """
 
     codec: str = "h264"
@@ -122,12 +113,7 @@ class Encoding:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Faults of a recording.
-
-    `dropped`: frames that the camera missed; `repeated`: frames written twice in a row; `wrong_second_frame`: the
-    second frame shows another moment; `corrupt_first_frame`: the first frame is garbage; `keep_fraction`: fraction of
-    the file left after truncation; `damaged_fraction`: fraction of the bytes behind the header that are overwritten.
-    """
+    """Faults of a recording."""
 
     dropped: tuple[int, ...] = ()
     repeated: tuple[int, ...] = ()
@@ -139,13 +125,8 @@ class Faults:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Everything that defines a recording except the motion and the frame rate.
-
-    `growth_angle_deg` is the direction of growth in the picture, from +x (right) towards +y (down). The path starts at
-    `origin_px` (plane pixels; if None, near the border, such that the path runs through the middle of the picture), and
-    the tip rests `start_m` further on. `psf_px` is the standard deviation of the blur by optics and pixel together;
-    `shake_px` that of the camera's motion; `exposure_fraction` is exposure time over frame period. A `target` hangs
-    behind the tube, in the plane of growth.
+    """Everything that defines a recording except the motion and the frame rate. `growth_angle_deg` is the direction of
+    growth in the picture, from +x (right) towards +y (down).
     """
 
     camera: Camera = field(default_factory=Camera)
@@ -256,26 +237,11 @@ def _presets() -> dict[str, Scene]:
     }
 
 
-PRESETS = tuple(_presets())
-"""Names of the presets."""
+PRESETS = tuple(_presets())  # Names of the presets
 
 
 def preset(name: str) -> Scene:
-    """Return a scene by name (see `PRESETS`).
-
-    Parameters
-    ----------
-    name : one of `PRESETS`.
-
-    Returns
-    -------
-    the scene.
-
-    Raises
-    ------
-    ValueError
-        If there is no such preset.
-    """
+    """Return a scene by name (see `PRESETS`)."""
     scenes = _presets()
     if name not in scenes:
         raise ValueError(f"No scene is called {name!r}; choose one of {', '.join(scenes)}.")

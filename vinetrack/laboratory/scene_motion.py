@@ -14,31 +14,18 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.laboratory.scene import Scene, Tube
 
-Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]
-"""Lead position in metres against time in seconds: a function of an array, or samples (time_s, lead_position_m)."""
+Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]  # Lead position in metres against time in seconds
 
-FASTEST_PAYLOAD_M_S = 150.0
-"""Largest speed of a payload that leaves the vine. Chosen above any vine, so that the picture stays finite where a
-motion jumps."""
+FASTEST_PAYLOAD_M_S = 150.0  # Largest speed of a payload that leaves the vine (chosen)
 
-RELEASE_TRAVEL_M = 1e-5
-"""Travel from which a vine counts as released. Chosen: a thirtieth of a pixel."""
+RELEASE_TRAVEL_M = 1e-5  # Travel from which a vine counts as released (chosen)
 
-EVENT_STEPS = 10
-"""Steps per frame of the search for the release and the exit of the tail. Chosen: doors and payloads then start within
-a tenth of a frame."""
+EVENT_STEPS = 10  # Steps per frame of the search for the release and the exit of the tail (chosen)
 
 
 def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
-    """Return a motion as a function; samples are interpolated by monotone cubics (PCHIP) and constant outside.
-
-    Parameters
-    ----------
-    motion : a function, or samples (time, s; position, m), shape (n,) each.
-
-    Returns
-    -------
-    function from times, s, to positions, m.
+    """Return a motion as a function; samples are interpolated by monotone cubics (PCHIP) and constant outside. Returns
+    function from times, s, to positions, m. Shapes: motion (n,).
     """
     if callable(motion):
         return motion
@@ -54,13 +41,7 @@ def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
 
 
 class SceneMotion:
-    """Positions of everything that moves in a scene whose tip, or body, follows a given motion.
-
-    Attributes
-    ----------
-    release_s
-        When the tip has moved by 10 µm; infinite where it never does.
-    """
+    """Positions of everything that moves in a scene whose tip, or body, follows a given motion."""
 
     def __init__(
         self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
@@ -91,43 +72,16 @@ class SceneMotion:
         return float(grid_s[k]), min(2 * lead_speed_m_s, FASTEST_PAYLOAD_M_S) / self.scene.camera.m_per_px
 
     def mid_exposure_s(self, frame: int | NDArray[np.int_]) -> Floats:
-        """Return the middle of the exposure of frames.
-
-        Parameters
-        ----------
-        frame : numbers of frames, any shape.
-
-        Returns
-        -------
-        s, of that shape.
-        """
+        """Return the middle of the exposure of frames."""
         return np.asarray(np.asarray(frame) / self.capture_fps + self.exposure_s / 2)
 
     def lead_px(self, time_s: Floats | float) -> Floats:
-        """Return the distance of the foremost point from the path's start.
-
-        Parameters
-        ----------
-        time_s : any shape, s.
-
-        Returns
-        -------
-        plane pixels, of that shape.
-        """
+        """Return the distance of the foremost point from the path's start."""
         lead_m = np.asarray(self._position_m(np.asarray(time_s, dtype=float)), dtype=float)
         return np.asarray((self.scene.start_m + lead_m) / self.scene.camera.m_per_px)
 
     def tail_end_px(self, time_s: Floats | float) -> Floats:
-        """Return the position of the tail's end and payload: 2y − L, and at constant speed after the exit.
-
-        Parameters
-        ----------
-        time_s : any shape, s.
-
-        Returns
-        -------
-        plane pixels along the path, of that shape.
-        """
+        """Return the position of the tail's end and payload: 2y − L, and at constant speed after the exit."""
         assert isinstance(self.scene.subject, Tube)
         scale = self.scene.camera.m_per_px
         end = (self.scene.subject.length_m + self.scene.start_m) / scale
@@ -144,16 +98,7 @@ class SceneMotion:
         return subject.length_m / self.scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
 
     def sway_px(self, time_s: float) -> float:
-        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release.
-
-        Parameters
-        ----------
-        time_s : s.
-
-        Returns
-        -------
-        plane pixels.
-        """
+        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release."""
         subject = self.scene.subject
         if not isinstance(subject, Tube) or not subject.wobble_px:
             return 0.0
@@ -162,14 +107,7 @@ class SceneMotion:
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
         """Return the displacement of the picture (x, y): six sinusoids of joint rms 1, and a damped kick at release.
-
-        Parameters
-        ----------
-        time_s : s.
-
-        Returns
-        -------
-        plane pixels along x and y.
+        Returns plane pixels along x and y.
         """
         if not self.scene.shake_px:
             return 0.0, 0.0
@@ -180,31 +118,13 @@ class SceneMotion:
         return float(self.scene.shake_px * sway[0]), float(self.scene.shake_px * sway[1])
 
     def lamp(self, frame: int) -> float:
-        """Return the brightness of the lamps averaged over the exposure T: the sine at its middle times sinc(fT).
-
-        Parameters
-        ----------
-        frame : its number.
-
-        Returns
-        -------
-        relative to the mean.
-        """
+        """Return the brightness of the lamps averaged over the exposure T: the sine at its middle times sinc(fT)."""
         light = self.scene.light
         phase = 2 * math.pi * light.flicker_Hz * float(self.mid_exposure_s(frame)) + self._lamp_phase
         return 1 + light.flicker * float(np.sinc(light.flicker_Hz * self.exposure_s)) * math.sin(phase)
 
     def door_angle_rad(self, time_s: float) -> float:
-        """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop.
-
-        Parameters
-        ----------
-        time_s : s.
-
-        Returns
-        -------
-        rad.
-        """
+        """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop."""
         door = self.scene.door
         if door is None or not math.isfinite(self.release_s):
             return 0.0
@@ -217,16 +137,7 @@ class SceneMotion:
         return math.radians(door.open_deg - 12 * math.exp(-after / 1.5) * abs(math.sin(2.2 * after)))
 
     def tip_plane_px(self, time_s: Floats) -> Floats:
-        """Return the tip of the tube or body in plane pixels, with sway and shake.
-
-        Parameters
-        ----------
-        time_s : shape (n,), s.
-
-        Returns
-        -------
-        plane pixels (x, y), shape (n, 2).
-        """
+        """Return the tip of the tube or body in plane pixels, with sway and shake. Shapes: time_s (n,) → (n, 2)."""
         along = self.lead_px(time_s)
         across = np.array([self.sway_px(float(t)) for t in time_s]) * np.clip(along / self.sway_length_px, 0, 1.5) ** 2
         shake = np.array([self.shake_px(float(t)) for t in time_s]).reshape(-1, 2)

@@ -15,23 +15,16 @@ from vinetrack.laboratory.scene_motion import SceneMotion
 
 Image = NDArray[np.float32]
 
-EXPOSURE_PIECES = 4
-"""Straight pieces that approximate the path of the tip over an exposure. Derived: at 3000 m/s² over 0.5 ms each errs by
-a·(T/4)²/8 = 6 µm at most, a sixtieth of a pixel of 0.36 mm."""
-TABLE_STEP_PX = 1 / 16
-"""Steps of the table of covers along the path. Chosen: linear interpolation of an edge blurred by 0.8 px then errs by
-2e-4."""
+EXPOSURE_PIECES = 4  # Straight pieces that approximate the path of the tip over an exposure (derived)
+TABLE_STEP_PX = 1 / 16  # Steps of the table of covers along the path (chosen)
 
-PROFILE_PER_PX = 16
-"""Entries per pixel of the profiles across. Chosen as TABLE_STEP_PX."""
+PROFILE_PER_PX = 16  # Entries per pixel of the profiles across (chosen)
 
+# How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)
 SLOPES = np.linspace(1.0, 4.0, 7)
-"""How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)."""
-TAIL_PERIOD_PX = 4096
-"""Period of the texture of the tail. Chosen: longer than any picture, so that the period does not show."""
+TAIL_PERIOD_PX = 4096  # Period of the texture of the tail (chosen)
 
-BALL_STEP_PX = 0.7
-"""Distance of the centres over which a moving ball is averaged. Chosen: less than a pixel."""
+BALL_STEP_PX = 0.7  # Distance of the centres over which a moving ball is averaged (chosen)
 
 
 class PathMaps:
@@ -45,15 +38,8 @@ class PathMaps:
         self.across: Image = (dy * ux - dx * uy).astype(np.float32)
 
     def rows_within(self, touched: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and one-past-last column of each row that `touched` marks; equal where it marks none.
-
-        Parameters
-        ----------
-        touched : pixels, shape (height, width).
-
-        Returns
-        -------
-        two arrays, shape (height,).
+        """First and one-past-last column of each row that `touched` marks; equal where it marks none. Returns two
+        arrays, shape (height,). Shapes: touched (height, width).
         """
         any_in_row = touched.any(axis=1)
         last = touched.shape[1] - touched[:, ::-1].argmax(axis=1)
@@ -91,14 +77,7 @@ class TubeLayer:
             self._payload = BallLayer(scene_motion, maps, rng, metal, scene_motion.tail_end_px, emerges_at_px=0.0)
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the tube as exposed in one frame over a picture, in place.
-
-        Parameters
-        ----------
-        light : fraction of full scale, shape (height, width).
-        frame : its number.
-        shift : shake along and across the path, px.
-        """
+        """Lay the tube as exposed in one frame over a picture, in place. Shapes: light (height, width)."""
         if self._payload is not None:
             self._payload.lay(light, frame, shift)
         scene_motion, tube = self._motion, self._tube
@@ -135,20 +114,7 @@ class TubeLayer:
 
 
 def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
-    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core.
-
-    The tip is flat for |v| < R − ρ and a quarter circle of radius ρ (`tip_roundness` of R) beyond: there its outline
-    lies `setback` = ρ − √(ρ² − (|v| − R + ρ)²) behind the foremost point, at a slant 1/cos = ρ/√(…), which picks the
-    row of the edge table. `side` is the coverage of the tube's blurred sides, `core` that of the tail.
-
-    Parameters
-    ----------
-    tube : what is drawn.
-    radius_px : of the tube.
-    psf_px : standard deviation of the optical blur.
-
-    Returns
-    -------
+    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core. Returns
     setback, slope row, side, core, each of shape (n_entries,).
     """
     from scipy.special import ndtr
@@ -183,13 +149,8 @@ class BallLayer:
         self._surface = textures.ball_surface(ball, rng, max(self._radius_px, 2.0))
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the ball over a picture, in place, averaged over centres at most BALL_STEP_PX apart.
-
-        Parameters
-        ----------
-        light : fraction of full scale, shape (height, width).
-        frame : its number.
-        shift : shake along and across the path, px.
+        """Lay the ball over a picture, in place, averaged over centres at most BALL_STEP_PX apart. Shapes: light
+        (height, width).
         """
         scene_motion = self._motion
         begin_s, span_s = frame / scene_motion.capture_fps, scene_motion.exposure_s
@@ -227,13 +188,8 @@ class DoorLayer:
         self._hinge = np.array([float(scene_motion.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
 
     def lay(self, light: Image, frame: int, shake: tuple[float, float]) -> None:
-        """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure.
-
-        Parameters
-        ----------
-        light : fraction of full scale, shape (height, width).
-        frame : its number.
-        shake : displacement of the picture along x and y, px.
+        """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure. Shapes:
+        light (height, width).
         """
         times_s = frame / self._motion.capture_fps + self._motion.exposure_s * np.array([0.1, 0.5, 0.9])
         angles = [self._motion.door_angle_rad(float(t)) for t in times_s]

@@ -13,11 +13,8 @@ from vinetrack.core.records import Floats
 Image = NDArray[np.float32]
 Whole = NDArray[np.int64]
 
-NORMAL_BITS = 12
-"""Bits of a random number per normal deviate: 4096 quantiles, whose steps are below one grey level. Chosen; each
-further bit doubles the table."""
-TAIL_TAPER_PX = 30.0
-"""Length over which the end of the tail, a crumpled bunch of film, fades out. Chosen by eye."""
+NORMAL_BITS = 12  # Bits of a random number per normal deviate (chosen)
+TAIL_TAPER_PX = 30.0  # Length over which the end of the tail, a crumpled bunch of film, fades out (chosen)
 
 
 @njit(cache=True)
@@ -32,23 +29,9 @@ def _ramp(z: float) -> float:
 
 @njit(cache=True)
 def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px: float, n: int) -> Image:
-    """Return the fraction of the exposure during which a blurred edge covers a point, shape (len(sigmas_px), n).
-
-    Column i is the point `first_px + i·step_px` ahead of the edge's reference position. `path_px` are positions of the
-    edge relative to that reference at equal time steps. The edge moves uniformly between them, so that each piece is
-    integrated exactly: the mean of Φ((p − e)/σ) over p from a to b is σ [ramp((b−e)/σ) − ramp((a−e)/σ)] / (b − a).
-
-    Parameters
-    ----------
-    path_px : positions of the edge at equal time steps, shape (n_pieces + 1,).
-    sigmas_px : standard deviation of the blur, one per row.
-    first_px : position of column 0.
-    step_px : spacing of the columns.
-    n : number of columns.
-
-    Returns
-    -------
-    shape (n_sigmas, n).
+    """Return the fraction of the exposure during which a blurred edge covers a point, shape (len(sigmas_px), n). Column
+    i is the point `first_px + i·step_px` ahead of the edge's reference position. `path_px` are positions of the edge
+    relative to that reference at equal time steps. Shapes: path_px (n_pieces + 1,) → (n_sigmas, n).
     """
     table = np.empty((sigmas_px.size, n), dtype=np.float32)
     pieces = path_px.size - 1
@@ -74,13 +57,7 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
 @njit(cache=True, fastmath=True, nogil=True)
 def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
     """Sample the backdrop, displaced by (shift_x, shift_y) px, at every pixel of the camera; bilinear, into `out`.
-
-    Parameters
-    ----------
-    canvas : the backdrop, shape (canvas_height, canvas_width).
-    map_x, map_y : position on the canvas that each pixel sees without shake, shape (height, width), px.
-    shift_x, shift_y : shake of the picture, px.
-    out : output, shape (height, width).
+    Shapes: canvas (canvas_height, canvas_width); map_x, map_y, out (height, width).
     """
     rows, columns = canvas.shape
     for y in range(out.shape[0]):
@@ -102,30 +79,9 @@ def shade_tube(
     girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
     tail_level: float, tail_contrast: float, fold_glow: float, ghost: float, ghost_across: float,
 ) -> None:  # fmt: skip
-    """Draw the tube over `out`, in place.
-
-    For each pixel: the mirror image is added, the tail is laid over the backdrop, then the film over both, in
-    proportion to the coverage by the moving edge. The texture of the tail is averaged over its motion during the
-    exposure.
-
-    Parameters
-    ----------
-    out : radiance so far, fraction of full scale, shape (height, width).
-    along, across : coordinates of each pixel without shake, shape (height, width), px.
-    first_x, last_x : columns of each row that the tube can touch, shape (height,).
-    shift_along, shift_across : shake, px.
-    tip_px : reference position of the tip in `table`.
-    sway, sway_length : sideways displacement, and the position along the path at which it applies, px.
-    table, table_first, table_step, fold_row : coverage of the edge, see `coverage_table`, and its row for the glow of
-        the fold.
-    setback, slope_row, side, core, per_px : profiles over the distance from the axis, see `scene_objects.tip_profiles`,
-        and their entries per pixel.
-    transmission, glow, girth, tail : textures, see `textures`.
-    tail_from, tail_to : displacement of the tail's texture at either end of the exposure, px.
-    tail_end : position of the end of the tail along the path, px.
-    tail_opacity, tail_level, tail_contrast : opacity, brightness and contrast of the tail.
-    fold_glow, ghost, ghost_across : brightness of the fold and of the mirror image, and the position of the latter
-        across, px.
+    """Draw the tube over `out`, in place. For each pixel: the mirror image is added, the tail is laid over the
+    backdrop, then the film over both, in proportion to the coverage by the moving edge. Shapes: out, along, across
+    (height, width); first_x, last_x (height,).
     """
     half_profile = (setback.size - 1) // 2
     reach = (half_profile - 1) / per_px
@@ -195,18 +151,8 @@ def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
     radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
 ) -> None:  # fmt: skip
-    """Draw a ball over `out` within `box`, averaged over its positions `path_px` during the exposure.
-
-    Parameters
-    ----------
-    out : radiance so far, fraction of full scale, shape (height, width).
-    along, across : coordinates of each pixel without shake, shape (height, width), px.
-    shift_along, shift_across : shake, px.
-    path_px : positions of the centre along the path, shape (n_pieces,).
-    radius_px, sigma_px : radius of the ball, and standard deviation of the optical blur.
-    surface : from `textures.ball_surface`.
-    box : x0, y0, x1, y1: pixels that the ball can touch.
-    min_along : position along the path before which the ball is hidden, px.
+    """Draw a ball over `out` within `box`, averaged over its positions `path_px` during the exposure. Shapes: out,
+    along, across (height, width); path_px (n_pieces,).
     """
     half = (surface.shape[0] - 1) // 2
     for y in range(box[1], box[3]):
@@ -246,23 +192,9 @@ def expose(
     light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
     normals: Image, tone: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
 ) -> None:  # fmt: skip
-    """Convert radiance to grey levels with shot and read noise, into `out`.
-
-    Level = low + span · tone(signal); the noise of a signal s has standard deviation √(s·well + read²)/well. Normal
-    deviates are looked up in `normals` (2^NORMAL_BITS quantiles), four per step of a 64-bit xorshift generator seeded
-    by (seed, frame, row). A `full_well_e` of 0 means no noise.
-
-    Parameters
-    ----------
-    light : radiance, fraction of full scale, shape (height, width).
-    gain : gain of each pixel, shape (height, width).
-    lamp : brightness of the lamps in this frame.
-    full_well_e, read_noise_e : full-well capacity and read noise of the sensor, electrons.
-    seed, frame : seed of the noise and index of the frame.
-    normals : quantiles of the normal distribution, shape (2^NORMAL_BITS,).
-    tone : lookup table of the sensor's gamma; fewer than three entries for a linear sensor.
-    low, span : black level, and number of levels from black to full scale.
-    out : output, shape (height, width).
+    """Convert radiance to grey levels with shot and read noise, into `out`. Level = low + span · tone(signal); the
+    noise of a signal s has standard deviation √(s·well + read²)/well. Shapes: light, gain, out (height, width); normals
+    (2^NORMAL_BITS,).
     """
     rows, columns = out.shape
     mask = np.uint64((1 << NORMAL_BITS) - 1)

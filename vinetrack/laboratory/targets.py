@@ -1,4 +1,5 @@
-"""Exactly projected pictures and clips of a calibration target, ChArUco board or checkerboard, in the plane of growth.
+"""Exactly projected pictures and clips of a calibration target, ChArUco board or checkerboard, in the plane
+of growth.
 
 Every picture pixel is sampled at POINTS points, each traced through lens and tilt to the plane, where it is black or
 white. Corners are therefore exactly where geometry puts them, and no picture is interpolated.
@@ -23,22 +24,13 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.float32]
 
-POINTS, LATTICE = 89, 55
-"""Points in a pixel, on a Fibonacci lattice: no two share a column or a row, so that edges along either, too, are met
-to 1/89 px; a square grid of as many would round them to 1/9. Derived from neighbours in the Fibonacci sequence."""
-PATTERN_PX = 120
-"""Side of a square in the stored pattern of a ChArUco board; squares are met exactly, marker bits to 1/240 square.
-Chosen: well below what a pixel shows; twice takes four times the memory."""
+POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
+PATTERN_PX = 120  # Side of a square in the stored pattern of a ChArUco board (chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A board in the plane of growth.
-
-    `kind` is charuco or checkerboard; `squares` their number across and down; the board's middle lies at `centre_m`
-    (x, y) from where the optical axis meets the plane, turned by `angle_deg` (from +x towards +y); `margin` is its
-    white border in squares; `black` and `white` are radiances.
-    """
+    """A board in the plane of growth."""
 
     kind: str = "charuco"
     squares: tuple[int, int] = (12, 5)
@@ -58,16 +50,7 @@ class Target:
         return np.asarray(board * self.square_m @ self._turn().T + np.array(self.centre_m))
 
     def board_squares(self, plane_m: Floats) -> Floats:
-        """Express points of the plane in squares of the board.
-
-        Parameters
-        ----------
-        plane_m : shape (..., 2), m.
-
-        Returns
-        -------
-        squares from the board's top left, shape (..., 2).
-        """
+        """Express points of the plane in squares of the board. Shapes: plane_m (..., 2) → (..., 2)."""
         along_board = (plane_m - np.array(self.centre_m)) @ self._turn()
         return np.asarray(along_board / self.square_m + np.array(self.squares) / 2)
 
@@ -93,10 +76,9 @@ def _paint_board(
     board: Floats, step_x: Floats, step_y: Floats, pattern: NDArray[np.uint8], per_square: int, margin: float,
     black: float, white: float, light: Image, share: Image,
 ) -> None:  # fmt: skip
-    """Radiance of the board times its share of each pixel, and that share, into `light` and `share`.
-
-    `board` are squares counted at each pixel's middle, shape (height, width, 2); `step_x`, `step_y` their change over
-    a pixel, which is even enough within one: lens and tilt bend it by 10⁻⁵ px at most.
+    """Radiance of the board times its share of each pixel, and that share, into `light` and `share`. `board` are
+    squares counted at each pixel's middle, shape (height, width, 2); `step_x`, `step_y` their change over a pixel,
+    which is even enough within one: lens and tilt bend it by 10⁻⁵ px at most.
     """
     rows, columns = pattern.shape
     across, down = columns / per_square, rows / per_square
@@ -122,32 +104,15 @@ def _paint_board(
 
 def plane_seen(camera: Camera) -> Floats:
     """Return the point of the plane at the centre of each pixel, relative to the optical axis; (height, width, 2), m.
-
-    Parameters
-    ----------
-    camera : that looks at the plane.
-
-    Returns
-    -------
-    shape (height, width, 2), m.
+    Shape (height, width, 2).
     """
     grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
     return np.asarray((camera.plane_from_picture(grid) - np.array(camera.centre_px)) * camera.m_per_px)
 
 
 def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> Image:
-    """Lay a target over a picture where pixels see it, blurred by the optics.
-
-    Parameters
-    ----------
-    light : fraction of full scale, shape (height, width).
-    target : what is printed, and where it lies.
-    plane_m : from `plane_seen`, shape (height, width, 2).
-    psf_px : standard deviation of the optical blur.
-
-    Returns
-    -------
-    a new picture, shape (height, width).
+    """Lay a target over a picture where pixels see it, blurred by the optics. Shapes: light (height, width); plane_m
+    (height, width, 2) → (height, width).
     """
     import cv2
 
@@ -163,10 +128,9 @@ def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> 
 
 
 class TargetRenderer:
-    """Frames of a target that is still, or changes from frame to frame as `moves` specifies.
-
-    Stands in for `render.FrameRenderer` where a file is written. `moves` lists, for each frame, what changes:
-    fields of `Target` such as `{"centre_m": (0.01, 0)}` or of `Camera` such as `{"tilt_x_deg": 10}`.
+    """Frames of a target that is still, or changes from frame to frame as `moves` specifies. Stands in for
+    `render.FrameRenderer` where a file is written. `moves` lists, for each frame, what changes: fields of `Target` such
+    as `{"centre_m": (0.01, 0)}` or of `Camera` such as `{"tilt_x_deg": 10}`.
     """
 
     def __init__(
@@ -197,17 +161,7 @@ class TargetRenderer:
         return light
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
-        """Render the grey levels of one frame.
-
-        Parameters
-        ----------
-        frame : its number.
-        low, span : as of `FrameRenderer.frame`.
-
-        Returns
-        -------
-        shape (height, width).
-        """
+        """Render the grey levels of one frame. Shape (height, width)."""
         return self._empty.expose(self._radiance(frame), frame, low=low, span=span)
 
 
@@ -218,20 +172,8 @@ def _target_scene(scene: Scene) -> Scene:
 
 
 def render_target(target: Target, scene: Scene, *, seed: int = 0, **settings: Any) -> NDArray[np.uint8 | np.uint16]:
-    """Render one picture of a target through the camera of a scene, with its noise.
-
-    The truth is `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks.
-
-    Parameters
-    ----------
-    target : what is printed, and where it lies.
-    scene : its camera, light and sensor.
-    seed : of the noise.
-    **settings : further arguments of `TargetRenderer`.
-
-    Returns
-    -------
-    grey levels, shape (height, width).
+    """Render one picture of a target through the camera of a scene, with its noise. The truth is `scene.camera`:
+    `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. Shape (height, width).
     """
     return TargetRenderer(target, _target_scene(scene), seed=seed, **settings).frame(0)
 
@@ -245,17 +187,7 @@ def render_calibration_clip(
     seed: int = 0,
     moves: tuple[dict[str, Any], ...] = (),
 ) -> None:
-    """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`.
-
-    Parameters
-    ----------
-    target : what is printed, and where it lies.
-    scene : its camera, light and sensor.
-    n_frames : of the clip.
-    out_path : its ending chooses the form.
-    seed : of the noise.
-    moves : see `TargetRenderer`.
-    """
+    """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`."""
     from vinetrack.laboratory.encode import write_recording
 
     renderer = TargetRenderer(target, _target_scene(scene), seed=seed, moves=moves)

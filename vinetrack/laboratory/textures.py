@@ -1,4 +1,5 @@
-"""Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film, tail, ball.
+"""Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film,
+tail, ball.
 
 All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that changing
 one surface does not change the others.
@@ -15,9 +16,7 @@ from vinetrack.laboratory.scene import Ball, Scene, Tube
 
 Image = NDArray[np.float32]
 
-OVERSAMPLING = 4
-"""Sub-pixels per pixel for drawing lines. Derived: edges are then within half a sub-pixel, 1/8 px, of their true
-positions."""
+OVERSAMPLING = 4  # Sub-pixels per pixel for drawing lines (derived)
 
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
@@ -149,19 +148,7 @@ def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
 
 
 def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
-    """Paint the static scene, blurred by the optics.
-
-    Parameters
-    ----------
-    scene : supplies backdrop, ruler and launcher.
-    rng : random generator of the textures.
-    shape : height and width, plane pixels.
-    corner : (x, y) of the first pixel, plane pixels.
-
-    Returns
-    -------
-    radiance, fraction of full scale, of that shape.
-    """
+    """Paint the static scene, blurred by the optics."""
     import cv2
 
     along, _ = _along_and_across(scene, shape, corner)
@@ -182,9 +169,8 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
 
 
 def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
-    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, creases in all directions.
-
-    A crease is a bright flank beside a dark one; most are short and within 60° of the tube's axis.
+    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, creases in all directions. A
+    crease is a bright flank beside a dark one; most are short and within 60° of the tube's axis.
     """
     import cv2
 
@@ -206,20 +192,9 @@ def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
 
 
 def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px: int) -> tuple[Image, Image]:
-    """Paint the everted wall at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px).
-
-    Row `i` lies `i − (rows − 1)/2` px off the axis. Towards the limb the line of sight crosses more film: the
-    transmission is (1 − opacity) to the power of 1/√(1 − (v/R)²), kept finite.
-
-    Parameters
-    ----------
-    tube : properties of the film.
-    rng : random generator of the wrinkles.
-    radius_px, length_px : radius and length of the tube.
-
-    Returns
-    -------
-    transmission, glow.
+    """Paint the everted wall at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px). Row `i` lies
+    `i − (rows − 1)/2` px off the axis. Towards the limb the line of sight crosses more film: the transmission is (1 −
+    opacity) to the power of 1/√(1 − (v/R)²), kept finite. Returns transmission, glow.
     """
     half = math.ceil(radius_px) + 7
     shape = (2 * half + 1, length_px)
@@ -238,37 +213,17 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
 
 
 def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
-    """Return the relative stretch of distances from the axis along the everted wall, whose sides ripple.
-
-    Parameters
-    ----------
-    tube : properties of the film.
-    rng : random generator of the ripples.
-    length_px : length of the tube.
-
-    Returns
-    -------
-    stretch, about 1, shape (length_px,).
+    """Return the relative stretch of distances from the axis along the everted wall, whose sides ripple. Shape
+    (length_px,).
     """
     ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
     return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
 
 
 def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
-    """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1).
-
-    The mean over any stretch, as in motion blur, is then the difference of two entries over the length.
-
-    Parameters
-    ----------
-    tube : properties of the tail.
-    rng : random generator of the texture.
-    radius_px : radius of the tube.
-    period_px : length after which the texture repeats.
-
-    Returns
-    -------
-    running sums, shape (rows, period_px + 1).
+    """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1). The
+    mean over any stretch, as in motion blur, is then the difference of two entries over the length. Shape (rows,
+    period_px + 1).
     """
     rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
     shape = (rows, period_px)
@@ -280,18 +235,7 @@ def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px:
 
 
 def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Image:
-    """Paint a sphere lit from the upper left, with texture and two highlights; square of side 2·(ceil(radius)+4)+1.
-
-    Parameters
-    ----------
-    ball : properties of the ball.
-    rng : random generator of the texture.
-    radius_px : radius of the ball.
-
-    Returns
-    -------
-    fraction of full scale, square.
-    """
+    """Paint a sphere lit from the upper left, with texture and two highlights; square of side 2·(ceil(radius)+4)+1."""
     half = math.ceil(radius_px) + 4
     grid = np.arange(-half, half + 1) / radius_px
     r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)

@@ -28,10 +28,9 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 @dataclass(frozen=True)
 class VirtualTrial:
-    """One simulated trial and its measurement.
-
-    `stated` is the trial as the sheet states it, `true` as it was, `model` the true model. `track` is what the analysis
-    gets; its zeros are arbitrary. The rest is the truth at the track's rows, SI; `release_s` is on the track's clock.
+    """One simulated trial and its measurement. `stated` is the trial as the sheet states it, `true` as it was, `model`
+    the true model. `track` is what the analysis gets; its zeros are arbitrary. The rest is the truth at the track's
+    rows, SI; `release_s` is on the track's clock.
     """
 
     stated: Trial
@@ -49,17 +48,7 @@ class VirtualTrial:
 
 
 def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
-    """Simulate and measure trials; the same seed gives the same numbers.
-
-    Parameters
-    ----------
-    trials : as the sheet states them.
-    truth : the ground truth.
-
-    Returns
-    -------
-    simulated trials, in order.
-    """
+    """Simulate and measure trials; the same seed gives the same numbers."""
     model = truth.model()
     draws = [_draw(truth.seed, 0, trial.name) for trial in trials]
     errors = _yield_errors(trials, truth)
@@ -152,10 +141,9 @@ def _measure(
 def _faults(
     velocity_m_s: Floats, truth: GroundTruth, draw: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], tuple[int, ...]]:
-    """True frame that each row shows, and the frame number it claims; then dropped frames and repeated rows.
-
-    A dropped frame is missing without notice, so all later rows claim a time one frame too early. A repeated frame
-    shows its predecessor instead of itself.
+    """True frame that each row shows, and the frame number it claims; then dropped frames and repeated rows. A dropped
+    frame is missing without notice, so all later rows claim a time one frame too early. A repeated frame shows its
+    predecessor instead of itself.
     """
     moving = velocity_m_s > 0
     dropped = moving & (draw.uniform(size=velocity_m_s.size) < truth.dropped)
@@ -169,13 +157,7 @@ def _faults(
 
 
 def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
-    """Write the track of each trial to `folder/<trial>.csv`.
-
-    Parameters
-    ----------
-    grown : from `grow`.
-    folder : where the tracks go.
-    """
+    """Write the track of each trial to `folder/<trial>.csv`."""
     for trial in grown:
         columns = {"time_s": trial.track.time_s.round(9), "position_m": trial.track.lead_position_m.round(8)}
         if np.isfinite(trial.track.lead_position_sigma_m).any():
@@ -199,16 +181,7 @@ SHEET_COLUMNS = (
 
 
 def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
-    """Return the trial sheet of a campaign whose tracks lie in `tracks/`.
-
-    Parameters
-    ----------
-    trials : as the sheet states them.
-
-    Returns
-    -------
-    one row for each trial.
-    """
+    """Return the trial sheet of a campaign whose tracks lie in `tracks/`."""
     rows = [
         (
             trial.name,
@@ -227,14 +200,7 @@ def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
 
 
 def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
-    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth.
-
-    Parameters
-    ----------
-    grown : from `grow`.
-    folder : of the experiment.
-    settings : text of `experiment.yaml`; none is written where blank.
-    """
+    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
     write_tracks(grown, folder / "tracks")
     write_csv(folder / "trials.csv", sheet([trial.stated for trial in grown]))
     if settings:
@@ -242,19 +208,7 @@ def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str 
 
 
 def write_truth(grown: Sequence[VirtualTrial], truth: GroundTruth, path: Path) -> None:
-    """Write the ground truth to a JSON file.
-
-    Parameters
-    ----------
-    grown : from `grow`.
-    truth : the ground truth.
-    path : of the JSON file.
-
-    Raises
-    ------
-    ValueError
-        If the file would lie in or below a folder with a trial sheet, where the analysis reads.
-    """
+    """Write the ground truth to a JSON file."""
     for parent in path.absolute().parents:
         if (parent / "trials.csv").exists():
             raise ValueError(f"{path}: the truth must not lie inside the experiment {parent}")
@@ -279,14 +233,9 @@ BASE = BASE_EFFECTS
 
 @dataclass(frozen=True, kw_only=True)
 class GroundTruth:
-    """Ground truth of a simulated campaign.
-
-    `effects` and `values` are the physics. Scatter is a relative between-trial standard deviation of B or P;
-    `yield_error_kPa` is the standard deviation of the error of the stated yield pressures. `release_frames` are the
-    limits of the number of frames at rest, and the release is uniform between two frames; `origin_m` are the limits of
-    the unknown zero of position. Noise is AR(1) with standard deviation `noise_m` and lag-one correlation
-    `noise_correlation`. `dropped` and `repeated` are probabilities per moving frame. `trace_sigma_kPa` is the noise of
-    a recorded pressure (None: none is recorded).
+    """Ground truth of a simulated campaign. `effects` and `values` are the physics. Scatter is a relative between-trial
+    standard deviation of B or P; `yield_error_kPa` is the standard deviation of the error of the stated yield
+    pressures.
     """
 
     effects: tuple[str, ...] = BASE
@@ -312,15 +261,8 @@ class GroundTruth:
 
 
 def read_ground_truth(path: Path) -> GroundTruth:
-    """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is ignored here.
-
-    Parameters
-    ----------
-    path : the YAML file.
-
-    Returns
-    -------
-    the ground truth.
+    """Read a ground truth from YAML, whose keys are the fields of `GroundTruth` and `filming`, which is
+    ignored here.
     """
     content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
     content.pop("filming", None)

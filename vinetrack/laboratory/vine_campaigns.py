@@ -22,9 +22,7 @@ PAPER_B = published.DAMPING_B
 PAPER_N = published.EXPONENT
 WALLS_UM = tuple(published.THICKNESS_UM.values())
 PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
-EFFICIENCY_LENGTH_MM = 200.0
-"""Length of the vines whose efficiency is evaluated. Chosen: 50 mm beyond the 150 mm at which the paper evaluates it,
-so that the end of growth has no effect."""
+EFFICIENCY_LENGTH_MM = 200.0  # Length of the vines whose efficiency is evaluated (chosen)
 
 
 @dataclass(frozen=True)
@@ -37,19 +35,7 @@ class Vine:
     yield_pressure_kPa: float = 3.0
 
     def trial(self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = CAPTURE_FPS) -> Trial:
-        """Make one trial with this vine.
-
-        Parameters
-        ----------
-        name : of the trial.
-        pressure_kPa : gauge pressure.
-        payload_g : mass that rides on the tail.
-        capture_fps : frames per second.
-
-        Returns
-        -------
-        the trial, with errors of 1 % of the pressure and 0.2 kPa of the yield pressure.
-        """
+        """Make one trial with this vine."""
         return Trial(
             name=name,
             capture_fps=capture_fps,
@@ -65,36 +51,14 @@ class Vine:
 
 
 def isometric_vine(scale: int) -> Vine:
-    """The paper's vine of scale R = 1…4: 50R µm, 6R mm and, isometric with the 280 mm of R = 4, 70R mm.
-
-    Parameters
-    ----------
-    scale : R.
-
-    Returns
-    -------
-    the vine.
-    """
+    """The paper's vine of scale R = 1…4: 50R µm, 6R mm and, isometric with the 280 mm of R = 4, 70R mm."""
     return Vine(6.0 * scale, 50.0 * scale, 70.0 * scale)
 
 
 def campaign(
     vine: Vine, pressures_kPa: Iterable[float], replicates: int, payload_g: float = 0.0, prefix: str = ""
 ) -> list[Trial]:
-    """Make trials of every pressure, `replicates` times, with one vine and payload.
-
-    Parameters
-    ----------
-    vine : the vine.
-    pressures_kPa : gauge pressures.
-    replicates : trials of each.
-    payload_g : mass that rides on the tail.
-    prefix : of the trials' names.
-
-    Returns
-    -------
-    trials, replicates together.
-    """
+    """Make trials of every pressure, `replicates` times, with one vine and payload."""
     return [
         vine.trial(f"{prefix}{pressure_kPa:g}kPa_{k + 1}".replace(".", "p"), pressure_kPa, payload_g)
         for pressure_kPa in pressures_kPa
@@ -103,10 +67,9 @@ def campaign(
 
 
 def _paper_B(diameter_m: float, thickness_m: float) -> float:
-    """B of a vine of the paper's campaign, N·(s/m)ⁿ: what is printed, where it is.
-
-    Of a diameter of Table I with another wall it is in proportion to the wall, as Fig. 7B says ("linearly"), through
-    the printed one; of any other diameter it is our guess.
+    """B of a vine of the paper's campaign, N·(s/m)ⁿ: what is printed, where it is. Of a diameter of Table I with
+    another wall it is in proportion to the wall, as Fig. 7B says ("linearly"), through the printed one; of any other
+    diameter it is our guess.
     """
     for scale, diameter_mm in published.DIAMETER_MM.items():
         if abs(1e3 * diameter_m / diameter_mm - 1) < 0.01:
@@ -115,26 +78,13 @@ def _paper_B(diameter_m: float, thickness_m: float) -> float:
 
 
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
-    """Return pressures of the damping protocol for one scale; see `_steady_pressures_kPa`.
-
-    Parameters
-    ----------
-    scale : R.
-    count : of pressures.
-
-    Returns
-    -------
-    shape (count,), kPa, rising.
-    """
+    """Return pressures of the damping protocol for one scale; see `_steady_pressures_kPa`. Shape (count,)."""
     return _steady_pressures_kPa(isometric_vine(scale), count)
 
 
 def _steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
-    """Pressures at which a vine gets steady within its length, kPa, shape (count,), rounded to 0.1.
-
-    The paper raises the pressure until speeds are still steady within the length of the vine. Lowest: 0.25 m/s of the
-    tail, where a trial lasts a second; highest: 3.2 relaxation times (mass over slope of the damping) within the
-    growth.
+    """Pressures at which a vine gets steady within its length, kPa, shape (count,), rounded to 0.1. The paper raises
+    the pressure until speeds are still steady within the length of the vine.
     """
     vine = of.trial("", 1.0)
     B = _paper_B(vine.diameter_m, vine.thickness_m)
@@ -148,17 +98,7 @@ def _steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
 
 
 def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
-    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload.
-
-    Parameters
-    ----------
-    replicates : trials of each pressure.
-    count : pressures of each scale.
-
-    Returns
-    -------
-    trials, with vine and condition named.
-    """
+    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload."""
     trials = [
         trial
         for scale in PAPER_B
@@ -170,16 +110,7 @@ def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
 
 
 def paper_payload(replicates: int = 4) -> list[Trial]:
-    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads.
-
-    Parameters
-    ----------
-    replicates : trials of each pressure and payload.
-
-    Returns
-    -------
-    trials, with vine and condition named.
-    """
+    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
     payload = published.PAYLOAD_G
     trials = campaign(isometric_vine(4), published.POSITION_RMS_CM, replicates, payload_g=payload, prefix="fig4_")
     thinner = replace(isometric_vine(4), thickness_um=published.FINAL_SPEED_THICKNESS_UM)
@@ -253,14 +184,7 @@ def paper_campaign() -> list[Trial]:
 
 
 def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
-    """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n.
-
-    Parameters
-    ----------
-    trials : of the paper's campaign, with vines named.
-
-    Returns
-    -------
+    """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n. Returns
     values as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
     """
     by_vine = {trial.vine: float(f"{_paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
@@ -268,15 +192,8 @@ def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]
 
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
-    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n.
-
-    Parameters
-    ----------
-    trials : of isometric vines, with vines named.
-
-    Returns
-    -------
-    values as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
+    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n. Returns values
+    as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
     """
     by_vine = {trial.vine: PAPER_B[round(trial.diameter_m / 6e-3)] for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
 
+# What to do about each difference between trials
 REMEDIES = {
     N_BY_VINE: "Give each vine its own n (`shared={'n': 'vine'}`) before testing for missing effects",
     ORDER_DRIFT: "Repeat six trials in random order, number all trials in the column `order`, and read the gauge at "
@@ -22,48 +23,20 @@ REMEDIES = {
     SPECIMEN: "Film each specimen at several pressures, and name it in the column `specimen`",
     DAY: "Repeat some conditions on another day; before each, zero the gauge and set the regulator anew",
 }
-"""What to do about each difference between trials."""
 
 
 def trials_differ(names: Sequence[str]) -> bool:
-    """Whether every name of an answer set is a difference between trials.
-
-    Parameters
-    ----------
-    names : an answer set.
-
-    Returns
-    -------
-    bool, False for an empty one
-    """
+    """Whether every name of an answer set is a difference between trials."""
     return bool(names) and all(name in BETWEEN_SUMMARIES for name in names)
 
 
 def difference_headline(names: Sequence[str]) -> str:
-    """The differences between trials of an answer set, each in a clause.
-
-    Parameters
-    ----------
-    names : an answer set of differences between trials.
-
-    Returns
-    -------
-    str
-    """
+    """The differences between trials of an answer set, each in a clause."""
     return " or ".join(BETWEEN_SUMMARIES[name] for name in names)
 
 
 def difference_in_words(result: LikelihoodRatio) -> str:
-    """The size of one difference between trials: `pressure rises by 0.42 ± 0.03 % with each trial`.
-
-    Parameters
-    ----------
-    result : the likelihood-ratio result of the difference.
-
-    Returns
-    -------
-    str
-    """
+    """The size of one difference between trials: `pressure rises by 0.42 ± 0.03 % with each trial`."""
     name = result.names[-1]
     if name == N_BY_VINE:
         return "n differs between the vines: " + ", ".join(
@@ -90,17 +63,7 @@ def difference_in_words(result: LikelihoodRatio) -> str:
 
 
 def remedies_in_words(answers: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
-    """What to do about the differences between trials in an answer set; blank where there are none.
-
-    Parameters
-    ----------
-    answers : results of the answer set.
-    trials : all trials of the experiment.
-
-    Returns
-    -------
-    str
-    """
+    """What to do about the differences between trials in an answer set; blank where there are none."""
     names = [result.names[-1] for result in answers if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""

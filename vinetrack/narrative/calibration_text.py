@@ -13,16 +13,7 @@ if TYPE_CHECKING:
 
 
 def calibration_lines(calibration: NullCalibration) -> list[str]:
-    """Return nominal and Monte-Carlo p-values of each test for this design, and whether the calls change.
-
-    Parameters
-    ----------
-    calibration : null distributions of the tests of an initial model.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return nominal and Monte-Carlo p-values of each test for this design, and whether the calls change."""
     from vinetrack.core.terminal import table
 
     count = calibration.campaigns

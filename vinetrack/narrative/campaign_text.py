@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from vinetrack.planning.predictive_inputs import PredictiveInputs
     from vinetrack.planning.simulated_campaigns import SimulatedCampaigns
 
-_SHOWN_OTHERS = 4
-"""Other campaigns shown that also meet the limits. Chosen: with more, the table fills the screen."""
+_SHOWN_OTHERS = 4  # Other campaigns shown that also meet the limits (chosen)
 
 
 def campaign_lines(
@@ -24,21 +23,7 @@ def campaign_lines(
     B_error: float,
     most_trials: int,
 ) -> Iterator[str]:
-    """Yield the campaign, its expected standard errors, and those of other campaigns.
-
-    Parameters
-    ----------
-    planned : the best campaign, the others, and the nearest where none meets the limits.
-    inputs : predictive inputs of each vine.
-    camera : how trials are filmed: frame rate and noise.
-    n_error : largest standard error of n that is allowed.
-    B_error : largest relative standard error of B that is allowed.
-    most_trials : largest number of trials of a campaign.
-
-    Yields
-    ------
-    str, a line
-    """
+    """Yield the campaign, its expected standard errors, and those of other campaigns."""
     spread_P, spread_B = inputs[0].spreads
     yield (
         f"standard errors wanted: n {n_error:g}, B {100 * B_error:g} %; filmed at {camera.capture_fps:g} "
@@ -131,17 +116,7 @@ def _out_of_reach(planned: Planned, most_trials: int) -> Iterator[str]:
 
 
 def simulation_lines(planned: Planned, simulated: SimulatedCampaigns) -> list[str]:
-    """Return the standard errors of simulated campaigns beside the expected ones, as lines of text.
-
-    Parameters
-    ----------
-    planned : the campaign, with its expected standard errors.
-    simulated : errors of fits to simulated campaigns.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the standard errors of simulated campaigns beside the expected ones, as lines of text."""
     from vinetrack.core.terminal import table
 
     assert planned.best is not None

@@ -36,32 +36,19 @@ _HEADLINES = {
     ARTEFACT: "a fault of the measurement, not missing physics",
     UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
 }
+# What a user does next where no effect of the catalogue explains the misfit
 GO_ON = (
     "Next: look at the figures of the missing force in the report, and run `vinetrack propose` on the results folder. "
     "It looks for a law that describes the missing force and writes the law as an effect file of your own."
 )
-"""What a user does next where no effect of the catalogue explains the misfit."""
 
-CLEAR_GAIN = 9.0
-"""Δχ² above which an added effect is said to help. Derived: 3 standard errors of one parameter, as for the answer
-set."""
+CLEAR_GAIN = 9.0  # Δχ² above which an added effect is said to help (derived)
 
-_SHOWN_CANDIDATES = 8
-"""Candidates of a round that the terminal shows. Chosen: two rounds fit a screen of 24 lines; `diagnosis.json` has
-all."""
+_SHOWN_CANDIDATES = 8  # Candidates of a round that the terminal shows (chosen)
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment.
-
-    Parameters
-    ----------
-    diagnosis : as `vinetrack.diagnosis.diagnose` returns it.
-
-    Returns
-    -------
-    str, lines separated by line feeds
-    """
+    """Return the printed diagnosis: verdict, rounds with their candidates, ladder of errors, next experiment."""
     if not diagnosis.rounds:
         return diagnosis.explanation
     lines = [verdict_line(diagnosis), "", diagnosis.explanation]
@@ -83,32 +70,14 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
 
 
 def to_go_on(diagnosis: Diagnosis) -> str:
-    """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere.
-
-    Parameters
-    ----------
-    diagnosis : in memory, or read back.
-
-    Returns
-    -------
-    str
-    """
+    """Return what to do next where no effect of the catalogue explains the trials; blank elsewhere."""
     if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
         return ""
     return ODD_MEANING if diagnosis.odd_trials else GO_ON
 
 
 def verdict_line(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one line.
-
-    Parameters
-    ----------
-    diagnosis : with a verdict.
-
-    Returns
-    -------
-    str
-    """
+    """Return the verdict in one line."""
     return f"{diagnosis.verdict}: {_headline(diagnosis)}"
 
 
@@ -183,17 +152,8 @@ def _partial_mark(row: Any) -> str:
 
 
 def gain_in_words(before: Fit, after: Fit) -> str:
-    """Return the improvement by an added effect.
-
-    The model with the effect contains the one without it, so a loss shows that the optimiser has not converged.
-
-    Parameters
-    ----------
-    before, after : fits without and with the effect.
-
-    Returns
-    -------
-    str
+    """Return the improvement by an added effect. The model with the effect contains the one without it, so a loss shows
+    that the optimiser has not converged.
     """
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     if gain < 0:
@@ -205,18 +165,7 @@ def gain_in_words(before: Fit, after: Fit) -> str:
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
-    """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables.
-
-    Parameters
-    ----------
-    table : the ladder of errors, `before` and `after`.
-    numbers : one row for each parameter and model: `symbol, vine, unit, added, value, sigma` (SI).
-    before, after : fits without and with the effect.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return how an effect added by hand changed position errors and parameters, as lines of aligned tables."""
     from vinetrack.core.terminal import table as aligned
 
     lines = [

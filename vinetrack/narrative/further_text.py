@@ -14,27 +14,13 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.power import EffectPower
 
 
-MOST_SIZES = 3
-"""Effects whose detectable sizes are stated beside recommended trials, at most. Chosen: those that gain most; more
-would not be read."""
+MOST_SIZES = 3  # Effects whose detectable sizes are stated beside recommended trials, at most (chosen)
 
-LEAST_STATED_GAIN = 1.1
-"""Factor by which a detectable size must fall to be stated. Chosen: a tenth is what detectable sizes err by."""
+LEAST_STATED_GAIN = 1.1  # Factor by which a detectable size must fall to be stated (chosen)
 
 
 def informative_text(plan: InformativeTrials, named: str = "", rival: str = "") -> str:
-    """Return recommended trials in words, and the detectable sizes that they lower most.
-
-    Parameters
-    ----------
-    plan : of trials that reveal most, or that confirm an effect.
-    named : the effect to be confirmed; blank where nothing is found yet.
-    rival : the candidate it is to be told from; blank for none.
-
-    Returns
-    -------
-    str
-    """
+    """Return recommended trials in words, and the detectable sizes that they lower most."""
     purpose = "These trials are expected to reveal most of what could be missing"
     if named:
         purpose = f"These trials tell most about {spaced_name(named)}"

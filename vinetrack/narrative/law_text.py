@@ -13,15 +13,12 @@ if TYPE_CHECKING:
 _STATUSES = ("ok", "warning", "failed", "left_out")
 _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
 
+# The two fits of the damping law, by their keys in `damping.json`
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
-"""The two fits of the damping law, by their keys in `damping.json`."""
 
-_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}
-"""Rows of the tables of n and B; the published rule uses the set pressure, no weight, and the windows of the 3 %
-rule."""
+_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, exactly as printed"}  # Rows of the tables of n and B
 
-PREFERRED = "both_axes"
-"""The fit whose numbers head the report: speed and force both have errors, and ignoring errors of speed biases n."""
+PREFERRED = "both_axes"  # The fit whose numbers head the report
 
 REFERENCES = (
     "Alvarez et al., High-Velocity, Pressure-Driven Eversion for Rapid Vine Robots, IEEE Robotics and Automation "
@@ -66,16 +63,7 @@ DIAGNOSIS_REFERENCES = (
 
 
 def damping_headline(damping: Mapping[str, Any]) -> str:
-    """Return the main result in one sentence.
-
-    Parameters
-    ----------
-    damping : content of `damping.json`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the main result in one sentence."""
     fit = damping.get(PREFERRED) or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
         return f"No damping law: {_sentence(fit.get('refused') or 'no trial gave a steady speed')}"
@@ -92,31 +80,15 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
 
 
 def status_tally(trials: pd.DataFrame) -> str:
-    """Return the number of trials of each status, as a sentence.
-
-    Parameters
-    ----------
-    trials : `trials.csv`; its column `status`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the number of trials of each status, as a sentence."""
     counts = trials["status"].value_counts()
     parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUSES if counts.get(status, 0)]
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
 def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return size, B, its intervals, R² and N of each vine and method of `damping.json` as text, smallest vine first.
-
-    Parameters
-    ----------
-    damping : content of `damping.json`.
-
-    Returns
-    -------
-    list of dict, one for each vine and method
+    """Return size, B, its intervals, R² and N of each vine and method of `damping.json` as text, smallest
+    vine first.
     """
     table, sizes = [], []
     for method, method_name in _TABLE_METHODS.items():
@@ -139,16 +111,7 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return n and its intervals by each method of `damping.json` as text, or why a method refused.
-
-    Parameters
-    ----------
-    damping : content of `damping.json`.
-
-    Returns
-    -------
-    list of dict, one for each method
-    """
+    """Return n and its intervals by each method of `damping.json` as text, or why a method refused."""
     table = []
     for method, method_name in _TABLE_METHODS.items():
         fit = damping.get(method)
@@ -167,31 +130,13 @@ def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def vines_without_law(damping: Mapping[str, Any]) -> list[str]:
-    """Return the vines that the preferred fit of `damping.json` left out, each with the reason.
-
-    Parameters
-    ----------
-    damping : content of `damping.json`.
-
-    Returns
-    -------
-    list of str, `vine: reason`
-    """
+    """Return the vines that the preferred fit of `damping.json` left out, each with the reason."""
     left_out = (damping.get(PREFERRED) or {}).get("left_out") or {}
     return [f"{vine}: {reason}" for vine, reason in left_out.items()]
 
 
 def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings.
-
-    Parameters
-    ----------
-    settings : of the run, as in `provenance.json`.
-
-    Returns
-    -------
-    list of (heading, paragraph)
-    """
+    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings."""
     velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
     return [
         (

@@ -14,8 +14,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.planning.feasible_trials import NEW_VINE, Condition
 
-_MUCH_MORE = 1.5
-"""Ratio from which the larger of two expected significances is stated beside the smaller. Chosen."""
+_MUCH_MORE = 1.5  # Ratio from which the larger of two expected significances is stated beside the smaller (chosen)
 
 _WITH_TRACE = (
     "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
@@ -24,15 +23,8 @@ _WITH_TRACE = (
 
 
 def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
-    """Return the effects that only the first model has, and those that only the second has.
-
-    Parameters
-    ----------
-    first, second : two fits to the same trials.
-
-    Returns
-    -------
-    only_first, only_second : list of Effect
+    """Return the effects that only the first model has, and those that only the second has. Returns only_first,
+    only_second : list of Effect.
     """
     return (
         [effect for effect in first.model if effect.name not in second.model],
@@ -41,16 +33,7 @@ def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]
 
 
 def only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ only in faults of the measurement.
-
-    Parameters
-    ----------
-    tied : fits of the hypotheses.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether the hypotheses differ only in faults of the measurement."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
     differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
     return bool(differ) and all(effect.kind == "measurement" for effect in differ)
@@ -58,16 +41,7 @@ def only_measurement(tied: Sequence[Fit]) -> bool:
 
 def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
     """Return what to measure in order to exclude one of each pair of hypotheses, as the files of their effects state.
-
     Where a fault of the measurement is among them, a calibration decides, and only the calibration is returned.
-
-    Parameters
-    ----------
-    pairs : fits of hypotheses that the data cannot tell apart.
-
-    Returns
-    -------
-    str, blank where the effects state nothing
     """
     sentences: list[str] = []
     effects: dict[str, Effect] = {}
@@ -85,16 +59,7 @@ def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
 
 
 def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
-    """Return the trials to make, as a list within a sentence.
-
-    Parameters
-    ----------
-    trials : entries of `trial_entries`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the trials to make, as a list within a sentence."""
     return "; ".join(_trial_in_words(trial) for trial in trials)
 
 
@@ -112,18 +77,7 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
 def separation_text(
     if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
 ) -> str:
-    """Return the expected significance with which the trials separate each pair of hypotheses.
-
-    Parameters
-    ----------
-    if_true : for each pair (`a | b`) the expected significance if the one or the other hypothesis is true. The smaller
-        is stated; the larger too where it is much larger.
-    simulated : mean and standard deviation of simulated significances for each pair.
-
-    Returns
-    -------
-    str
-    """
+    """Return the expected significance with which the trials separate each pair of hypotheses."""
     parts = []
     for pair, by_truth in if_true.items():
         least, most = sorted(by_truth, key=by_truth.__getitem__)
@@ -138,17 +92,7 @@ def separation_text(
 
 
 def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """Return the trials of a design as entries of `next_experiment`, one for each condition.
-
-    Parameters
-    ----------
-    every : all feasible conditions.
-    design : index into `every` of each trial.
-
-    Returns
-    -------
-    tuple of dict
-    """
+    """Return the trials of a design as entries of `next_experiment`, one for each condition."""
     return tuple(
         _entry(every[index], int(count))
         for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
@@ -176,21 +120,7 @@ def advice_text(
     worth_it: bool,
     least: float,
 ) -> str:
-    """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead.
-
-    Parameters
-    ----------
-    trials : entries of `trial_entries`.
-    promise : the text of `separation_text`, expected significances.
-    left : pairs that the trials do not separate.
-    advice : the text of `calibration_advice`.
-    worth_it : whether the best design separates a pair by at least `least`.
-    least : smallest separation that is worth a trial, standard deviations.
-
-    Returns
-    -------
-    str
-    """
+    """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
     if not worth_it:
         return (
             f"No trials within `limits` separate the tied hypotheses by {least:g} σ; the best would separate"

@@ -13,43 +13,20 @@ from vinetrack.narrative.verdict_summary import joined, listed_names, spaced_nam
 if TYPE_CHECKING:
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
 
-LOW_POWER = 0.1
-"""Power below which an effect counts as undetectable. Chosen: one campaign in ten; with one in twenty the size that is
-named is smaller by a tenth."""
+LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
 
-MOST_SENTENCES = 4
-"""Effects that get a sentence each, at most. Chosen: the table above has all; twice as many would not be read."""
+MOST_SENTENCES = 4  # Effects that get a sentence each, at most (chosen)
 
-AT_LARGEST = "with 90 % power at their largest plausible size"
-"""Follows the number of detectable effects (`detectable_count`)."""
+AT_LARGEST = "with 90 % power at their largest plausible size"  # Follows the number of detectable effects
 
 
 def percent(rate: float) -> str:
-    """Return a rate in per cent, two digits.
-
-    Parameters
-    ----------
-    rate : 0 to 1.
-
-    Returns
-    -------
-    str
-    """
+    """Return a rate in per cent, two digits."""
     return f"{number(100 * rate, 2)} %"
 
 
 def size_text(power: EffectPower, value: float) -> str:
-    """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none.
-
-    Parameters
-    ----------
-    power : of the effect.
-    value : SI.
-
-    Returns
-    -------
-    str
-    """
+    """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none."""
     if not math.isfinite(value):
         return "–"
     unit, factor = display_unit(power.unit)
@@ -57,17 +34,7 @@ def size_text(power: EffectPower, value: float) -> str:
 
 
 def effect_sentence(power: EffectPower, n_trials: int) -> str:
-    """Return the sizes of one effect that the trials detect, in a sentence.
-
-    Parameters
-    ----------
-    power : of the effect.
-    n_trials : number of trials.
-
-    Returns
-    -------
-    str
-    """
+    """Return the sizes of one effect that the trials detect, in a sentence."""
     trials, detect = (f"These {n_trials} trials", "detect") if n_trials != 1 else ("This trial", "detects")
     name, symbol = spaced_name(power.effect), power.symbol
     largest, at_largest = size_text(power, power.largest), power.probability_at(power.largest)
@@ -100,16 +67,7 @@ def effect_sentence(power: EffectPower, n_trials: int) -> str:
 
 
 def false_alarm_sentence(power: Power) -> str:
-    """Return the false-alarm rate of such trials: how often something is called missing where nothing is.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    str
-    """
+    """Return the false-alarm rate of such trials: how often something is called missing where nothing is."""
     return (
         f"If nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
         "campaigns, provided that noise and scatter are as fitted."
@@ -117,16 +75,7 @@ def false_alarm_sentence(power: Power) -> str:
 
 
 def power_brief(power: Power) -> str:
-    """Return the false-alarm rate and the number of detectable effects, which must stand beside a verdict.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    str
-    """
+    """Return the false-alarm rate and the number of detectable effects, which must stand beside a verdict."""
     alarms = f"false alarms in at most {percent(power.false_alarm_rate)} of such campaigns"
     if power.wary or not power.effects:
         return alarms
@@ -134,33 +83,13 @@ def power_brief(power: Power) -> str:
 
 
 def detectable_count(power: Power) -> str:
-    """Return how many effects the trials detect with 90 % power at their largest plausible size.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    str
-        `17 of 29 effects`
-    """
+    """Return how many effects the trials detect with 90 % power at their largest plausible size."""
     n_detectable = sum(entry.probability_at(entry.largest) >= 0.9 for entry in power.effects)
     return f"{n_detectable} of {len(power.effects) + len(power.not_testable)} effects"
 
 
 def could_have_seen(power: Power) -> list[str]:
-    """Return the sizes that the trials detect with 90 % power, and the effects that they do not detect.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    list of str
-        At most three sentences.
-    """
+    """Return the sizes that the trials detect with 90 % power, and the effects that they do not detect."""
     if power.wary:
         return [f"Detectable sizes were not computed: {power.wary}."]
     physical = _physical(power)
@@ -186,16 +115,8 @@ def could_have_seen(power: Power) -> list[str]:
 
 
 def unseen(power: Power) -> list[str]:
-    """Return the physical effects that are not testable, or detected with less than 10 % power at any plausible size.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    list of str
-        Names of effects; of all kinds where none is physical.
+    """Return the physical effects that are not testable, or detected with less than 10 % power at any
+    plausible size.
     """
     undetectable = [entry.effect for entry in _physical(power) if entry.probability_at(entry.largest) < LOW_POWER]
     return [*undetectable, *(name for name in power.not_testable if name not in undetectable)]
@@ -207,32 +128,14 @@ def _physical(power: Power) -> list[EffectPower]:
 
 
 def width_text(width: NumberWidth) -> str:
-    """Return the half width of the 95 % interval of a parameter: `n ± 0.0075`.
-
-    Parameters
-    ----------
-    width : of n or a B.
-
-    Returns
-    -------
-    str
-    """
+    """Return the half width of the 95 % interval of a parameter: `n ± 0.0075`."""
     title = f"{width.name} ({width.vine})" if width.vine else width.name
     half = percent(width.half_width) if width.is_relative else number(width.half_width, 2)
     return f"{title} ± {half}"
 
 
 def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
-    """Return a row for each effect, with the columns of `POWER_COLUMNS`.
-
-    Parameters
-    ----------
-    effects : of the trials.
-
-    Returns
-    -------
-    list of tuple of str
-    """
+    """Return a row for each effect, with the columns of `POWER_COLUMNS`."""
     rows = []
     for entry in effects:
         taken = ", ".join(f"{spaced_name(other)} {percent(rate)}" for other, rate in list(entry.taken_for.items())[:3])
@@ -250,22 +153,19 @@ def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str,
     return rows
 
 
-POWER_COLUMNS = ("effect", "", "50 % power", "90 % power", "largest plausible", "power there", "mistaken for (at 90 %)")
-"""Headings of `power_rows`: effect, symbol, sizes detected with 50 and 90 % power, largest plausible size, power at it,
-and the effects that the diagnosis would name instead, at the size of 90 % power."""
+POWER_COLUMNS = (
+    "effect",
+    "",
+    "50 % power",
+    "90 % power",
+    "largest plausible",
+    "power there",
+    "mistaken for (at 90 %)",
+)  # Headings of `power_rows`
 
 
 def power_lines(power: Power) -> list[str]:
-    """Return what `vinetrack power` prints.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return what `vinetrack power` prints."""
     lines = [f"Power of {power.n_trials} trials to detect effects beyond {' + '.join(power.model)}"]
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
     if power.wary:
@@ -295,16 +195,7 @@ def _size_table(effects: Sequence[EffectPower]) -> list[str]:
 
 
 def seen_lines(power: Power) -> list[str]:
-    """Return the power of a campaign designed for n and B to detect other effects.
-
-    Parameters
-    ----------
-    power : of the campaign.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the power of a campaign designed for n and B to detect other effects."""
     physical = [entry for entry in power.effects if entry.kind == "physical"]
     head = f"power of these {power.n_trials} trials to detect physics that their model lacks, by linear theory:"
     return [head, *_size_table(physical), false_alarm_sentence(power)]
@@ -319,17 +210,7 @@ def _effects_in_sentences(power: Power) -> list[EffectPower]:
 
 
 def simulated_lines(power: Power) -> list[str]:
-    """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory.
-
-    Parameters
-    ----------
-    power : of the trials.
-
-    Returns
-    -------
-    list of str
-        Empty where no campaign was simulated.
-    """
+    """Return the detection and false-alarm rates of simulated campaigns beside those of linear theory."""
     lines = []
     for rates in power.simulated:
         counted = rates.detections if rates.effect else rates.alarms
@@ -351,16 +232,7 @@ def simulated_lines(power: Power) -> list[str]:
 
 
 def further_lines(plan: FurtherTrials) -> list[str]:
-    """Return the further trials with which an effect is detected with the wanted power, a row for each condition.
-
-    Parameters
-    ----------
-    plan : further trials, or why none suffice.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the further trials with which an effect is detected with the wanted power, a row for each condition."""
     from vinetrack.core.terminal import table
     from vinetrack.diagnosis.power import sheet_cells
 
@@ -414,5 +286,5 @@ def further_lines(plan: FurtherTrials) -> list[str]:
     return lines
 
 
+# Columns of the rig that a further trial may change, as printed
 COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
-"""Columns of the rig that a further trial may change, as printed."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.inference.fit_result import Number
 
+# What each verdict means
 MEANINGS = {
     MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
     AMBIGUOUS: "An effect is missing, and these trials cannot tell which of several: nothing was added. "
@@ -33,7 +34,6 @@ MEANINGS = {
     UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
     "The missing force is drawn below; `vinetrack propose` looks for a law that describes it.",
 }
-"""What each verdict means."""
 
 TRIALS_DIFFER = (
     "A difference between trials, not missing physics, explains the misfit: nothing was added. The explanation below "
@@ -45,6 +45,7 @@ ODD_MEANING = (
     "row, or leave it out with `use: no`, and run again."
 )
 
+# The verdict on the model with all added effects
 THEREAFTER = {
     MISSING: "A further effect is still missing.",
     AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
@@ -52,14 +53,10 @@ THEREAFTER = {
     ADEQUATE: "With it, no further effect can be detected.",
     UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
 }
-"""The verdict on the model with all added effects."""
 
-MOST_UNDETECTABLE_LISTED = 6
-"""Undetectable effects listed on the first screen, at most. Chosen: two lines; the table of the page has all."""
+MOST_UNDETECTABLE_LISTED = 6  # Undetectable effects listed on the first screen, at most (chosen)
 
-SIGNIFICANT_SIGMA = 2.0
-"""Standard errors below which a size is reported as not significant. Chosen: the usual 95 %. At half of it one size in
-three of pure noise would be reported as significant; at twice, some real sizes would not be."""
+SIGNIFICANT_SIGMA = 2.0  # Standard errors below which a size is reported as not significant
 
 
 @dataclass(frozen=True)
@@ -72,63 +69,22 @@ class Fact:
 
 
 def spaced_name(effect: str) -> str:
-    """Return the name of an effect with blanks for underscores.
-
-    Parameters
-    ----------
-    effect : name in the catalogue.
-
-    Returns
-    -------
-    str
-    """
+    """Return the name of an effect with blanks for underscores."""
     return str(effect).replace("_", " ")
 
 
 def listed_names(names: Sequence[str], last: str = "and") -> str:
-    """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`.
-
-    Parameters
-    ----------
-    names : in the catalogue.
-    last : the conjunction before the last name.
-
-    Returns
-    -------
-    str
-    """
+    """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`."""
     return joined([spaced_name(name) for name in names], last)
 
 
 def joined(names: Sequence[str], last: str = "and") -> str:
-    """Return names as a sentence lists them; blank for none.
-
-    Parameters
-    ----------
-    names : any texts.
-    last : the conjunction before the last one.
-
-    Returns
-    -------
-    str
-
-    >>> joined(["leak", "air_drag", "gravity"], "or")
-    'leak, air_drag or gravity'
-    """
+    """Return names as a sentence lists them; blank for none."""
     return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one sentence.
-
-    Parameters
-    ----------
-    diagnosis : in memory, or read back.
-
-    Returns
-    -------
-    str
-    """
+    """Return the verdict in one sentence."""
     verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
     added = list(diagnosis.effects)
     if verdict == MISSING:
@@ -150,16 +106,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
 
 
 def verdict_meaning(diagnosis: Diagnosis) -> str:
-    """Return what the verdict means, and the verdict on the model with all added effects.
-
-    Parameters
-    ----------
-    diagnosis : in memory, or read back.
-
-    Returns
-    -------
-    str
-    """
+    """Return what the verdict means, and the verdict on the model with all added effects."""
     if diagnosis.odd_trials:
         return ODD_MEANING
     text = MEANINGS.get(diagnosis.verdict, diagnosis.refused)
@@ -171,17 +118,7 @@ def verdict_meaning(diagnosis: Diagnosis) -> str:
 
 
 def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
-    """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them.
-
-    Parameters
-    ----------
-    diagnosis : in memory, or read back.
-    ladder : `ladder.csv`; None where there is none.
-
-    Returns
-    -------
-    list of Fact
-    """
+    """Return significance, sizes, power, change of the error and damping exponent, as far as the verdict has them."""
     entries = [
         _significance(diagnosis),
         *_sizes(diagnosis),
@@ -194,16 +131,7 @@ def summary_facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fac
 
 
 def is_finite(value: Any) -> bool:
-    """Return whether a value of a JSON file is a finite number.
-
-    Parameters
-    ----------
-    value : of any type.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether a value of a JSON file is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
 
 
@@ -250,32 +178,13 @@ def _sigmas(row: Candidate) -> str:
 
 
 def value_text(entry: Number) -> str:
-    """Return a fitted number with its standard error in its display unit, without symbol and unit: `1.170 ± 0.004`.
-
-    Parameters
-    ----------
-    entry : SI.
-
-    Returns
-    -------
-    str
-    """
+    """Return a fitted number with its standard error in its display unit, without symbol and unit: `1.170 ± 0.004`."""
     _, factor = display_unit(entry.unit)
     return with_error(factor * entry.value, factor * entry.sigma if is_finite(entry.sigma) else None)
 
 
 def estimate_text(entry: Number) -> str:
-    """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`.
-
-    Parameters
-    ----------
-    entry : SI.
-
-    Returns
-    -------
-    str
-        With a remark where it lies at or outside a bound.
-    """
+    """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`."""
     unit, factor = display_unit(entry.unit)
     if is_finite(entry.bound):
         return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
@@ -286,18 +195,7 @@ def estimate_text(entry: Number) -> str:
 
 
 def estimates_text(row: Candidate) -> str:
-    """Return all fitted numbers of a candidate.
-
-    Parameters
-    ----------
-    row : an entry of a ranking.
-
-    Returns
-    -------
-    str
-        Blank where it has no fitted number; `not significant` follows where the candidate is less than 2 standard
-        errors from no effect.
-    """
+    """Return all fitted numbers of a candidate."""
     text = ", ".join(estimate_text(entry) for entry in row.numbers if is_finite(entry.value))
     return f"{text}: not significant" if text and is_finite(row.sigma) and abs(row.sigma) < SIGNIFICANT_SIGMA else text
 
@@ -334,17 +232,7 @@ def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
 
 
 def interval_text(entry: Number) -> str:
-    """Return the 95 % interval of a fitted number in its display unit, a bound that it ends at named.
-
-    Parameters
-    ----------
-    entry : SI.
-
-    Returns
-    -------
-    str
-        `95 %: 1.371 to 1.400 (its upper bound)`; `95 %: open` where unknown.
-    """
+    """Return the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
     unit, factor = display_unit(entry.unit)
     if not (is_finite(entry.low) and is_finite(entry.high)):
         return "95 %: open"
@@ -403,16 +291,7 @@ def _exponent(diagnosis: Diagnosis) -> list[Fact]:
 
 
 def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it.
-
-    Parameters
-    ----------
-    table : as in `ladder.csv`.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
     if "partial" not in table:
         return table
     return table[[value not in (True, "True") for value in table["partial"]]]

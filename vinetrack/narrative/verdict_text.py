@@ -35,40 +35,19 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.selection import SelectionStep
 
 MEASUREMENT = "measurement"
-MOST_BIASED_NAMED = 3
-"""Biased parameters named in a sentence, at most. Chosen to keep the sentence short; the ranking has all of them."""
+MOST_BIASED_NAMED = 3  # Biased parameters named in a sentence, at most (chosen)
 
+# Significance from which a fault of the measurement below its threshold is named as worth a check (chosen)
 WORTH_A_CHECK_SIGMA = 3.0
-"""Significance from which a fault of the measurement below its threshold is named as worth a check. Chosen: one of the
-ten that are tested reaches it by chance in about one campaign in fifty; at 2.5 in one of ten, at 3.5 in one of 200. It
-changes no verdict."""
 
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
-    """Return the fitted sizes of a hypothesis with their standard errors; blank where it has none.
-
-    Parameters
-    ----------
-    numbers : parameters of the hypothesis, SI.
-
-    Returns
-    -------
-    str
-    """
+    """Return the fitted sizes of a hypothesis with their standard errors; blank where it has none."""
     return ", ".join(map(estimate_text, numbers))
 
 
 def explain(step: SelectionStep) -> str:
-    """Return the explanation of one round: its verdict with the reasons.
-
-    Parameters
-    ----------
-    step : the selection step of the round.
-
-    Returns
-    -------
-    str
-    """
+    """Return the explanation of one round: its verdict with the reasons."""
     fit = step.tests.fit
     count = len(fit.trials)
     model, trials = " + ".join(fit.model.names), f"{count} trial{'s' if count != 1 else ''}"
@@ -168,18 +147,7 @@ def _partial_in_words(step: SelectionStep) -> str:
 
 
 def confounders_in_words(confounders: Sequence[Confounder]) -> str:
-    """State how far each fitted size would change with another effect that the data do not exclude in the model.
-
-    Parameters
-    ----------
-    confounders
-        Of the effects that were added.
-
-    Returns
-    -------
-    str
-        Two sentences a size, a blank before each; blank where there are none.
-    """
+    """State how far each fitted size would change with another effect that the data do not exclude in the model."""
     text = ""
     for name in dict.fromkeys(confounder.number.name for confounder in confounders):
         alike = [confounder for confounder in confounders if confounder.number.name == name]
@@ -248,12 +216,7 @@ def _slips(answers: Sequence[LikelihoodRatio]) -> str:
 
 
 def _camera_of_a_vine(answers: Sequence[LikelihoodRatio]) -> str:
-    """Name the faults of camera and gauge equivalent to film masses that differ between vines; blank where none do.
-
-    A relative error ε of the film mass is equivalent to ε/2 of the frame rate of that vine's recordings (exactly, for
-    horizontal growth without payload) and nearly to −ε of their scale or of their pressures: the trials show all of
-    them only through mass times acceleration.
-    """
+    """Name the faults of camera and gauge equivalent to film masses that differ between vines; blank where none do."""
     if not any(FILM in hypothesis.names and len(_vines_with_film_error(hypothesis)) > 1 for hypothesis in answers):
         return ""
     return (
@@ -283,10 +246,8 @@ def _by_film(answers: Sequence[LikelihoodRatio]) -> str:
 
 def _with_the_fault(step: SelectionStep) -> str:
     """Give the parameters that are biased without the likeliest fault in the model, fitted with it and without it.
-
     These are all parameters of effects added before, and those of the base model whose value with the fault lies
-    outside their 95 % interval without it; n comes first. Where n differs between vines nothing is compared: B then has
-    another unit.
+    outside their 95 % interval without it; n comes first.
     """
     fit, best = step.tests.fit, step.answer_set[0]
     if best.names[-1] == N_BY_VINE:
@@ -381,17 +342,7 @@ def _runner_up(step: SelectionStep) -> str:
 
 
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
-    """Return the explanation for trials whose stated pressure is inconsistent with the other trials.
-
-    Parameters
-    ----------
-    odd : the inconsistent trials, at least one.
-    count : number of all trials.
-
-    Returns
-    -------
-    str
-    """
+    """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
     names = joined([trial.name for trial in odd])
     single = len(odd) == 1
     pressures = [
@@ -408,16 +359,7 @@ def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
 
 
 def dropped_in_words(trials: Sequence[str]) -> str:
-    """Return the explanation of a diagnosis where frames are missing from these recordings.
-
-    Parameters
-    ----------
-    trials : names of the recordings.
-
-    Returns
-    -------
-    str
-    """
+    """Return the explanation of a diagnosis where frames are missing from these recordings."""
     return (
         f"Frames are missing from {_recordings(trials)}: the edge moves much farther from one frame to the next than "
         "in the frames around them, so the camera or the disk dropped frames. The times were corrected; record again "
@@ -426,16 +368,7 @@ def dropped_in_words(trials: Sequence[str]) -> str:
 
 
 def perhaps_dropped_in_words(trials: Sequence[str]) -> str:
-    """Return the note of a diagnosis where frames may be missing from these recordings.
-
-    Parameters
-    ----------
-    trials : names of the recordings.
-
-    Returns
-    -------
-    str
-    """
+    """Return the note of a diagnosis where frames may be missing from these recordings."""
     return (
         f"Frames may be missing from {_recordings(trials)}: the edge moves farther from one frame to the next than in "
         "the frames around them, and the later times were shifted accordingly. Points farther away are too few or too "

@@ -20,107 +20,41 @@ from vinetrack.kinematics.scaling import regress
 from vinetrack.paper.rows import COMPUTED, PaperRow
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
 
-GAMMAS = {"slow": 1.0, "fast": 1.4}
-"""Isothermal and adiabatic: the chamber's gas lies between them."""
+GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 
 
 def area_m2(diameter_mm: float) -> float:
-    """Cross-section πD²/4.
-
-    Parameters
-    ----------
-    diameter_mm : D.
-
-    Returns
-    -------
-    m².
-    """
+    """Cross-section πD²/4."""
     return math.pi * (diameter_mm / 1e3) ** 2 / 4
 
 
 def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> float:
-    """Return the volume of a whole vine over that of its chamber.
-
-    Parameters
-    ----------
-    chamber_m3 : volume of the chamber.
-    diameter_mm, length_mm : of the vine.
-
-    Returns
-    -------
-    a fraction.
-    """
+    """Return the volume of a whole vine over that of its chamber."""
     return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
 
 
 def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
-    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`.
-
-    P_abs V^γ is constant, with absolute pressure.
-
-    Parameters
-    ----------
-    gauge_Pa : gauge pressure at first.
-    change : of the volume, a fraction.
-    gamma : γ, 1 isothermal, 1.4 adiabatic.
-
-    Returns
-    -------
-    a fraction.
-
-    >>> round(1 - gauge_left(28e3, 0.0342), 3)
-    0.153
+    """Return the fraction of the gauge pressure left after the volume has grown by the fraction `change`. P_abs V^γ is
+    constant, with absolute pressure.
     """
     absolute_Pa = gauge_Pa + AMBIENT_PRESSURE_PA
     return (absolute_Pa * (1 + change) ** -gamma - AMBIENT_PRESSURE_PA) / gauge_Pa
 
 
 def p_value(R2: float, n: int) -> float:
-    """Return the two-sided p-value of the slope of a straight line from its R² and the number of points.
-
-    Parameters
-    ----------
-    R2 : coefficient of determination.
-    n : points.
-
-    Returns
-    -------
-    probability.
-
-    >>> round(p_value(0.935, 4), 3)
-    0.033
-    """
+    """Return the two-sided p-value of the slope of a straight line from its R² and the number of points."""
     dof = n - 2
     return 2 * float(student.sf(math.sqrt(R2 * dof / (1 - R2)), dof))
 
 
 def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> float:
-    """Return the steady tail speed by Eq. (3) with the printed B and n.
-
-    Parameters
-    ----------
-    scale : R.
-    gauge_Pa, yield_Pa : P and P_y.
-
-    Returns
-    -------
-    m/s.
-    """
+    """Return the steady tail speed by Eq. (3) with the printed B and n."""
     force_N = (gauge_Pa - yield_Pa) * area_m2(published.DIAMETER_MM[scale])
     return (force_N / published.DAMPING_B[scale]) ** (1 / published.EXPONENT)
 
 
 def weight_over_gas(diameter_mm: float) -> float:
-    """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y.
-
-    Parameters
-    ----------
-    diameter_mm : D.
-
-    Returns
-    -------
-    a fraction.
-    """
+    """Return the work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
     gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * area_m2(diameter_mm)
     return published.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
 

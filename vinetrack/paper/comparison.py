@@ -38,15 +38,8 @@ class Rest(NamedTuple):
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
-    """Find the trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload.
-
-    Parameters
-    ----------
-    trials : of the experiment.
-
-    Returns
-    -------
-    trials of one condition each, by pressure in kPa.
+    """Find the trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload. Returns trials
+    of one condition each, by pressure in kPa.
     """
     conditions: dict[float, list[Trial]] = {}
     for pressure_kPa in published.POSITION_RMS_CM:
@@ -57,14 +50,7 @@ def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
 
 
 def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
-    """Find the trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload.
-
-    Parameters
-    ----------
-    trials : of the experiment.
-
-    Returns
-    -------
+    """Find the trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload. Returns
     trials by condition.
     """
     conditions: dict[str, list[Trial]] = {}
@@ -89,20 +75,9 @@ def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float
 def mean_motions(
     conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %.
-
-    The release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a
-    trial would absorb its deviation of speed.
-
-    Parameters
-    ----------
-    conditions : as `position_conditions` finds them.
-    kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
-    rests : by trial.
-
-    Returns
-    -------
-    the table; empty where no trial can be aligned.
+    """Average the trials of each pressure since release, columns `MEAN_COLUMNS`, until the first has grown to 95 %. The
+    release comes from a fit in which each trial has its own pressure and B. With one B for all, the release of a trial
+    would absorb its deviation of speed.
     """
     parts = []
     for pressure_kPa, trials in conditions.items():
@@ -139,16 +114,7 @@ def position_errors(
     conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
     """Compare positions with Eq. (2) and the printed B and n, of the mean and of single trials (`POSITION_COLUMNS`).
-
     From release until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
-
-    Parameters
-    ----------
-    conditions, kinematics, rests : as of `mean_motions`.
-
-    Returns
-    -------
-    one row for each pressure.
     """
     rows = []
     for pressure_kPa, trials in conditions.items():
@@ -167,17 +133,8 @@ def position_errors(
 def final_speeds(
     conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
-    """Average the speed of the leading edge at the paper's 12 cm, and compute it by Eq. (2), columns `SPEED_COLUMNS`.
-
-    Parameters
-    ----------
-    conditions : as `speed_conditions` finds them.
-    kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
-    rests : by trial.
-
-    Returns
-    -------
-    one row for each condition.
+    """Average the speed of the leading edge at the paper's 12 cm, and compute it by Eq. (2), columns
+    `SPEED_COLUMNS`.
     """
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
@@ -200,16 +157,7 @@ def final_speeds(
 
 
 def eq2_speed_m_s(trial: Trial) -> float:
-    """Return the speed of the leading edge at 12 cm by Eq. (2), B proportional to the wall; 0 where not reached.
-
-    Parameters
-    ----------
-    trial : its size, pressure and payload.
-
-    Returns
-    -------
-    m/s.
-    """
+    """Return the speed of the leading edge at 12 cm by Eq. (2), B proportional to the wall; 0 where not reached."""
     B = published.DAMPING_B[4] * 1e6 * trial.thickness_m / published.THICKNESS_UM[4]
     moved = follow(trial, NONE, B)
     speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, published.FINAL_SPEED_AT_MM / 1e3)
@@ -217,17 +165,7 @@ def eq2_speed_m_s(trial: Trial) -> float:
 
 
 def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> pd.DataFrame:
-    """Compute Eq. (2) over the range of payloads of each pressure, in the columns of `final_speeds`.
-
-    Parameters
-    ----------
-    conditions : as `speed_conditions` finds them.
-    instants : payloads along each curve.
-
-    Returns
-    -------
-    one row for each payload and pressure.
-    """
+    """Compute Eq. (2) over the range of payloads of each pressure, in the columns of `final_speeds`."""
     rows = []
     by_pressure: dict[float, list[Trial]] = {}
     for trials in conditions.values():

@@ -22,14 +22,10 @@ from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.kinematics.conditions import lead_velocity_at
 
+# Fraction of the length up to which positions are compared (chosen)
 WITHIN = 0.95
-"""Fraction of the length up to which positions are compared, since a motion that stalls would be averaged without end.
-Chosen: a motion that runs out of pressure creeps in the last 5 %. At 0.9 differences are a little smaller, at 1 they
-may not end."""
 
-LASTS_S = 60.0
-"""Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2). Chosen: eight times that; half and
-twice change nothing."""
+LASTS_S = 60.0  # Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2) (chosen)
 
 
 @dataclass(frozen=True)
@@ -42,32 +38,14 @@ class Departure:
     slack: bool = False
 
     def model(self, B: float) -> Model:
-        """Return Eq. (2) with the printed n and this departure.
-
-        Parameters
-        ----------
-        B : damping coefficient, N·(s/m)ⁿ.
-
-        Returns
-        -------
-        the model.
-        """
+        """Return Eq. (2) with the printed n and this departure."""
         model = base_model()
         if self.gamma is not None:
             model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
         return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
 
     def trial(self, trial: Trial) -> Trial:
-        """Return the trial, whose tail may go slack if the departure says so.
-
-        Parameters
-        ----------
-        trial : of the paper's rig.
-
-        Returns
-        -------
-        the trial.
-        """
+        """Return the trial, whose tail may go slack if the departure says so."""
         return replace(trial, tail_slack="free" if self.slack else "taut")
 
 
@@ -94,18 +72,7 @@ MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
 def paper_trial(
     diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
 ) -> Trial:
-    """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa.
-
-    Parameters
-    ----------
-    diameter_mm, thickness_um, length_mm : of the vine.
-    pressure_kPa : gauge pressure.
-    payload_g : mass that rides on the tail.
-
-    Returns
-    -------
-    the trial.
-    """
+    """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa."""
     return Trial(
         name=f"{diameter_mm:g} mm × {thickness_um:g} µm at {pressure_kPa:g} kPa",
         capture_fps=published.CAPTURE_FPS,
@@ -126,16 +93,7 @@ def position_trials() -> list[Trial]:
 
 
 def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
-    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`.
-
-    Parameters
-    ----------
-    payloads_g : payloads of Fig. 5, over which the root mean square of speeds is taken.
-
-    Returns
-    -------
-    one row for each figure, pressure and departure.
-    """
+    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`."""
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
         plain = follow(trial, NONE, published.DAMPING_B[4])
@@ -152,34 +110,13 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 
 
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
-    """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`.
-
-    Parameters
-    ----------
-    trial : of the paper's rig.
-    departure : what is added to Eq. (2).
-    B : damping coefficient, N·(s/m)ⁿ.
-
-    Returns
-    -------
-    the motion.
-    """
+    """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
     time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
     return simulate(departure.model(B), departure.trial(trial), time_s)
 
 
 def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
-    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %.
-
-    Parameters
-    ----------
-    plain, moved : motions without and with a departure, at the same times.
-    trial : its length.
-
-    Returns
-    -------
-    m.
-    """
+    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
     stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
@@ -203,16 +140,7 @@ def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departur
 
 
 def motion_table(instants: int = 200) -> pd.DataFrame:
-    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`.
-
-    Parameters
-    ----------
-    instants : rows of each motion.
-
-    Returns
-    -------
-    the table.
-    """
+    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`."""
     parts = []
     for trial in position_trials():
         for departure in (NONE, *DEPARTURES):
@@ -226,16 +154,7 @@ def motion_table(instants: int = 200) -> pd.DataFrame:
 
 
 def pressure_table(instants: int = 60) -> pd.DataFrame:
-    """Compute the remaining gauge pressure along the growth of Fig. 4's vine.
-
-    Parameters
-    ----------
-    instants : rows of each curve.
-
-    Returns
-    -------
-    columns `pressure_kPa, departure, lead_position_m, gauge_left`; the last is a fraction.
-    """
+    """Compute the remaining gauge pressure along the growth of Fig. 4's vine."""
     from vinetrack.paper.arithmetic import area_m2, gauge_left
 
     rows = []

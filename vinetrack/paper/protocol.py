@@ -15,18 +15,7 @@ from vinetrack.paper.rows import NOT_CHECKABLE, SIMULATED, PaperRow
 
 
 def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> Iterator[PaperRow]:
-    """Compare the protocol of an experiment with that of the paper.
-
-    Parameters
-    ----------
-    trials : of the experiment.
-    steady : as in `steady.csv`.
-    mark : `SIMULATED` or `MEASURED`.
-
-    Yields
-    ------
-    rows of the table.
-    """
+    """Compare the protocol of an experiment with that of the paper."""
     source = "an input: the virtual trials were grown with it" if mark == SIMULATED else "as the trial sheet says"
     bare = [trial for trial in trials if trial.payload_kg == 0 and trial.travel_ratio == 2]
     by_scale = {

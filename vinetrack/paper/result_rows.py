@@ -21,11 +21,8 @@ nan = math.nan
 
 @dataclass(frozen=True, kw_only=True)
 class ExperimentResults:
-    """Results of an experiment: tables and files of its results folder, by their names there.
-
-    `mark` is `SIMULATED` or `MEASURED`. `positions` has a row for each pressure of the paper's Fig. 4 (`pressure_kPa,
-    n_trials, rms_mean_m, rms_single_m`), `speeds` one for each condition of Fig. 5 (`pressure_kPa, payload_g,
-    final_lead_velocity_m_s, eq2_lead_velocity_m_s`); `departures` is that of `departures.departure_table`.
+    """Results of an experiment: tables and files of its results folder, by their names there. `mark` is `SIMULATED` or
+    `MEASURED`.
     """
 
     mark: str
@@ -39,16 +36,7 @@ class ExperimentResults:
 
 
 def result_rows(results: ExperimentResults) -> Iterator[PaperRow]:
-    """Yield every row that an experiment can answer; where it does not, ours is blank.
-
-    Parameters
-    ----------
-    results : of the experiment.
-
-    Yields
-    ------
-    rows of the table.
-    """
+    """Yield every row that an experiment can answer; where it does not, ours is blank."""
     yield from _law_rows(results)
     yield from _position_rows(results)
     yield from _final_speed_rows(results)
@@ -202,17 +190,7 @@ def _fast_row(results: ExperimentResults) -> PaperRow:
 
 
 def size_rows(mark: str, damping: Mapping[str, Any], scaling: Mapping[str, Any]) -> Iterator[PaperRow]:
-    """Yield the rows from `damping.json` and `scaling.json`; where these do not answer, ours is blank.
-
-    Parameters
-    ----------
-    mark : `SIMULATED` or `MEASURED`.
-    damping, scaling : contents of `damping.json` and `scaling.json`.
-
-    Yields
-    ------
-    rows of the table.
-    """
+    """Yield the rows from `damping.json` and `scaling.json`; where these do not answer, ours is blank."""
     yield from _scale_rows(mark, scaling)
     yield from _steady_speed_rows(mark, scaling)
     yield from _wall_rows(mark, damping, scaling)

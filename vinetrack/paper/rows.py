@@ -43,19 +43,16 @@ PAPER_COLUMNS = (
     "beside",
 )
 
-PREFERRED = "both_axes"
-"""The fit of the damping law that supplies our numbers."""
+PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
 
 nan = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperRow:
-    """A published number or statement and ours, in `unit`.
-
-    `row` identifies it in programs; `where` and `as_printed` say where and how it is printed; `published` is NaN where
-    that is not a number. `low` and `high` are the 95 % interval of ours. `how` gives the origin of ours; `beside`, the
-    effect of a departure from the paper's assumptions.
+    """A published number or statement and ours, in `unit`. `row` identifies it in programs; `where` and `as_printed`
+    say where and how it is printed; `published` is NaN where that is not a number. `low` and `high` are the 95 %
+    interval of ours.
     """
 
     row: str
@@ -74,21 +71,7 @@ class PaperRow:
 
 
 def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
-    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`.
-
-    Parameters
-    ----------
-    rows : of the table, with unique names.
-
-    Returns
-    -------
-    DataFrame, one row each.
-
-    Raises
-    ------
-    ValueError
-        If a name is repeated or a mark is unknown.
-    """
+    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`."""
     entries = []
     for row in map(_as_answered, rows):
         entry = asdict(row)
@@ -112,29 +95,11 @@ def _as_answered(row: PaperRow) -> PaperRow:
 
 
 def number(value: Any) -> float:
-    """Return a number read from JSON, NaN for null.
-
-    Parameters
-    ----------
-    value : a number, or None.
-
-    Returns
-    -------
-    float.
-    """
+    """Return a number read from JSON, NaN for null."""
     return nan if value is None else float(value)
 
 
 def bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
-    """Return an interval read from JSON, NaN for null.
-
-    Parameters
-    ----------
-    pair : low and high, or None.
-
-    Returns
-    -------
-    low, high.
-    """
+    """Return an interval read from JSON, NaN for null. Returns low, high."""
     low, high = pair or (None, None)
     return number(low), number(high)

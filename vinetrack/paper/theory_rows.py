@@ -24,26 +24,13 @@ from vinetrack.paper.departures import DEPARTURES, NONE, Departure, paper_trial
 from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, PaperRow
 from vinetrack.planning.scaling_priors import damping_prior
 
-FAST_AT = (0.90, 0.95, 0.98, 0.99)
-"""Fractions of the length at which the speed of the fast vine is evaluated. Chosen near the end, where it is
-fastest."""
+FAST_AT = (0.90, 0.95, 0.98, 0.99)  # Fractions of the length at which the speed of the fast vine is evaluated (chosen)
 
-DRAG_AT = (0.50, 0.95, 0.99)
-"""Fractions of the length at which drag is evaluated. Chosen: half-way, and near the end, where it is largest."""
+DRAG_AT = (0.50, 0.95, 0.99)  # Fractions of the length at which drag is evaluated (chosen)
 
 
 def theory_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
-    """Compute the rows on the fast vine, on air drag, and on the published rule for noise-free motions.
-
-    Parameters
-    ----------
-    trials : of the experiment; the rule is applied at the pressures and lengths of those at the printed scales without
-        payload.
-
-    Yields
-    ------
-    rows of the table.
-    """
+    """Compute the rows on the fast vine, on air drag, and on the published rule for noise-free motions."""
     yield from _fast_rows()
     yield from _drag_rows()
     yield from _rule_rows(trials)
@@ -118,18 +105,7 @@ def _rule_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
 
 
 def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -> str:
-    """Describe the effect of departures from Eq. (2) in a sentence: positions in cm, speeds in m/s.
-
-    Parameters
-    ----------
-    table : from `departure_table`.
-    figure : "Fig. 4" or "Fig. 5".
-    pressure_kPa : of the row.
-
-    Returns
-    -------
-    half a sentence; blank where the table has no such row.
-    """
+    """Describe the effect of departures from Eq. (2) in a sentence: positions in cm, speeds in m/s."""
     lines = table[(table["figure"] == figure) & (abs(table["pressure_kPa"] - pressure_kPa) < 1e-6)]
     column, factor, unit = (
         ("rms_position_m", 100.0, "cm") if figure == "Fig. 4" else ("rms_final_lead_velocity_m_s", 1.0, "m/s")
@@ -144,21 +120,11 @@ def departures_in_words(table: pd.DataFrame, figure: str, pressure_kPa: float) -
     )
 
 
-SLOWEST_S = 10.0
-"""Duration of the simulated motions, s. Chosen: four times that of the slowest, 2.3 s."""
+SLOWEST_S = 10.0  # Duration of the simulated motions, s (chosen)
 
 
 def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
-    """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior.
-
-    Parameters
-    ----------
-    fractions : of the length.
-
-    Returns
-    -------
-    m/s, one each.
-    """
+    """Compute the speed of the fast vine's leading edge by Eq. (2) with B from the scaling prior."""
     fast = published.FAST_VINE
     trial = paper_trial(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"], fast["pressure_kPa"])
     model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
@@ -167,18 +133,9 @@ def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
 
 
 def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, float]]:
-    """Compute the ratio of drag to drive in the paper's example of air drag, by mechanics and as printed.
-
-    By mechanics the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is
-    ½ρ A C_D ẋ². Speeds are those of Eq. (2) without drag, with B from the scaling prior.
-
-    Parameters
-    ----------
-    fractions : of the length.
-
-    Yields
-    ------
-    fraction, drag over drive by mechanics, drag over drive as printed.
+    """Compute the ratio of drag to drive in the paper's example of air drag, by mechanics and as printed. By mechanics
+    the air meets the head at ẏ and the pulley halves the force: ¼ρ A C_D ẏ² over ½PA; printed is ½ρ A C_D ẋ². Speeds
+    are those of Eq. (2) without drag, with B from the scaling prior.
     """
     case = published.DRAG_EXAMPLE
     trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
@@ -192,16 +149,7 @@ def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, floa
 
 def rule_on_noise_free(gamma: float | None, trials: Sequence[Trial]) -> tuple[float, dict[int, float]]:
     """Apply the published rule to noise-free motions of these trials, simulated with the printed B and n.
-
-    Parameters
-    ----------
-    gamma : of a chamber that is not refilled; None for constant pressure.
-    trials : one for each vine and pressure, without payload; sizes other than the printed scales are ignored.
-
-    Returns
-    -------
-    n : float
-    B : dict, by scale, N·(s/m)ⁿ
+    Returns n, B.
     """
     departure = Departure("", "", gamma=gamma)
     time_s = np.arange(0, SLOWEST_S, 1 / published.CAPTURE_FPS)

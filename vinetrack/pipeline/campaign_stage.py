@@ -35,15 +35,13 @@ if TYPE_CHECKING:
     from vinetrack.planning.simulated_campaigns import SimulatedCampaigns
 
 _VINE = re.compile(r"\s*([^x×]+)[x×]([^x×]+)[x×]([^x×]+)\s*")
-PLACEHOLDER_KPA = "100"
-"""Placeholder that lets a vine be read before the pressures of the campaign are chosen."""
+PLACEHOLDER_KPA = "100"  # Placeholder that lets a vine be read before the pressures of the campaign are chosen
 
 
 @dataclass(frozen=True)
 class CampaignRequest:
-    """Options of the command: wanted standard errors (that of B relative), and constraints on the campaign.
-
-    `power` requests the power for effects that are not in the model.
+    """Options of the command: wanted standard errors (that of B relative), and constraints on the campaign. `power`
+    requests the power for effects that are not in the model.
     """
 
     vines: tuple[str, ...]
@@ -69,11 +67,6 @@ def _read_vine(text: str) -> dict[str, str]:
 
     >>> _read_vine("24x200x280")
     {'diameter_mm': '24', 'thickness_um': '200', 'length_mm': '280'}
-
-    Raises
-    ------
-    ExperimentError
-        If the text is not of that form.
     """
     match = _VINE.fullmatch(text)
     if match is None:
@@ -87,29 +80,7 @@ def _read_vine(text: str) -> dict[str, str]:
 def design_campaign(
     request: PredictionRequest, wanted: CampaignRequest, *, sheet: Path | None = None, figure: Path | None = None
 ) -> list[str]:
-    """Design a campaign; write its sheet and figure if requested.
-
-    Parameters
-    ----------
-    request
-        Inputs of the prediction.
-    wanted
-        Goals of and constraints on the campaign.
-    sheet : Path, optional
-        Output file for the trial sheet of the campaign.
-    figure : Path, optional
-        Output file for its figure; the suffix names the format.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    ExperimentError, ResultsError, EffectError
-        If an option is not allowed, or the vines cannot be simulated.
-    """
+    """Design a campaign; write its sheet and figure if requested."""
     from vinetrack.core.terminal import waiting
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError

@@ -37,16 +37,7 @@ class CheckReport:
 
 
 def check_folder(folder: Path) -> CheckReport:
-    """Check sheet, settings, effects, tracks and recordings of an experiment.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-
-    Returns
-    -------
-    CheckReport
-    """
+    """Check sheet, settings, effects, tracks and recordings of an experiment."""
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.pipeline.run_folders import path_problems

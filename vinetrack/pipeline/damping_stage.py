@@ -16,22 +16,8 @@ log = logging.getLogger(__name__)
 
 
 def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
-    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`.
-
-    Parameters
-    ----------
-    folder : results folder.
-    settings : number of bootstrap resamples, and their seed.
-
-    Returns
-    -------
-    dict
-        `damping.json` as written.
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run.
+    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`. Returns `damping.json` as
+    written.
     """
     results = Results(folder)
     points = read_result(results.points)

@@ -30,36 +30,14 @@ if TYPE_CHECKING:
     from vinetrack.planning.predictive_inputs import PredictiveInputs
     from vinetrack.planning.reservoir_design import Chamber
 
-MAX_FILMS = 12
-"""Largest number of films. Chosen: each film takes a search of its own. Half still covers the films that a shop sells;
-twice doubles the time."""
+MAX_FILMS = 12  # Largest number of films (chosen)
 
 FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
-    """Read a range from `low:high` or one number, each checked like a cell of the column.
-
-    Parameters
-    ----------
-    column : str
-        Column of the sheet.
-    text : str
-        Text given by the user.
-
-    Returns
-    -------
-    low, high : float, SI
-
-    Raises
-    ------
-    ExperimentError
-        If it is not a range.
-
-    Examples
-    --------
-    >>> read_range("diameter_mm", "5:25")
-    (0.005, 0.025)
+    """Read a range from `low:high` or one number, each checked like a cell of the column. Returns low, high : float,
+    SI.
     """
     values = [_cell(column, part) for part in text.split(":")]
     if len(values) > 2:
@@ -70,27 +48,7 @@ def read_range(column: str, text: str) -> tuple[float, float]:
 
 
 def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
-    """Read a list of numbers joined by commas, each checked like a cell of the column.
-
-    Parameters
-    ----------
-    column : str
-        Column of the sheet.
-    text : str
-        Numbers joined by commas.
-    name : str
-        Option named in messages; blank for that of the column.
-
-    Returns
-    -------
-    tuple of float, SI
-        Without repetitions.
-
-    Raises
-    ------
-    ExperimentError
-        If an element is not an allowed number.
-    """
+    """Read a list of numbers joined by commas, each checked like a cell of the column. Returns without repetitions."""
     return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
@@ -125,37 +83,7 @@ def design_vine(
     at_fraction: float,
     figure: Path | None = None,
 ) -> list[str]:
-    """Find the fastest vine of every film; draw the choice if requested.
-
-    Parameters
-    ----------
-    request
-        Inputs of the prediction.
-    films : str
-        Wall thicknesses, µm, joined by commas.
-    diameter, length : str
-        `low:high`, mm.
-    burst_share : float
-        Fraction of the burst stress that the wall may carry.
-    burst_stress_MPa : float
-        Burst stress of the film.
-    samples, seed : int
-        Number of draws, and seed of the random numbers.
-    at_fraction : float
-        y/L at which a bare vine's final speed is evaluated.
-    figure : Path, optional
-        Output file for the figure; the suffix names the format.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    ExperimentError, ResultsError, EffectError
-        If an option is not allowed, or the vines cannot be simulated.
-    """
+    """Find the fastest vine of every film; draw the choice if requested."""
     from vinetrack.core.terminal import waiting
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError
@@ -288,32 +216,8 @@ def design_reservoir(
     at_fraction: float,
     figure: Path | None = None,
 ) -> list[str]:
-    """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested.
-
-    Speeds are predicted if the wall thickness is given.
-
-    Parameters
-    ----------
-    request
-        Inputs of the prediction.
-    within_percent : float
-        Allowed loss of gauge pressure, %.
-    supply_s : float, optional
-        Time constant of a supply that refills the chamber, s.
-    at_fraction : float
-        y/L at which a bare vine's final speed is evaluated.
-    figure : Path, optional
-        Output file for the figure; the suffix names the format.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    ExperimentError, ResultsError, EffectError
-        If an option is not allowed, or the vine cannot be simulated.
+    """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
+    predicted if the wall thickness is given.
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.effects import EffectError

@@ -50,26 +50,8 @@ def _quiet(_: str) -> None:
 def diagnose_results(
     experiment: Experiment, folder: Path, report: Report = _quiet, settings: RunSettings | None = None
 ) -> dict[str, Any]:
-    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
-
-    Parameters
-    ----------
-    experiment : sheet and settings.
-    folder : results folder.
-    report : callable
-        Called with a description of each step.
-    settings : optional
-        Settings of the run, for steady windows; None for the defaults.
-
-    Returns
-    -------
-    dict
-        `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run.
+    """Diagnose the trials of a results folder; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns
+    `diagnosis.json` as written; `refused` is None, or the reason why there is no verdict.
     """
     results = Results(folder)
     pairs, _ = measured_trials(experiment, results)
@@ -85,36 +67,14 @@ def diagnose_results(
 
 
 def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
-    """Diagnose trials with the model, candidates, user effects and limits that the experiment states.
-
-    Parameters
-    ----------
-    experiment : sheet and settings.
-    pairs : sequence of (Trial, Track)
-    report : callable
-        Called with a description of each step.
-
-    Returns
-    -------
-    Diagnosis
-    """
+    """Diagnose trials with the model, candidates, user effects and limits that the experiment states."""
     from vinetrack.diagnosis.diagnose import diagnose
 
     return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report)
 
 
 def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
-    """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics.
-
-    Parameters
-    ----------
-    diagnosis : diagnosis of the trials.
-    results, pairs : see `sheet_contradictions`.
-
-    Returns
-    -------
-    Diagnosis
-    """
+    """Add contradictions between measurements and sheet to a diagnosis: a wrong scale or unit can look like physics."""
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
         return diagnosis
@@ -128,17 +88,8 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[
 
 
 def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
-    """Return a sentence for each column of the sheet that recordings or speeds contradict.
-
-    Parameters
-    ----------
-    results : results folder, which contains the contradictions found while tracking.
-    pairs : sequence of (Trial, Track)
-
-    Returns
-    -------
-    dict of str
-        By name of the column.
+    """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
+    column.
     """
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
 
@@ -185,18 +136,7 @@ def _emptied_folder(results: Results) -> Path:
 
 
 def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
-
-    Parameters
-    ----------
-    results : results folder; its subfolder `diagnosis` is replaced.
-    diagnosis : the diagnosis to write.
-
-    Returns
-    -------
-    dict
-        `diagnosis.json` as written.
-    """
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`. Returns `diagnosis.json` as written."""
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
 
     folder = _emptied_folder(results)
@@ -259,20 +199,9 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
 
 
 def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
-    """Predict every trial with the initial and the final model.
-
-    As in `comparison.csv` and the ladder, only release and origin are fitted per trial. `model_after_m` is NaN if no
-    effect was added.
-
-    Parameters
-    ----------
-    before : fit of the initial model.
-    after : fit of the final model; the same object if no effect was added.
-
-    Returns
-    -------
-    dict of DataFrame
-        By name of trial, columns `PREDICTION_COLUMNS`: s and m.
+    """Predict every trial with the initial and the final model. As in `comparison.csv` and the ladder, only release and
+    origin are fitted per trial. `model_after_m` is NaN if no effect was added. Returns by name of trial, columns
+    `PREDICTION_COLUMNS`: s and m.
     """
     import pandas as pd
 
@@ -289,31 +218,7 @@ def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
 
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
-    """Add an effect to the model and refit; the errors are appended to `ladder.csv`.
-
-    Parameters
-    ----------
-    experiment : sheet and settings.
-    folder : results folder.
-    name : str
-        Name of the effect.
-    report : callable
-        Called with a description of each step.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal: errors and parameters before and after.
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run.
-    EffectError
-        If there is no such effect, it is in the model already, or a trial lacks an input that it requires.
-    FitError
-        If the model cannot be simulated.
-    """
+    """Add an effect to the model and refit; the errors are appended to `ladder.csv`."""
     import pandas as pd
 
     from vinetrack.diagnosis.add import add
@@ -334,21 +239,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
 
 
 def diagnosis_lines(folder: Path) -> list[str]:
-    """Return the verdict of a results folder in one line, then its reasons, one sentence per line.
-
-    Parameters
-    ----------
-    folder : results folder.
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    ResultsError
-        If it has not been diagnosed.
-    """
+    """Return the verdict of a results folder in one line, then its reasons, one sentence per line."""
     diagnosis = read_diagnosis(Results(folder))
     if diagnosis is None:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")

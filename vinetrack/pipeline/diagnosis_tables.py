@@ -32,10 +32,9 @@ CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_befor
 
 @dataclass(frozen=True)
 class DiagnosisTables:
-    """Data of the figures; a table is empty if there is nothing to draw.
-
-    `rounds` are (heading, ranking) pairs, `worst` is the condition that `before_after` shows, `cosines` are names and
-    matrix, `added` the added effects in words, `labels` the labels of conditions by name.
+    """Data of the figures; a table is empty if there is nothing to draw. `rounds` are (heading, ranking) pairs, `worst`
+    is the condition that `before_after` shows, `cosines` are names and matrix, `added` the added effects in words,
+    `labels` the labels of conditions by name.
     """
 
     ladder: pd.DataFrame
@@ -54,18 +53,7 @@ class DiagnosisTables:
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
-    """Read the tables of a results folder; None if it has no diagnosis, or that failed.
-
-    Parameters
-    ----------
-    results : results folder.
-    conditions : DataFrame
-        `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
-
-    Returns
-    -------
-    DiagnosisTables or None
-    """
+    """Read the tables of a results folder; None if it has no diagnosis, or that failed."""
     diagnosis = stored_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
@@ -84,23 +72,7 @@ def assemble_tables(
     force: pd.DataFrame,
     learned: pd.DataFrame | None = None,
 ) -> DiagnosisTables:
-    """Assemble the data of the figures.
-
-    Parameters
-    ----------
-    diagnosis : with a verdict.
-    conditions : DataFrame
-        See `read_diagnosis_tables`.
-    trials : DataFrame
-        Columns `CURVE_COLUMNS`.
-    located, drifting, force, learned : DataFrame
-        Misfit along the growth, drift between groups of trials, missing force, and missing force as learned within the
-        fit; empty if there is none.
-
-    Returns
-    -------
-    DiagnosisTables
-    """
+    """Assemble the data of the figures."""
     import pandas as pd
 
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
@@ -126,17 +98,7 @@ def assemble_tables(
 
 
 def read_diagnosis_section(results: Results, experiment: Experiment) -> DiagnosisResult | None:
-    """Return the content of the report's section on the diagnosis; None if there is no diagnosis.
-
-    Parameters
-    ----------
-    results : results folder.
-    experiment : experiment, whose settings name the files of the user's effects.
-
-    Returns
-    -------
-    DiagnosisResult or None
-    """
+    """Return the content of the report's section on the diagnosis; None if there is no diagnosis."""
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
     diagnosis = stored_diagnosis(results)
@@ -172,21 +134,7 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
 
 
 def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
-    """Return the data table of each figure with content, by name of the figure.
-
-    Parameters
-    ----------
-    diagnosed : tables from `read_diagnosis_tables`.
-
-    Returns
-    -------
-    dict of DataFrame
-
-    Raises
-    ------
-    RuntimeError
-        If this function and the registry do not name the same figures: one would be left out without a word.
-    """
+    """Return the data table of each figure with content, by name of the figure."""
     import pandas as pd
 
     from vinetrack.figures.registry import DIAGNOSIS_FIGURES
@@ -216,19 +164,7 @@ def _table(path: Any) -> pd.DataFrame:
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Return measured and predicted positions of all trials, relative to release and origin.
-
-    Parameters
-    ----------
-    results : results folder.
-    conditions : DataFrame
-        `trial` and `condition` of every trial.
-
-    Returns
-    -------
-    DataFrame
-        Columns `CURVE_COLUMNS`; only trials with predictions.
-    """
+    """Return measured and predicted positions of all trials, relative to release and origin."""
     import pandas as pd
 
     parts = []
@@ -264,17 +200,7 @@ def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
-    """Return the condition with the largest RMS error of the initial model; blank without predictions.
-
-    Parameters
-    ----------
-    trials : DataFrame
-        From `predicted_trials`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the condition with the largest RMS error of the initial model; blank without predictions."""
     from vinetrack.figures.ladder_figures import rms_m
 
     if not len(trials):
@@ -285,9 +211,8 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in sections of its growth, for `misfit_figures.draw_where`.
-
-    The misfit of the initial model and its error are taken from the diagnosis if it contains them.
+    """Return the mean misfit of every condition in sections of its growth, for `misfit_figures.draw_where`. The misfit
+    of the initial model and its error are taken from the diagnosis if it contains them.
     """
     import pandas as pd
 
@@ -372,18 +297,7 @@ def _mean_misfits(members: pd.DataFrame, along: str, low: float, high: float) ->
 
 
 def round_heading(index: int, rounds: Sequence[Round]) -> str:
-    """Return the heading of a round of the diagnosis, as a question.
-
-    Parameters
-    ----------
-    index : int
-        Index of the round, from 0.
-    rounds : all rounds of the diagnosis.
-
-    Returns
-    -------
-    str
-    """
+    """Return the heading of a round of the diagnosis, as a question."""
     if index == 0:
         return "Which effect is missing from the initial model?"
     added = [name for name in rounds[index].model if name not in rounds[0].model]
@@ -391,17 +305,7 @@ def round_heading(index: int, rounds: Sequence[Round]) -> str:
 
 
 def ranking_table(ranked: Round) -> pd.DataFrame:
-    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN.
-
-    Parameters
-    ----------
-    ranked : one round of the diagnosis.
-
-    Returns
-    -------
-    DataFrame
-        One row per candidate.
-    """
+    """Return the ranking of a round as a table; Δχ² of candidates that are not testable is NaN."""
     import pandas as pd
 
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
@@ -413,17 +317,7 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
 
 
 def cosines_by_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
-    """Return the cosines of a round, ordered by rank, with the answer set first.
-
-    Parameters
-    ----------
-    ranked : one round of the diagnosis.
-
-    Returns
-    -------
-    names : list of str
-    matrix : list of lists of float
-    """
+    """Return the cosines of a round, ordered by rank, with the answer set first. Returns names, matrix."""
     names, matrix = ranked.cosine_names, ranked.cosines
     ranks = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
     order = sorted(range(len(matrix)), key=lambda i: ranks.get(names[i], (True, len(ranked.ranking))))

@@ -16,29 +16,7 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def describe_effects(name: str | None, experiment: Path | None, figure: Path | None) -> list[str]:
-    """List all effects, or explain one and draw it.
-
-    Parameters
-    ----------
-    name : str or None
-        Name of an effect; None for all.
-    experiment : Path or None
-        Experiment folder whose own effects are included.
-    figure : Path or None
-        Output file for the figure of the effect.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    ExperimentError
-        If the settings of the experiment cannot be read, or the figure has no name of an effect or no known format.
-    EffectError
-        If there is no such effect, or a file of the user's is not an effect.
-    """
+    """List all effects, or explain one and draw it."""
     from vinetrack.effects import catalogue, explanation, find_effect, listing
 
     user_effects = {} if experiment is None else effects_of(experiment)
@@ -59,25 +37,7 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
 
 
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
-    """Load and test the user's own effects of an experiment.
-
-    Parameters
-    ----------
-    experiment : Path
-        Folder with `experiment.yaml`.
-
-    Returns
-    -------
-    dict of Effect
-        By name.
-
-    Raises
-    ------
-    ExperimentError
-        If the settings cannot be read, or a file lies outside the folder.
-    EffectError
-        If a file is not an effect.
-    """
+    """Load and test the user's own effects of an experiment."""
     from vinetrack.core.tables import TableError, safe_join
     from vinetrack.effects import own_effects
     from vinetrack.experiment.settings import read_experiment_settings
@@ -90,18 +50,8 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
 
 
 def model_problems(experiment: Path) -> list[Problem]:
-    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`.
-
-    Returns nothing for the base model, nor if the experiment cannot be read, which `check_experiment` reports.
-
-    Parameters
-    ----------
-    experiment : Path
-        Experiment folder.
-
-    Returns
-    -------
-    list of Problem
+    """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`. Returns nothing for
+    the base model, nor if the experiment cannot be read, which `check_experiment` reports.
     """
     from vinetrack.core.constants import BASE_EFFECTS
     from vinetrack.dynamics.model import make_model
@@ -155,19 +105,7 @@ def _write_picture(effect: Effect, path: Path) -> None:
 
 
 def effects_content(name: str | None, experiment: Path | None) -> list[dict[str, Any]]:
-    """Describe all effects, or one, for a program; see `describe_effects`.
-
-    Parameters
-    ----------
-    name : str or None
-        Name of an effect; None for all.
-    experiment : Path or None
-        Experiment folder whose own effects are included.
-
-    Returns
-    -------
-    list of dict, one per effect
-    """
+    """Describe all effects, or one, for a program; see `describe_effects`."""
     from vinetrack.effects import catalogue, find_effect
 
     user_effects = {} if experiment is None else effects_of(experiment)

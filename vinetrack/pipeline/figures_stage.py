@@ -45,25 +45,7 @@ def draw_trials(
     n_workers: int = 1,
     only: Collection[str] | None = None,
 ) -> int:
-    """Draw `figures/trial_<trial>` for every trial that is not left out; return the number of figures.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Formats and resolution.
-    n_workers : int
-        Number of processes.
-    only : collection of str, optional
-        Names of the trials; all by default.
-
-    Returns
-    -------
-    int
-    """
+    """Draw `figures/trial_<trial>` for every trial that is not left out; return the number of figures."""
     results = Results(folder)
     by_trial = dict(iter(read_result(results.steady).groupby("trial", sort=False)))
     no_windows = read_result(results.steady).iloc[:0]
@@ -94,18 +76,7 @@ def _trial_figure(picture: _TrialPicture, results: Results) -> Figure:
 
 
 def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
-    """Draw position, speed and steady windows of one trial of a results folder.
-
-    Parameters
-    ----------
-    folder : results folder.
-    trial : row of the sheet; None if it could not be read.
-    name : name of the trial.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw position, speed and steady windows of one trial of a results folder."""
     results = Results(folder)
     windows = read_result(results.steady)
     title, ratio = (_describe_trial(trial), trial.travel_ratio) if trial is not None else (name, 2.0)
@@ -113,23 +84,7 @@ def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
 
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
-    """Draw the figures of the whole experiment that have content; remove those of an earlier run.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Formats and resolution.
-
-    Returns
-    -------
-    list of str
-        Names of the figures drawn, also written to `figures/campaign.json`, since Snakemake cannot know them in
-        advance.
-    """
+    """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
     from vinetrack.figures.registry import CAMPAIGN_FIGURES, draw
 
     results = Results(folder)
@@ -145,17 +100,8 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
 
 
 def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[Any, ...]]:
-    """Read the data of all figures of a whole experiment.
-
-    Parameters
-    ----------
-    folder : results folder.
-    known : trials of the sheet, for labels.
-
-    Returns
-    -------
-    dict
-        Arguments of the drawing function by name of the figure, for figures with content.
+    """Read the data of all figures of a whole experiment. Returns arguments of the drawing function by name of the
+    figure, for figures with content.
     """
     from vinetrack.figures.pixel_places import MIN_EDGES, subpixel_positions
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
@@ -220,20 +166,7 @@ def _features(trial: Trial) -> list[str]:
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
-    """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview.
-
-    Parameters
-    ----------
-    trials : DataFrame
-        `trials.csv`.
-    known : tuple of Trial
-        Trials of the sheet that could be read.
-
-    Returns
-    -------
-    DataFrame
-        With columns `condition_label` and `pressure_kPa`, NaN for a trial that could not be read.
-    """
+    """Add pressure and a short label of the condition to `trials.csv`, for the panels of the overview."""
     by_name: dict[str, Any] = {trial.name: trial for trial in known}
     labels, pressures = [], []
     for row in trials.itertuples():
@@ -249,19 +182,7 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
 
 
 def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
-    """Add vine and label of each condition to `comparison.csv`, sorted by vine and then pressure.
-
-    Parameters
-    ----------
-    comparison : DataFrame
-        `comparison.csv`.
-    described : DataFrame
-        From `describe_conditions`.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Add vine and label of each condition to `comparison.csv`, sorted by vine and then pressure."""
     first = described.drop_duplicates("condition").set_index("condition")
     vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
     labelled = comparison[comparison["condition"].isin(first.index)]
@@ -272,17 +193,8 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
 
 
 def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
-    """Return the data of the figures of a diagnosis that have content, by name.
-
-    Parameters
-    ----------
-    tables
-        Tables from `read_diagnosis_tables`.
-
-    Returns
-    -------
-    dict of tuple
-        Arguments of the drawing function.
+    """Return the data of the figures of a diagnosis that have content, by name. Returns arguments of the drawing
+    function.
     """
     from vinetrack.figures.registry import DIAGNOSIS_FIGURES
     from vinetrack.pipeline.diagnosis_tables import figure_tables
@@ -304,19 +216,8 @@ def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
 def with_final_model(
     trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
 ) -> dict[str, pd.DataFrame]:
-    """Add the predictions of the final model to trajectories, if effects were added.
-
-    Parameters
-    ----------
-    trajectories : dict of DataFrame
-        Tables of `comparison/` by condition.
-    diagnosed
-        Tables from `read_diagnosis_tables`.
-
-    Returns
-    -------
-    dict of DataFrame
-        With a column `model_after_m`, m, if the table has as many rows as the prediction.
+    """Add the predictions of the final model to trajectories, if effects were added. Returns with a column
+    `model_after_m`, m, if the table has as many rows as the prediction.
     """
     if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
         return dict(trajectories)

@@ -25,23 +25,7 @@ class ChosenFit:
 
 
 def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
-    """Choose the fit of a results folder to predict from.
-
-    Parameters
-    ----------
-    folder : results folder.
-    anyway : accept a refuted model.
-
-    Returns
-    -------
-    ChosenFit
-        `heading` states the verdict unless the model in use is `adequate`.
-
-    Raises
-    ------
-    ResultsError
-        If there is no fit, or its model was refuted and `anyway` is not given.
-    """
+    """Choose the fit of a results folder to predict from."""
     results = Results(folder)
     in_use = read_json(results.fit)
     diagnosis = read_diagnosis(results)

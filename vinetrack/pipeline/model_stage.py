@@ -33,29 +33,9 @@ log = logging.getLogger(__name__)
 
 
 def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
-    """Fit the model in use to all trials.
-
-    Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv`, `audit.csv` and `payload_model.csv`, the
-    modelled final speed against payload.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Settings of the run.
-
-    Returns
-    -------
-    dict
-        `fit.json` as written; `refused` is None or the reason.
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run.
+    """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv`,
+    `audit.csv` and `payload_model.csv`, the modelled final speed against payload. Returns `fit.json` as written;
+    `refused` is None or the reason.
     """
     from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
     from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
@@ -100,25 +80,8 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
 def measured_trials(
     experiment: Experiment, results: Results
 ) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
-    """Read the tracks and kinematics of all trials that did not fail from a results folder.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    results
-        Results folder.
-
-    Returns
-    -------
-    pairs : list of (Trial, Track)
-    kinematics : dict of Kinematics
-        By name of trial.
-
-    Raises
-    ------
-    ResultsError
-        If a trial has not been analysed.
+    """Read the tracks and kinematics of all trials that did not fail from a results folder. Returns pairs, kinematics
+    (by name of trial).
     """
     pairs, kinematics = [], {}
     failed: set[str] = set()
@@ -134,26 +97,8 @@ def measured_trials(
 
 
 def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
-    """Make a track of `tracks/<trial>.csv`, with the measured pressure.
-
-    The results do not contain the pressure: it is read from the user's track or pressure trace.
-
-    Parameters
-    ----------
-    trial
-        Row of the sheet, which names those files.
-    table : DataFrame
-        `tracks/<trial>.csv`.
-
-    Returns
-    -------
-    Track
-        With `pressure_Pa` if it was measured.
-
-    Raises
-    ------
-    ResultsError
-        If the pressure cannot be read.
+    """Make a track of `tracks/<trial>.csv`, with the measured pressure. The results do not contain the pressure: it is
+    read from the user's track or pressure trace.
     """
     from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
 
@@ -262,22 +207,7 @@ def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame])
 
 
 def comparison_lines(folder: Path) -> list[str]:
-    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty.
-
-    Parameters
-    ----------
-    folder
-        Results folder.
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    ResultsError
-        If the model has not been fitted there.
-    """
+    """Return `comparison.csv` as aligned lines for the terminal, or the reason why it is empty."""
     from vinetrack.core.terminal import table as aligned
 
     results = Results(folder)

@@ -35,38 +35,16 @@ log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
-FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0
-"""Limits of the playback rate of a clip, frames per second. Chosen: 30 is what players and eyes can follow, and 4 is
-still perceived as motion. At half or twice clips play jerkily or skip frames; nothing else depends on it."""
+FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0  # Limits of the playback rate of a clip, frames per second (chosen)
 
-MARGIN_FRAMES = 8
-"""Frames before and after the motion that a clip shows. Chosen: a third of a second at 25 frames per second, so that
-start and end are visible."""
+MARGIN_FRAMES = 8  # Frames before and after the motion that a clip shows (chosen)
 
-FEWEST_POINTS = 5
-"""Fewest points known in pixels and in metres for drawing a prediction into the picture. Derived: a parabola takes
-three, and two more test its fit."""
+FEWEST_POINTS = 5  # Fewest points known in pixels and in metres for drawing a prediction into the picture (derived)
 
 
 def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySettings, n_workers: int = 1) -> list[str]:
-    """Write the clips that the settings request; return a line for every clip that could not be made.
-
-    A recording that cannot be drawn does not stop the others. The folder is created even without clips.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Choice of trials, width and duration.
-    n_workers : int
-        Number of processes.
-
-    Returns
-    -------
-    list of str
+    """Write the clips that the settings request; return a line for every clip that could not be made. A recording that
+    cannot be drawn does not stop the others. The folder is created even without clips.
     """
     results = Results(folder)
     results.overlays.mkdir(parents=True, exist_ok=True)
@@ -77,30 +55,7 @@ def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySetting
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
-    """Write the clip of one trial of a results folder with the settings of its run; return its path.
-
-    Parameters
-    ----------
-    folder
-        Results folder.
-    trial : str
-        Name of the trial.
-    experiment : Path, optional
-        Path of the experiment; None for the one recorded in the results.
-    seconds : float, optional
-        Approximate duration of the clip, s; None for that of the run.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    ResultsError
-        If there is no such trial, or no clip of it can be made.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Write the clip of one trial of a results folder with the settings of its run; return its path."""
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import OverlaySettings
 
@@ -118,22 +73,7 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
 
 
 def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
-    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none.
-
-    Parameters
-    ----------
-    experiment
-        Sheet.
-    results
-        Results folder.
-    of : {'one_per_condition', 'all', 'none'}
-        Setting `overlays.of`.
-
-    Returns
-    -------
-    list of str
-        Names of trials.
-    """
+    """Return the names of the trials to draw: the first tracked recording of every condition, all, or none."""
     if of == "none":
         return []
     trials = read_result(results.trials)
@@ -161,13 +101,7 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
 
 
 def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
-    """Write the clip of one trial; return its path.
-
-    Raises
-    ------
-    ResultsError
-        If it has no recording, was not tracked, or its recording cannot be read.
-    """
+    """Write the clip of one trial; return its path."""
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.write import write_clip
 
@@ -187,22 +121,7 @@ def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) ->
 
 
 def frames_to_show(track: pd.DataFrame) -> range:
-    """Return the range of frames in which the edge moves, with `MARGIN_FRAMES` before and after.
-
-    Parameters
-    ----------
-    track : DataFrame
-        `tracks/<trial>.csv`.
-
-    Returns
-    -------
-    range
-
-    Raises
-    ------
-    ResultsError
-        If no edge was found.
-    """
+    """Return the range of frames in which the edge moves, with `MARGIN_FRAMES` before and after."""
     edge = track["edge_px"].to_numpy(dtype=float)
     tracked = np.flatnonzero(np.isfinite(edge))
     if tracked.size < FEWEST_POINTS:
@@ -214,28 +133,8 @@ def frames_to_show(track: pd.DataFrame) -> range:
 
 
 def playback_rate(n_frames: int, seconds: float) -> tuple[float, int]:
-    """Return playback rate and stride of a clip that lasts about `seconds`.
-
-    Parameters
-    ----------
-    n_frames : int
-        Number of frames to show.
-    seconds : float
-        Desired duration, s.
-
-    Returns
-    -------
-    play_fps : float
-        Frames per second.
-    stride : int
-        Every how many frames of the recording one is shown.
-
-    Examples
-    --------
-    >>> playback_rate(120, 6.0)
-    (20.0, 1)
-    >>> playback_rate(3420, 6.0)
-    (30.0, 19)
+    """Return playback rate and stride of a clip that lasts about `seconds`. Returns play_fps (frames per second),
+    stride (every how many frames of the recording one is shown).
     """
     stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
     return float(np.clip(n_frames / stride / seconds, SLOWEST_FPS, FASTEST_FPS)), stride
@@ -277,21 +176,7 @@ def _pictures(
 def draw_over(
     recording: Recording, view: ClipView, edges: list[Edge], time_ms: Floats, shown: range, stride: int
 ) -> Iterator[NDArray[np.uint8]]:
-    """Draw edges over the frames of a recording.
-
-    Parameters
-    ----------
-    recording : an inspected recording.
-    view : layout of the clip.
-    edges : edges to draw, px along the axis of the view.
-    time_ms : time of every frame since release, shape (n_frames,); NaN if the capture rate is unknown.
-    shown : range of frames to show.
-    stride : every how many frames one is shown.
-
-    Yields
-    ------
-    frames of the clip, RGB, uint8, shape (height, width, 3).
-    """
+    """Draw edges over the frames of a recording. Shapes: time_ms (n_frames,)."""
     from vinetrack.figures.overlay import compose, levels
     from vinetrack.video.frames import iterate_frames
 
@@ -307,18 +192,8 @@ def draw_over(
 
 
 def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
-    """Return the shift of each frame along the axis due to camera shake, px; 0 for a camera at rest.
-
-    Parameters
-    ----------
-    line : mapping
-        `axis` of `analysed/<trial>.json`; without `shake_px` if the camera was at rest.
-    n_frames : int
-        Number of frames of the recording.
-
-    Returns
-    -------
-    array, shape (n_frames,)
+    """Return the shift of each frame along the axis due to camera shake, px; 0 for a camera at rest. Shape
+    (n_frames,).
     """
     shake_px = np.zeros(n_frames)
     stored_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
@@ -327,21 +202,8 @@ def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
 
 
 def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
-    """Return the tracked edge, the predicted edges if there are any, and the time of release, s.
-
-    Parameters
-    ----------
-    trial : str
-        Name of the trial.
-    results
-        Results folder.
-    track : DataFrame
-        `tracks/<trial>.csv`.
-
-    Returns
-    -------
-    edges : list of Edge
-    release_s : float
+    """Return the tracked edge, the predicted edges if there are any, and the time of release, s. Returns edges,
+    release_s.
     """
     from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 
@@ -370,24 +232,8 @@ def edges_to_draw(trial: str, results: Results, track: pd.DataFrame) -> tuple[li
 
 
 def position_to_px(track: pd.DataFrame) -> Any:
-    """Return the conversion from metres to pixels along the axis, fitted to the points of a track.
-
-    It is a quadratic polynomial, since lens distortion and tilt make it slightly nonlinear.
-
-    Parameters
-    ----------
-    track : DataFrame
-        `tracks/<trial>.csv`.
-
-    Returns
-    -------
-    numpy.polynomial.Polynomial
-        Of second degree, fitted by least squares.
-
-    Raises
-    ------
-    ResultsError
-        If too few points are known in both.
+    """Return the conversion from metres to pixels along the axis, fitted to the points of a track. It is a quadratic
+    polynomial, since lens distortion and tilt make it slightly nonlinear.
     """
     both = track[["lead_position_m", "edge_px"]].dropna()
     metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)

@@ -39,22 +39,7 @@ FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend wit
 
 
 def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
-    """Write `paper.csv` and the tables of the figures; return `paper.csv` as written.
-
-    Parameters
-    ----------
-    experiment : experiment whose setting `published` requests the comparison.
-    folder : results folder.
-
-    Returns
-    -------
-    DataFrame
-
-    Raises
-    ------
-    ResultsError
-        If the experiment does not request it, or a stage before this one has not run.
-    """
+    """Write `paper.csv` and the tables of the figures; return `paper.csv` as written."""
     from vinetrack.paper.arithmetic import computed_rows
     from vinetrack.paper.protocol import protocol_rows
     from vinetrack.paper.result_rows import result_rows
@@ -114,13 +99,7 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures of the comparison from the tables of `compare_with_paper`.
-
-    Parameters
-    ----------
-    folder : results folder.
-    settings : formats and resolution.
-    """
+    """Draw the figures of the comparison from the tables of `compare_with_paper`."""
     from vinetrack.figures.registry import draw
     from vinetrack.figures.style import render
 

@@ -15,33 +15,14 @@ from vinetrack.core.terminal import progress
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
-MIN_ITEMS_FOR_POOL = 8
-"""Fewest items for which a second process is started. Chosen: starting a process takes as long as a few trials. At half
-small experiments take longer; at twice larger ones are not distributed."""
+MIN_ITEMS_FOR_POOL = 8  # Fewest items for which a second process is started (chosen)
 
 
 def map_trials(
     function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int, label: str
 ) -> Iterator[Answer]:
-    """Yield `function(item)` for every item, in order, with a progress bar on a terminal.
-
-    `function` and items are sent to other processes and must be picklable.
-
-    Parameters
-    ----------
-    function : callable
-        Applied to each item.
-    items : sequence
-        Arguments.
-    n_workers : int
-        Number of processes; below 2, this process does all the work.
-    label : str
-        Text of the progress bar.
-
-    Yields
-    ------
-    Answer
-        In the order of `items`.
+    """Yield `function(item)` for every item, in order, with a progress bar on a terminal. `function` and items are sent
+    to other processes and must be picklable.
     """
     if n_workers < 2 or len(items) < MIN_ITEMS_FOR_POOL:
         yield from progress(map(function, items), label, total=len(items))
@@ -52,22 +33,8 @@ def map_trials(
 
 
 def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
-    """Yield `function(item)` of every item as soon as it is ready, in any order.
-
-    `function` and items are sent to other processes and must be picklable.
-
-    Parameters
-    ----------
-    function : callable
-        Applied to each item.
-    items : sequence
-        Arguments.
-    n_workers : int
-        Number of processes; below 2, this process does all the work.
-
-    Yields
-    ------
-    Answer
+    """Yield `function(item)` of every item as soon as it is ready, in any order. `function` and items are sent to other
+    processes and must be picklable.
     """
     if n_workers < 2 or len(items) < 2:
         yield from map(function, items)
@@ -88,10 +55,9 @@ def _pool(n_workers: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent process ends, even if the parent is killed.
-
-    A worker waits for its next argument on a pipe that the other workers hold open as well: after a killed run all of
-    them would wait forever and keep their memory.
+    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
+    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
+    memory.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None

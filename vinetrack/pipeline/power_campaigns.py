@@ -24,19 +24,14 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
 
-DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0
-"""Default noise of a position, and default frame rate. Chosen: those of `vinetrack design campaign`. At half the noise,
-effects limited by noise are detected at half the size; those limited by between-trial scatter are not."""
+DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)
 
 
 @dataclass(frozen=True)
 class PowerRequest:
     """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
-
     `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
-    with each. `reach` is the probability with which further trials shall detect each effect; the fewest such trials are
-    determined. `calibrate` is the number of simulated null campaigns against which the tests of the first model are
-    calibrated.
+    with each.
     """
 
     target: Path
@@ -80,16 +75,7 @@ class MeasuredTrials:
 
 
 def campaign_of_target(request: PowerRequest) -> PowerCampaign:
-    """Return the campaign of the measured trials of the target; without any, that of the planned trials.
-
-    Parameters
-    ----------
-    request : options of the command.
-
-    Returns
-    -------
-    PowerCampaign
-    """
+    """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
     from vinetrack.experiment.planned import planned_sheet
 
     measured = trials_of_target(request)
@@ -99,17 +85,7 @@ def campaign_of_target(request: PowerRequest) -> PowerCampaign:
 
 
 def trials_of_target(request: PowerRequest) -> MeasuredTrials | None:
-    """Read the trials of a results folder or of an experiment with tracks.
-
-    Parameters
-    ----------
-    request : its `target`, and `experiment` where that has moved.
-
-    Returns
-    -------
-    MeasuredTrials or None
-        None for a target without measurements.
-    """
+    """Read the trials of a results folder or of an experiment with tracks."""
     from vinetrack.effects import own_effects
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
@@ -131,17 +107,7 @@ def trials_of_target(request: PowerRequest) -> MeasuredTrials | None:
 
 
 def campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> PowerCampaign:
-    """Return the campaign of a fit, or of trials in memory with the base model.
-
-    Parameters
-    ----------
-    request : options of the command.
-    given : a fit, or pairs of trial and track.
-
-    Returns
-    -------
-    PowerCampaign
-    """
+    """Return the campaign of a fit, or of trials in memory with the base model."""
     from vinetrack.inference.fit_result import Fit
 
     if isinstance(given, Fit):
@@ -169,17 +135,7 @@ def _trials_of_results(request: PowerRequest) -> MeasuredTrials:
 
 
 def measured_campaign(request: PowerRequest, measured: MeasuredTrials) -> PowerCampaign:
-    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit.
-
-    Parameters
-    ----------
-    request : options of the command.
-    measured : the trials, and the model to fit.
-
-    Returns
-    -------
-    PowerCampaign
-    """
+    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
     from vinetrack.diagnosis.initial_fit import candidates_of
     from vinetrack.dynamics.host import host_for
     from vinetrack.dynamics.model import make_model

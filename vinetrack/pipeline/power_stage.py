@@ -35,23 +35,7 @@ if TYPE_CHECKING:
 
 @in_one_blas_thread
 def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> Power:
-    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns.
-
-    Parameters
-    ----------
-    request : options of the command.
-    given : optional
-        A fit, or pairs of trial and track, in place of the target.
-
-    Returns
-    -------
-    Power
-
-    Raises
-    ------
-    ExperimentError, ResultsError, EffectError, FitError
-        If the trials cannot be read or fitted, or an effect is unknown.
-    """
+    """Calculate the power of the trials by linear theory and, if requested, by diagnoses of simulated campaigns."""
     from vinetrack.core.terminal import waiting
 
     with waiting("calculating the power of the trials"):
@@ -87,19 +71,7 @@ def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[
 
 
 def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook) -> str:
-    """Recommend the further trials of a campaign that goes on, in words; blank where none can be recommended.
-
-    Parameters
-    ----------
-    target : a results folder or an experiment of measured tracks.
-    experiment : new path of the experiment of a results folder, if it has moved.
-    look : the last one. If it names one effect, the trials tell most about it and its rival; if it names none, they
-        reveal most of what could be missing.
-
-    Returns
-    -------
-    str
-    """
+    """Recommend the further trials of a campaign that goes on, in words; blank where none can be recommended."""
     from vinetrack.core.terminal import waiting
     from vinetrack.diagnosis.informative_trials import confirming_trials, exploratory_trials
     from vinetrack.narrative.further_text import informative_text
@@ -122,17 +94,7 @@ def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:
-    """Return the rows of the sheet for the further trials.
-
-    Parameters
-    ----------
-    power : power with further trials.
-
-    Returns
-    -------
-    list of dict
-        Cells by column, one row per trial; several effects in sequence.
-    """
+    """Return the rows of the sheet for the further trials."""
     return [
         {"trial": f"{plan.effect}_{k}" if len(power.further) > 1 else added.trial.name, **sheet_cells(added.trial)}
         for plan in power.further

@@ -31,13 +31,10 @@ if TYPE_CHECKING:
     from vinetrack.planning.design_checks import Neglected
     from vinetrack.planning.prediction import Quantity, VinePrediction
 
-SMALL_FORCE_N = 0.01
-"""Forces are shown in mN if all are below this, N. Chosen: three digits then need no leading zeros."""
+SMALL_FORCE_N = 0.01  # Forces are shown in mN if all are below this, N (chosen)
 
+# Smallest relative change of the final speed for which a neglected effect is listed (chosen)
 SMALLEST_LISTED_CHANGE = 0.005
-"""Smallest relative change of the final speed for which a neglected effect is listed. Chosen: 0.5 % is a tenth of the
-resolution of a good measurement of speed. At half insignificant effects are listed; at twice some of 1 % are
-missing."""
 
 
 @dataclass(frozen=True)
@@ -59,29 +56,7 @@ def predict_conditions(
     csv: Path | None = None,
     json: Path | None = None,
 ) -> list[str]:
-    """Predict all conditions; write figure, curves and JSON if requested.
-
-    Parameters
-    ----------
-    request
-        Inputs of the prediction.
-    samples, seed : int
-        Number of draws, and seed of the random numbers.
-    at_fraction : float
-        y/L at which a bare vine's final speed is evaluated.
-    figure, csv, json : Path, optional
-        Output files for the figure, the curves and all numbers.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    ExperimentError, ResultsError, EffectError
-        If an input is not allowed; see `read_basis`.
-    """
+    """Predict all conditions; write figure, curves and JSON if requested."""
     import pandas as pd
 
     check_figure(figure)
@@ -104,13 +79,7 @@ def predict_conditions(
 
 
 def _predict_all(basis: PredictionBasis, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
-    """Predict every condition.
-
-    Raises
-    ------
-    ResultsError
-        If a condition cannot be simulated, or the fit is not one of everting vines.
-    """
+    """Predict every condition."""
     from vinetrack.core.terminal import progress
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError

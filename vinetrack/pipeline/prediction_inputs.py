@@ -34,10 +34,9 @@ NEVER = "never"
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """Options of a command about new vines; NaN and None for those not given.
-
-    `cells` are texts by column of the sheet, for the columns that were given. `B_error` and the between-trial standard
-    deviations `spreads` are relative. `anyway` allows a fit whose model was refuted.
+    """Options of a command about new vines; NaN and None for those not given. `cells` are texts by column of the sheet,
+    for the columns that were given. `B_error` and the between-trial standard deviations `spreads` are relative.
+    `anyway` allows a fit whose model was refuted.
     """
 
     cells: Mapping[str, str] = field(default_factory=dict)
@@ -63,27 +62,7 @@ class PredictionBasis:
 
 
 def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) -> PredictionBasis:
-    """Read the sheet or the options, the fit, and the requested effects.
-
-    Parameters
-    ----------
-    request : options of the command.
-    needed : sequence of str, optional
-        Required columns; by default those that a prediction needs.
-
-    Returns
-    -------
-    PredictionBasis
-
-    Raises
-    ------
-    ExperimentError
-        If the sheet or an option has an error.
-    ResultsError
-        If the results folder has no usable fit.
-    EffectError
-        If an effect is unknown or has no such size.
-    """
+    """Read the sheet or the options, the fit, and the requested effects."""
     from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
     from vinetrack.experiment.settings import ExperimentSettings
     from vinetrack.planning.input_sources import StatedValues
@@ -137,28 +116,12 @@ def _effects_of_sheet(planned: PlannedTrials) -> Mapping[str, Effect]:
 
 
 def fit_heading(request: PredictionRequest) -> list[str]:
-    """Return the heading for everything predicted from a fit: the verdict on its model.
-
-    Parameters
-    ----------
-    request : options of the command.
-
-    Returns
-    -------
-    list of str
-        Empty without a fit, and if its model is adequate.
-    """
+    """Return the heading for everything predicted from a fit: the verdict on its model."""
     return [] if request.results is None else list(choose_fit(request.results, request.anyway).heading)
 
 
 def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Effect]]:
-    """Read the fit of a results folder, and the user's own effects if its model contains any.
-
-    Raises
-    ------
-    ResultsError
-        If the folder holds no fit, its model was refuted, or an effect of it can no longer be found.
-    """
+    """Read the fit of a results folder, and the user's own effects if its model contains any."""
     from vinetrack.effects import catalogue
     from vinetrack.inference.fit_data import FitError
     from vinetrack.pipeline.effects_stage import effects_of
@@ -183,22 +146,7 @@ def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Eff
 
 
 def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
-    """Return the predictive inputs of every trial.
-
-    Parameters
-    ----------
-    basis : result of `read_basis`.
-
-    Returns
-    -------
-    list of PredictiveInputs
-        In the order of the trials.
-
-    Raises
-    ------
-    ResultsError
-        If the fit is not one of everting vines.
-    """
+    """Return the predictive inputs of every trial."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.planning.input_sources import predictive_inputs
 
@@ -209,16 +157,7 @@ def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
 
 
 def name_missing_option(error: Exception) -> Exception:
-    """Convert an error about a missing input of an effect to one that names the option; return others unchanged.
-
-    Parameters
-    ----------
-    error : error raised by an effect.
-
-    Returns
-    -------
-    Exception
-    """
+    """Convert an error about a missing input of an effect to one that names the option; return others unchanged."""
     match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
     if match is None:
         return error
@@ -229,56 +168,17 @@ def name_missing_option(error: Exception) -> Exception:
 
 
 def warnings_of(basis: PredictionBasis) -> list[str]:
-    """Return warnings about values of the sheet or the options that are allowed but implausible.
-
-    Parameters
-    ----------
-    basis : result of `read_basis`.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return warnings about values of the sheet or the options that are allowed but implausible."""
     return [str(problem) for problem in basis.planned.problems]
 
 
 def format_volume(volume_m3: float) -> str:
-    """Return a volume in litres, or in millilitres below 0.1 L.
-
-    Parameters
-    ----------
-    volume_m3 : float
-        m³.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> format_volume(3.7e-3), format_volume(3.534e-6)
-    ('3.7 L', '3.53 mL')
-    """
+    """Return a volume in litres, or in millilitres below 0.1 L."""
     return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
 
 
 def describe_trial(trial: Trial) -> str:
-    """Describe a trial in one line.
-
-    Parameters
-    ----------
-    trial : the trial.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> from vinetrack.core.records import Trial
-    >>> describe_trial(Trial(name="a", diameter_m=0.025, thickness_m=1e-4, length_m=0.4, pressure_Pa=62e3))
-    '25 mm × 100 µm × 400 mm at 62 kPa, no payload, growing straight down'
-    """
+    """Describe a trial in one line."""
     size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
     payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
     degrees = math.degrees(trial.growth_angle_rad)
@@ -290,53 +190,19 @@ def describe_trial(trial: Trial) -> str:
 
 
 def display_value(value: float, unit: str, digits: int = 3) -> str:
-    """Format an SI value in its display unit; infinity, a time that is never reached, is `never`.
-
-    Parameters
-    ----------
-    value : float
-        SI.
-    unit : str
-        SI unit.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-    """
+    """Format an SI value in its display unit; infinity, a time that is never reached, is `never`."""
     if math.isinf(value):
         return NEVER
     return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
 
 
 def display_unit_name(unit: str) -> str:
-    """Return the unit that `display_value` uses.
-
-    Parameters
-    ----------
-    unit : str
-        SI unit.
-
-    Returns
-    -------
-    str
-    """
+    """Return the unit that `display_value` uses."""
     return display_unit(unit, PREDICTION_UNITS)[0]
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
-    """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out.
-
-    Parameters
-    ----------
-    inputs : sequence of Input
-        Inputs of one prediction.
-
-    Returns
-    -------
-    list of tuple of str
-    """
+    """Return rows of a table of inputs: symbol, median, 90 % band, unit, origin; constants of nature are left out."""
     rows = []
     for entry in inputs:
         if entry.origin == "constant":
@@ -350,20 +216,7 @@ def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
 
 
 def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
-    """Write a figure in the format that the suffix names.
-
-    Parameters
-    ----------
-    fig : matplotlib figure.
-    path : output file.
-    dpi : float
-        Resolution of a bitmap.
-
-    Raises
-    ------
-    ExperimentError
-        If the suffix does not name a format.
-    """
+    """Write a figure in the format that the suffix names."""
     from vinetrack.figures.style import render
 
     check_figure(path)
@@ -372,18 +225,7 @@ def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
 
 
 def check_figure(path: Path | None) -> None:
-    """Check the suffix of an output figure before anything is computed.
-
-    Parameters
-    ----------
-    path : Path or None
-        Output file for a figure.
-
-    Raises
-    ------
-    ExperimentError
-        If the suffix does not name a format.
-    """
+    """Check the suffix of an output figure before anything is computed."""
     if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
         remedy = f"end it in one of {', '.join(FIGURE_FORMATS)}"
         raise ExperimentError([Problem(message="is not the name of a picture", file=str(path), remedy=remedy)])

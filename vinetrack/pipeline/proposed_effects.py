@@ -23,27 +23,7 @@ class WrittenProposal:
 
 
 def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
-    """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table.
-
-    Parameters
-    ----------
-    experiment : sheet and settings.
-    folder : results folder with a diagnosis.
-    to : output file; None for a file in the experiment folder.
-    report : callable
-        Called with a description of each step.
-
-    Returns
-    -------
-    WrittenProposal
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run, or the diagnosis did not end as `unexplained`.
-    FitError
-        If the model cannot be simulated.
-    """
+    """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table."""
     from vinetrack.core.tables import write_text
     from vinetrack.diagnosis.learned_effect import table_text
     from vinetrack.diagnosis.propose import effect_text, propose

@@ -28,21 +28,7 @@ log = logging.getLogger(__name__)
 
 
 def analyse_recording(experiment: Experiment, name: str, folder: Path, settings: RunSettings) -> str:
-    """Track the recording of one trial and analyse its motion; write all files of the trial.
-
-    Parameters
-    ----------
-    experiment : sheet and settings.
-    name : str
-        Name of the trial.
-    folder : results folder.
-    settings : settings of the run.
-
-    Returns
-    -------
-    str
-        A line for the terminal: what was found, or why it failed.
-    """
+    """Track the recording of one trial and analyse its motion; write all files of the trial."""
     trial = experiment.trial(name)
     results = Results(folder)
     reason, fault = _analyse(experiment, trial, results, settings)
@@ -110,13 +96,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
 
 
 def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
-    """Return the measured sizes and exposures that contradict the sheet, as warnings.
-
-    Raises
-    ------
-    RecordingError
-        If a difference is larger than lens and ruler can explain.
-    """
+    """Return the measured sizes and exposures that contradict the sheet, as warnings."""
     from vinetrack.video.frames import RecordingError
     from vinetrack.video.recording_facts import exposure_problems, size_problems, tracked_facts
 

@@ -27,37 +27,17 @@ if TYPE_CHECKING:
 
 _SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
 _DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
+# Addition to the caption of a figure that shows the initial model, if that is refuted
 OF_INITIAL_MODEL = {
     **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _SHOWS_REFUTED),
     **dict.fromkeys(("model_comparison", "before_after"), _DASHED_REFUTED),
 }
-"""Addition to the caption of a figure that shows the initial model, if that is refuted."""
 
-MAX_CURVE_ROWS = 6000
-"""Largest number of rows of the downloadable curves. Chosen: about 300 kB of the page."""
+MAX_CURVE_ROWS = 6000  # Largest number of rows of the downloadable curves (chosen)
 
 
 def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
-    """Write `provenance.json` and `report.html`; return the path of the report.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings : mapping
-        Settings of the run, for `provenance.json`.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    ResultsError
-        If a stage before this one has not run.
-    """
+    """Write `provenance.json` and `report.html`; return the path of the report."""
     from vinetrack.report.build import build_report
 
     results = Results(folder)
@@ -69,26 +49,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
 
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
-    """Collect the content of the report from a results folder.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings : mapping
-        Settings of the run, for `provenance.json`.
-
-    Returns
-    -------
-    ReportContent
-
-    Raises
-    ------
-    ResultsError
-        If a stage has not run.
-    """
+    """Collect the content of the report from a results folder."""
     from vinetrack.report.build import ReportContent
 
     results = Results(folder)

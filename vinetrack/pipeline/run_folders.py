@@ -13,27 +13,11 @@ from vinetrack.core.problems import ExperimentError, Problem
 
 PACKAGE = Path(__file__).parents[1]
 
-CLAIM_FILE = "experiment.json"
-"""File of a results folder that names its experiment from the start of a run; `provenance.json` is written last."""
+CLAIM_FILE = "experiment.json"  # File of a results folder that names its experiment from the start of a run
 
 
 def find_experiment(folder: Path) -> Path:
-    """Return `folder` if it exists.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder, as given by the user.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    ExperimentError
-        If it does not exist; the message suggests a similar name or existing experiments.
-    """
+    """Return `folder` if it exists."""
     if folder.exists():
         return folder
     parent = folder.absolute().parent
@@ -57,16 +41,7 @@ def _shown(path: Path) -> str:
 
 
 def command_for_results(experiment: Path, results: Path) -> str:
-    """Return the command that writes the results of an experiment to the folder where they are.
-
-    Parameters
-    ----------
-    experiment, results : the two folders.
-
-    Returns
-    -------
-    str
-    """
+    """Return the command that writes the results of an experiment to the folder where they are."""
     name, where = experiment.absolute().name, results.absolute()
     if where.name != name:
         return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
@@ -76,18 +51,8 @@ def command_for_results(experiment: Path, results: Path) -> str:
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
-    """Return the ground truth of a shipped virtual experiment; None for any other folder.
-
-    The virtual laboratory has a file for each folder of `data/` that it makes, with the same name.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-    base : checkout that may contain `data/`.
-
-    Returns
-    -------
-    path of the ground truth, or None.
+    """Return the ground truth of a shipped virtual experiment; None for any other folder. The virtual laboratory has a
+    file for each folder of `data/` that it makes, with the same name.
     """
     for ground_truth in sorted((PACKAGE / "laboratory").glob("*.yaml")):
         shipped = base / "data" / ground_truth.stem
@@ -97,18 +62,7 @@ def find_ground_truth(folder: Path, base: Path) -> Path | None:
 
 
 def refuse_shared_results(results: Path, experiment: Path) -> None:
-    """Refuse a results folder that holds the results of another experiment.
-
-    Parameters
-    ----------
-    results : results folder, which need not exist.
-    experiment : experiment whose results are to be written there.
-
-    Raises
-    ------
-    ExperimentError
-        If the folder was made from another experiment that still exists; the message names both.
-    """
+    """Refuse a results folder that holds the results of another experiment."""
     for name in ("provenance.json", CLAIM_FILE):
         try:
             made_from = Path(str(json.loads((results / name).read_text(encoding="utf-8"))["experiment"]))
@@ -124,29 +78,14 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
 
 
 def claim_results(results: Path, experiment: Path) -> None:
-    """Record to which experiment a results folder belongs, before the first result is written.
-
-    Parameters
-    ----------
-    results : results folder; created if it does not exist.
-    experiment : experiment folder.
-    """
+    """Record to which experiment a results folder belongs, before the first result is written."""
     from vinetrack.core.tables import write_json
 
     write_json(results / CLAIM_FILE, {"experiment": experiment.absolute().as_posix()})
 
 
 def path_problems(*folders: Path) -> list[Problem]:
-    """Report folders whose path Snakemake would take for a pattern.
-
-    Parameters
-    ----------
-    folders : folders of an experiment or of results.
-
-    Returns
-    -------
-    problems : an error for each path with braces or a word in angle brackets.
-    """
+    """Report folders whose path Snakemake would take for a pattern."""
     return [
         Problem(
             message="has braces or a word in < > in its path, which Snakemake cannot handle", file=str(folder),
@@ -158,14 +97,5 @@ def path_problems(*folders: Path) -> list[Problem]:
 
 
 def has_wildcard(path: Path) -> bool:
-    """Whether Snakemake would take part of a path for a wildcard or a variable, which cannot be escaped.
-
-    Parameters
-    ----------
-    path : the path.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether Snakemake would take part of a path for a wildcard or a variable, which cannot be escaped."""
     return re.search(r"[{}]|<\w+>", str(path)) is not None

@@ -20,25 +20,20 @@ from pathlib import Path
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_text
 
-START_TOLERANCE_S = 1.0
-"""Largest difference between two readings of the start time of one process. Derived: systems count it in hundredths of
-a second; a process id is reused only after all others were used, minutes later at the earliest."""
-MIN_UNFINISHED_AGE_S = 60.0
-"""Age from which an unfinished file in the experiment folder counts as abandoned; a younger one may be a save in
-progress. Chosen: a save takes milliseconds; half or twice matters on network drives only."""
-OWNER_FILE = ".run.json"
-"""File of a results folder that names the process writing it."""
+START_TOLERANCE_S = 1.0  # Largest difference between two readings of the start time of one process (derived)
+MIN_UNFINISHED_AGE_S = 60.0  # Age from which an unfinished file in the experiment folder counts as abandoned (chosen)
+OWNER_FILE = ".run.json"  # File of a results folder that names the process writing it
 
 LOCK_REMOVED = "Removed the lock of an interrupted run"
+# Temporary names of files that are being written
 UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
-"""Temporary names of files that are being written."""
 
 
+# Options of Snakemake with which it executes no jobs
 NON_EXECUTING_OPTIONS = re.compile(
     r"-[a-zA-Z]*[nlhDS][a-zA-Z]*|--(dry-?run|unlock|lint|report|summary|detailed-summary|dag|rulegraph|filegraph|d3dag|list.*|help|"
     r"version|archive|print-compilation|cleanup-.*|delete-.*|containerize)(=.*)?"
 )
-"""Options of Snakemake with which it executes no jobs."""
 
 
 @dataclass(frozen=True)
@@ -64,52 +59,20 @@ class RunOwner:
 
 
 def executes_nothing(options: Iterable[str]) -> bool:
-    """Whether Snakemake executes no jobs with these options, as in a dry run, a listing, or an unlock.
-
-    Parameters
-    ----------
-    options : options of its command line.
-
-    Returns
-    -------
-    True if no jobs are executed.
-    """
+    """Whether Snakemake executes no jobs with these options, as in a dry run, a listing, or an unlock."""
     return any(NON_EXECUTING_OPTIONS.fullmatch(option) for option in options)
 
 
 def refuse_running(results: Path) -> None:
-    """Refuse a results folder that another running process writes.
-
-    Parameters
-    ----------
-    results : results folder.
-
-    Raises
-    ------
-    ExperimentError
-        If there is such a process; the message names it.
-    """
+    """Refuse a results folder that another running process writes."""
     owner = _read_owner(results / OWNER_FILE)
     if owner is not None and owner.pid != os.getpid() and owner.is_alive:
         raise ExperimentError([_refusal(owner, results)])
 
 
 def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str], None]) -> None:
-    """Make this process the owner of a results folder, and clean up after a killed run.
-
-    Removes the locks and the unfinished files of a run that has ended. The ownership ends with this process.
-
-    Parameters
-    ----------
-    results : results folder.
-    experiment : experiment folder; unfinished files directly in it are removed as well.
-    working : folder in which Snakemake runs; its locks are in `.snakemake` there.
-    say : prints a line.
-
-    Raises
-    ------
-    ExperimentError
-        If another running process writes these results; the message names it.
+    """Make this process the owner of a results folder, and clean up after a killed run. Removes the locks and the
+    unfinished files of a run that has ended. The ownership ends with this process.
     """
     refuse_running(results)
     owner_file = (results / OWNER_FILE).absolute()  # Snakemake may change the working directory before it exits
@@ -124,13 +87,7 @@ def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str
 
 
 def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
-    """Remove unfinished files of a program that was killed.
-
-    Parameters
-    ----------
-    paths : paths to consider; only those with the temporary name of an unfinished file are removed.
-    older_than_s : minimum age, s.
-    """
+    """Remove unfinished files of a program that was killed."""
     for path in [path for path in paths if UNFINISHED_FILES.fullmatch(path.name)]:
         with contextlib.suppress(OSError):
             if path.is_file() and time.time() - path.stat().st_mtime >= older_than_s:

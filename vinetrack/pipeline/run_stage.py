@@ -32,15 +32,14 @@ _FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+?)(?:_(\d+))?\)")
 _STEPS = re.compile(r"^(\d+) of (\d+) steps")
 _FAILED = re.compile(r"^Error in rule (\w+)")
 _STAGE_LOG = re.compile(r"^\s+log: (\S.*\.log)")
+# Lines that Snakemake prints about itself; format of version 9
 _SNAKEMAKE_LINES = re.compile(
     r"^(\[|\s|$|Finished jobid|\d+ of \d+ steps|Select jobs|Execute \d|Using |Config file|Assuming|Building|Provided|"
     r"Rules claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting|"
     r"Removing output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
 )
-"""Lines that Snakemake prints about itself; format of version 9. All other lines were printed by stages."""
 
-MAX_EXPLANATION_LINES = 12
-"""Lines printed by stages that are kept to explain a failure. Chosen: a failing stage prints one to three."""
+MAX_EXPLANATION_LINES = 12  # Lines printed by stages that are kept to explain a failure (chosen)
 
 STAGE_DONE_TEXT = {
     "laboratory": "virtual measurements made",
@@ -71,23 +70,7 @@ class RunPaths:
 
 
 def run_paths(folder: Path, base: Path | None) -> RunPaths:
-    """Return the folders of a run.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-    base : folder in which the results folder, named after the experiment, is made; None for `results` beside the
-        experiment.
-
-    Returns
-    -------
-    paths : absolute paths.
-
-    Raises
-    ------
-    ExperimentError
-        If the experiment does not exist, or the results folder belongs to another experiment.
-    """
+    """Return the folders of a run."""
     experiment = Path(os.path.normpath(find_experiment(folder).absolute()))
     name = experiment.name or "experiment"
     results = (experiment.parent / "results" if base is None else base.absolute()) / name
@@ -96,18 +79,7 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
 
 
 def check_before_run(experiment: Path, say: Say) -> None:
-    """Print the problems of an experiment before its run.
-
-    Parameters
-    ----------
-    experiment : experiment folder.
-    say : prints a line.
-
-    Raises
-    ------
-    ExperimentError
-        If every trial has an error, or the sheet or the settings cannot be read.
-    """
+    """Print the problems of an experiment before its run."""
     from vinetrack.core.problems import format_problems
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.pipeline.check_stage import check_folder
@@ -125,21 +97,7 @@ def check_before_run(experiment: Path, say: Say) -> None:
 
 
 def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
-    """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere.
-
-    Parameters
-    ----------
-    paths : folders of experiment and results.
-    cores : number of processor cores.
-    say : prints a line.
-
-    Raises
-    ------
-    RunError
-        If a stage fails, with its last output.
-    ExperimentError
-        If another run writes the same results.
-    """
+    """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere."""
     refuse_running(paths.results)
     claim_results(paths.results, paths.experiment)
     log = paths.results / "logs" / "run.log"
@@ -221,16 +179,7 @@ def _failure_text(failed: dict[str, str], last_lines: list[str], log: Path) -> s
 
 
 def run_lines(results: Path) -> list[str]:
-    """Summarise finished results for the terminal: failed trials, path of the report, reasons, and last the verdict.
-
-    Parameters
-    ----------
-    results : results folder.
-
-    Returns
-    -------
-    lines, the verdict last.
-    """
+    """Summarise finished results for the terminal: failed trials, path of the report, reasons, and last the verdict."""
     from vinetrack.pipeline.diagnosis_stage import diagnosis_lines
     from vinetrack.results.folder_layout import Results, read_result
 

@@ -18,23 +18,18 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Track, Trial
     from vinetrack.diagnosis.result import Diagnosis
 
-LEDGER = "campaign.json"
-"""File name of the ledger, beside the sheet. Convention."""
+LEDGER = "campaign.json"  # File name of the ledger, beside the sheet (convention)
 
-DEFAULT_RISK = 0.03
-"""Default risk of stopping with a wrong effect. Chosen: three campaigns in a hundred; at half or twice, a campaign
-takes about a tenth more or fewer trials, since the number depends on the logarithm of the risk."""
+DEFAULT_RISK = 0.03  # Default risk of stopping with a wrong effect (chosen)
 
+# What to do next where no particular trials can be recommended
 VARY_MORE = "Vary more from trial to trial: other pressures, payloads, chambers, connectors or vines."
-"""What to do next where no particular trials can be recommended."""
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """The looks at a campaign, in order.
-
-    `risk` is stated at the first look and cannot change; `marks` are fingerprints of the data of each look; `next_text`
-    says what to do next.
+    """The looks at a campaign, in order. `risk` is stated at the first look and cannot change; `marks` are fingerprints
+    of the data of each look; `next_text` says what to do next.
     """
 
     risk: float
@@ -49,26 +44,7 @@ class Ledger:
 
 
 def look_at_folder(target: Path, risk: float | None = None, experiment: Path | None = None) -> Ledger:
-    """Add a look at a campaign to its ledger.
-
-    Parameters
-    ----------
-    target : a results folder, whose diagnosis is read, or an experiment of measured tracks, which is diagnosed.
-    risk : float, optional
-        Risk of stopping with a wrong effect; it cannot be changed after the first look.
-    experiment : Path, optional
-        New path of the experiment of a results folder, if it has moved.
-
-    Returns
-    -------
-    Ledger
-        With a further look; if the data have not changed since the last look, that one is replaced.
-
-    Raises
-    ------
-    ExperimentError, ResultsError, FitError
-        If there is nothing to look at, or another risk was stated before.
-    """
+    """Add a look at a campaign to its ledger."""
     diagnosis, pairs, folder = _diagnose_target(target, experiment)
     previous = read_ledger(folder / LEDGER)
     if previous is not None and risk is not None and risk != previous.risk:
@@ -161,22 +137,7 @@ def _recommendation(look: CampaignLook, target: Path, experiment: Path | None) -
 
 
 def read_ledger(path: Path) -> Ledger | None:
-    """Read a ledger.
-
-    Parameters
-    ----------
-    path : path of the ledger.
-
-    Returns
-    -------
-    Ledger or None
-        None if the file does not exist.
-
-    Raises
-    ------
-    ExperimentError
-        If the file is not a ledger.
-    """
+    """Read a ledger."""
     import json
 
     if not path.is_file():
@@ -195,16 +156,7 @@ def read_ledger(path: Path) -> Ledger | None:
 
 
 def ledger_lines(ledger: Ledger) -> list[str]:
-    """Return the output of `vinetrack campaign`: one row per look, the reason of the decision, and what to do next.
-
-    Parameters
-    ----------
-    ledger : ledger with at least one look.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the output of `vinetrack campaign`: one row per look, the reason of the decision, and what to do next."""
     from vinetrack.core.terminal import table
 
     rows = [

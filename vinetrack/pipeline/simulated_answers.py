@@ -40,20 +40,7 @@ class Simulation:
 def simulate_answers(
     design: CampaignDesign, wanted: Sequence[tuple[str, float]], simulation: Simulation
 ) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
-    """Simulate campaigns and diagnose each completely.
-
-    Parameters
-    ----------
-    design : design of the campaigns.
-    wanted : sequence of (str, float)
-        Effect (blank for none) and its size, SI, of each kind of campaign.
-    simulation : settings of the simulation.
-
-    Returns
-    -------
-    dict
-        Answers by effect, `size_key` of the size, and seed.
-    """
+    """Simulate campaigns and diagnose each completely. Returns answers by effect, `size_key` of the size, and seed."""
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
@@ -76,18 +63,7 @@ def simulate_answers(
 
 
 def simulate_null_tests(design: CampaignDesign, simulation: Simulation) -> list[CampaignPValues]:
-    """Apply every test to simulated null campaigns.
-
-    Parameters
-    ----------
-    design : design of the campaigns.
-    simulation : settings of the simulation.
-
-    Returns
-    -------
-    list of CampaignPValues
-        One per campaign, in the order of the seeds.
-    """
+    """Apply every test to simulated null campaigns."""
     from vinetrack.core.terminal import Progress, progress
 
     mark = fingerprint(design)
@@ -105,16 +81,7 @@ def simulate_null_tests(design: CampaignDesign, simulation: Simulation) -> list[
 
 
 def size_key(value: float) -> str:
-    """Return the text of a size in the file of answers.
-
-    Parameters
-    ----------
-    value : SI; NaN for none.
-
-    Returns
-    -------
-    str
-    """
+    """Return the text of a size in the file of answers."""
     return "" if math.isnan(value) else f"{value:.9g}"
 
 
@@ -127,16 +94,7 @@ def _test_task(task: tuple[CampaignDesign, int]) -> CampaignPValues:
 
 
 def fingerprint(design: CampaignDesign) -> str:
-    """Return a short hash of everything that simulated campaigns depend on.
-
-    Parameters
-    ----------
-    design : design of the campaigns.
-
-    Returns
-    -------
-    str
-    """
+    """Return a short hash of everything that simulated campaigns depend on."""
     parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
     around = (
         design.spreads,
@@ -149,17 +107,7 @@ def fingerprint(design: CampaignDesign) -> str:
 
 
 def stored_answers(path: Path, mark: str) -> list[SimulatedDiagnosis]:
-    """Return the stored answers of a design.
-
-    Parameters
-    ----------
-    path : file of answers, which need not exist.
-    mark : fingerprint of the design.
-
-    Returns
-    -------
-    list of SimulatedDiagnosis
-    """
+    """Return the stored answers of a design."""
     return [
         SimulatedDiagnosis(
             effect=row["effect"],

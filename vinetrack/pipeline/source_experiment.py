@@ -13,25 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
-    """Read the experiment that a results folder was made from, as stated by its `provenance.json`.
-
-    Parameters
-    ----------
-    folder : results folder.
-    experiment : Path, optional
-        New path of the experiment, if it has moved.
-
-    Returns
-    -------
-    Experiment
-
-    Raises
-    ------
-    ResultsError
-        If it is not a results folder, or its experiment has moved.
-    ExperimentError
-        If the experiment cannot be read.
-    """
+    """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
     from vinetrack.experiment.folder import read_experiment
 
     results = Results(folder)
@@ -55,28 +37,8 @@ BOM = b"\xef\xbb\xbf"
 
 
 def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
-    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings.
-
-    A byte-order mark and the line ends of the file are kept; other encodings are converted to UTF-8.
-
-    Parameters
-    ----------
-    folder : experiment folder.
-    names : sequence of str
-        Effects of the model.
-    files : sequence of str
-        Files of the user's own effects in that folder, to be added to `effects:` if it does not list them.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    ExperimentError
-        If the settings cannot be read, or the key cannot be set without altering other settings.
-    TableError
-        If the file is not text.
+    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
+    ends of the file are kept; other encodings are converted to UTF-8.
     """
     from vinetrack.core.tables import read_text, write_bytes
     from vinetrack.core.yaml_document import with_list

@@ -20,6 +20,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 
 _EXPERIMENT_READERS = ("experiment.folder", "experiment.settings")
+# Modules that the command of each stage calls
 STAGE_MODULES = {
     "laboratory": ("laboratory.__main__",),
     "recording": ("pipeline.recordings_stage", *_EXPERIMENT_READERS),
@@ -33,8 +34,6 @@ STAGE_MODULES = {
     "overlays": ("pipeline.overlays_stage", *_EXPERIMENT_READERS),
     "report": ("pipeline.report_stage", *_EXPERIMENT_READERS),
 }
-"""Modules that the command of each stage calls. The command line itself is left out: it only passes options on, and an
-edit of a help text should not rerun an analysis."""
 
 _TYPE_CHECKING_BLOCK = re.compile(r"^if TYPE_CHECKING:\n(?:(?:[ \t]+[^\n]*)?\n)+", re.MULTILINE)
 _FROM = re.compile(r"^[ \t]*from (vinetrack[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -45,17 +44,7 @@ _PLACEHOLDER = re.compile(r"\{[^}]*\}")
 
 
 def code_hash(stage: str, package: Path = PACKAGE) -> str:
-    """Return a hash of the code of a stage, which as a parameter of its rule makes Snakemake rerun it after an edit.
-
-    Parameters
-    ----------
-    stage : a key of `STAGE_MODULES`.
-    package : folder of the package; the running one by default.
-
-    Returns
-    -------
-    16 hexadecimal digits.
-    """
+    """Return a hash of the code of a stage, which as a parameter of its rule makes Snakemake rerun it after an edit."""
     digest = hashlib.sha256()
     for path in stage_files(stage, package):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + _content(path))
@@ -63,19 +52,7 @@ def code_hash(stage: str, package: Path = PACKAGE) -> str:
 
 
 def stage_files(stage: str, package: Path = PACKAGE) -> list[Path]:
-    """Return all files of the package that a stage runs or reads, sorted.
-
-    Parameters
-    ----------
-    stage : str
-        A key of `STAGE_MODULES`.
-    package : Path
-        Folder of the package; the running one by default.
-
-    Returns
-    -------
-    list of Path
-    """
+    """Return all files of the package that a stage runs or reads, sorted."""
     waiting = [path for name in STAGE_MODULES[stage] for path in _module_files(name, package)]
     reached: set[Path] = set()
     while waiting:
@@ -99,25 +76,9 @@ def _files_used(path: Path, package: Path) -> tuple[Path, ...]:
 
 
 def imported_names(text: str) -> set[str]:
-    r"""Return the dotted names below `vinetrack` that a source imports at run time: modules and their members.
-
-    `from vinetrack.core import published` gives `core` and `core.published`: the text alone does not tell whether
-    `published` is a module.
-
-    Parameters
-    ----------
-    text : str
-        Source code.
-
-    Returns
-    -------
-    set of str
-        Dotted names without `vinetrack.`.
-
-    Examples
-    --------
-    >>> sorted(imported_names("from vinetrack.core import published\nimport numpy"))
-    ['core', 'core.published']
+    r"""Return the dotted names below `vinetrack` that a source imports at run time: modules and their members. `from
+    vinetrack.core import published` gives `core` and `core.published`: the text alone does not tell whether `published`
+    is a module.
     """
     text = _TYPE_CHECKING_BLOCK.sub("", text)
     names = set(_IMPORT.findall(text))
@@ -129,9 +90,8 @@ def imported_names(text: str) -> set[str]:
 
 @lru_cache(maxsize=4096)
 def _module_files(name: str, package: Path) -> tuple[Path, ...]:
-    """File of a module and the `__init__.py` that Python runs before it; empty if the name is not a module.
-
-    The `__init__.py` of vinetrack itself counts only if something is imported from it: it loads nothing.
+    """File of a module and the `__init__.py` that Python runs before it; empty if the name is not a module. The
+    `__init__.py` of vinetrack itself counts only if something is imported from it: it loads nothing.
     """
     if not name:
         return (package / "__init__.py",)

@@ -23,16 +23,14 @@ if TYPE_CHECKING:
     from vinetrack.video.frames import Recording
     from vinetrack.video.measure import Measurement
 
-TABLE, STRIP, CLIP = "track.csv", "strip.png", "overlay.mp4"
-"""Names of the output files."""
+TABLE, STRIP, CLIP = "track.csv", "strip.png", "overlay.mp4"  # Names of the output files
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
-    """Options of the command; NaN and None for those not given.
-
-    `fps` is the capture rate, `exposure_us` the exposure of a frame. The scale is `mm_per_px`, or the `calibration:` of
-    the settings file `calibration`. `body`: the object moves as a whole. `out` is the output folder.
+    """Options of the command; NaN and None for those not given. `fps` is the capture rate, `exposure_us` the exposure
+    of a frame. The scale is `mm_per_px`, or the `calibration:` of the settings file `calibration`. `body`: the object
+    moves as a whole. `out` is the output folder.
     """
 
     fps: float = math.nan
@@ -51,24 +49,8 @@ class TrackOptions:
 
 
 def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Track the leading edge of one recording; write its table, strip and clip.
-
-    Parameters
-    ----------
-    path : a film, a stack, or a folder of pictures.
-    options : options of the command.
-    say : prints a line; facts about the file are printed before tracking starts.
-
-    Returns
-    -------
-    mapping with facts about the file, results of tracking, and paths of output files, units in the keys.
-
-    Raises
-    ------
-    UserError
-        If the recording cannot be used or shows no motion.
-    ExperimentError
-        If the settings file with the calibration cannot be read.
+    """Track the leading edge of one recording; write its table, strip and clip. Returns mapping with facts about the
+    file, results of tracking, and paths of output files, units in the keys.
     """
     from vinetrack.video.frames import RecordingError, inspect_recording
     from vinetrack.video.measure import measure_recording
@@ -109,13 +91,7 @@ def track_file(path: Path, options: TrackOptions, say: Callable[[str], None]) ->
 
 
 def _recording_path(path: Path) -> Path:
-    """Return the path if it can be a single recording.
-
-    Raises
-    ------
-    UserError
-        If it does not exist, is an empty folder, or a folder with films.
-    """
+    """Return the path if it can be a single recording."""
     from vinetrack.video.frames import CONTAINERS, IMAGES
 
     if not path.exists():
@@ -136,13 +112,7 @@ def _recording_path(path: Path) -> Path:
 
 
 def _calibration(options: TrackOptions) -> tuple[ExperimentSettings, Path]:
-    """Return settings with only the calibration, and the folder to which the path of its picture is relative.
-
-    Raises
-    ------
-    UserError
-        If the file has no calibration, or two scales are given.
-    """
+    """Return settings with only the calibration, and the folder to which the path of its picture is relative."""
     if options.calibration is None:
         return ExperimentSettings(), Path()
     if math.isfinite(options.mm_per_px):

@@ -51,27 +51,8 @@ def analyse_tracks(
     n_workers: int = 1,
     only: Collection[str] | None = None,
 ) -> list[str]:
-    """Analyse all trials that are tracks; write the files of each in `tracks/`, `kinematics/` and `analysed/`.
-
-    Trials with a faulty row of the sheet get empty files.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Settings of the run.
-    n_workers : int
-        Number of processes.
-    only : collection of str, optional
-        Names of the trials; all by default.
-
-    Returns
-    -------
-    list of str
-        A line for every trial that failed: its name and the reason.
+    """Analyse all trials that are tracks; write the files of each in `tracks/`, `kinematics/` and `analysed/`. Trials
+    with a faulty row of the sheet get empty files.
     """
     results = Results(folder)
     failed = {name: reason for name, reason in experiment.failed.items() if only is None or name in only}
@@ -105,29 +86,8 @@ def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experi
 def analyse(
     trial: Trial, track: Track, results: Results, settings: RunSettings, experiment: Experiment, **columns: float
 ) -> tuple[str, str]:
-    """Analyse the track of one trial, and write its files.
-
-    Parameters
-    ----------
-    trial
-        Row of the sheet.
-    track
-        Its positions.
-    results
-        Results folder.
-    settings
-        Settings of the run.
-    experiment
-        Experiment whose settings name the model in use.
-    **columns : float
-        Further columns of `trials.csv`.
-
-    Returns
-    -------
-    reason : str
-        Why the trial failed; blank if it did not.
-    fault : str
-        Traceback of an unexpected exception; blank if there was none.
+    """Analyse the track of one trial, and write its files. Returns reason (why the trial failed; blank if it did not),
+    fault (traceback of an unexpected exception; blank if there was none).
     """
     from vinetrack.kinematics.summary import TrialError, summarise_trial
 
@@ -149,27 +109,7 @@ def analyse(
 
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
-    """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
-
-    Parameters
-    ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
-    settings
-        Settings of the run.
-
-    Returns
-    -------
-    DataFrame
-        `trials.csv` as written, in the order of the sheet.
-
-    Raises
-    ------
-    ResultsError
-        If a trial has not been analysed.
-    """
+    """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
     from vinetrack.kinematics.conditions import condition_table
     from vinetrack.kinematics.damping import mark_left_out
 
@@ -228,17 +168,7 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
 
 
 def model_of(experiment: Experiment) -> Model:
-    """Return the model in use; each process makes its own, since a user's effects cannot be pickled.
-
-    Parameters
-    ----------
-    experiment
-        Experiment whose settings name the effects.
-
-    Returns
-    -------
-    Model
-    """
+    """Return the model in use; each process makes its own, since a user's effects cannot be pickled."""
     return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
 
 
@@ -251,34 +181,12 @@ def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
 
 
 def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
-    """Return the row of `trials.csv` of a trial that failed.
-
-    Parameters
-    ----------
-    trial
-        Row of the sheet.
-    reason : str
-        Why it failed.
-
-    Returns
-    -------
-    dict
-    """
+    """Return the row of `trials.csv` of a trial that failed."""
     return _bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
 
 
 def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
-    """Write the files of a trial without results: tables with headers only, and its row.
-
-    Parameters
-    ----------
-    results
-        Results folder.
-    trial : str
-        Name of the trial.
-    row : dict
-        Its row of `trials.csv`.
-    """
+    """Write the files of a trial without results: tables with headers only, and its row."""
     write_csv(results.track(trial), empty_table(TRACK_COLUMNS))
     write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS))
     write_json(results.analysed(trial), {"row": row, "windows": [], "point": None})

@@ -29,6 +29,7 @@ from vinetrack.pipeline.run_folders import (
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import RunSettings
 
+# Additional tables of an experiment that is compared with published numbers
 PAPER_TABLES = (
     "paper",
     "paper_departures",
@@ -39,29 +40,21 @@ PAPER_TABLES = (
     "paper_speeds",
     "paper_speed_curves",
 )
-"""Additional tables of an experiment that is compared with published numbers."""
 
 SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
+# The rules: `vinetrack run` runs this file from anywhere, and the Snakefile of a checkout includes it
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
-"""The rules: `vinetrack run` runs this file from anywhere, and the Snakefile of a checkout includes it."""
 
+# Largest number of tracks analysed, or of trial figures drawn, in one job of the workflow (chosen)
 TRIALS_PER_JOB = 100
-"""Largest number of tracks analysed, or of trial figures drawn, in one job of the workflow. Chosen: for every file that
-a job writes, Snakemake records all files that the job reads, 50 µs each, so that 1,000 trials in one job took it six
-minutes, more than the work itself. At half there are twice as many processes to start, 2 to 4 s each; at twice, twice
-as many records per trial, 60 ms."""
 
 
 @dataclass(frozen=True)
 class WorkflowPlan:
-    """Inputs and outputs of one run of the workflow.
-
-    `trials` are all trials that get files (a trial with a faulty row gets empty ones); `filmed` maps those that are
-    recordings to their input files, `track_inputs` the others to their tracks and traces. `inputs` are all input files
-    that Snakemake watches; `unwatched` is a fingerprint of those whose path cannot be written in a rule. `ground_truth`
-    is the file from which the virtual laboratory makes the measurements of a shipped experiment on first use, None for
-    any other experiment. `published` says whether the results are compared with the numbers of the paper.
+    """Inputs and outputs of one run of the workflow. `trials` are all trials that get files (a trial with a faulty row
+    gets empty ones); `filmed` maps those that are recordings to their input files, `track_inputs` the others to their
+    tracks and traces.
     """
 
     experiment: Path
@@ -100,53 +93,19 @@ class WorkflowPlan:
         return tuple(trial for trial in self.trials if trial not in self.filmed)
 
     def track_files(self, trials: Iterable[str]) -> list[str]:
-        """Return the tracks and traces of trials that are not recordings.
-
-        Parameters
-        ----------
-        trials : names of trials; a trial with a faulty row has no files.
-
-        Returns
-        -------
-        list of str
-            Paths.
-        """
+        """Return the tracks and traces of trials that are not recordings."""
         return [path for trial in trials for path in self.track_inputs.get(trial, ())]
 
     @staticmethod
     def parts(stage: str, trials: Sequence[str]) -> dict[str, list[str]]:
-        """Distribute trials over the jobs of a stage.
-
-        Parameters
-        ----------
-        stage : name of the stage.
-        trials : names of trials.
-
-        Returns
-        -------
-        dict of str to list of str
-            Names of trials by name of the job, which is that of the stage if there is only one job.
+        """Distribute trials over the jobs of a stage. Returns names of trials by name of the job, which is that of the
+        stage if there is only one job.
         """
         shares = [list(trials[first : first + TRIALS_PER_JOB]) for first in range(0, len(trials), TRIALS_PER_JOB)]
         return {stage if len(shares) == 1 else f"{stage}_{number}": share for number, share in enumerate(shares, 1)}
 
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
-        """Return the path of one result for each trial.
-
-        Parameters
-        ----------
-        folder : str
-            Subfolder of the results.
-        suffix : str
-            Suffix of the files.
-        trials : iterable of str, optional
-            Names of trials; all by default.
-
-        Returns
-        -------
-        list of str
-            Paths.
-        """
+        """Return the path of one result for each trial."""
         return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
 
     @property
@@ -156,18 +115,7 @@ class WorkflowPlan:
 
     @staticmethod
     def one_of(names: Iterable[str]) -> str:
-        """Return a regular expression that matches exactly these names.
-
-        Parameters
-        ----------
-        names : iterable of str
-            Names.
-
-        Returns
-        -------
-        str
-            Regular expression.
-        """
+        """Return a regular expression that matches exactly these names."""
         return "|".join(sorted(names)) or "there-is-none"
 
     @property
@@ -185,18 +133,7 @@ class WorkflowPlan:
         return self._figures(PAPER_FIGURES, "") if self.published else []
 
     def trial_figures(self, trials: Iterable[str] | None = None) -> list[tuple[str, str, str]]:
-        """Return the figures of single trials.
-
-        Parameters
-        ----------
-        trials : iterable of str, optional
-            Names of trials; all by default.
-
-        Returns
-        -------
-        list of (str, str, str)
-            Trial, format and path of each.
-        """
+        """Return the figures of single trials."""
         return self._figures(self.trials if trials is None else trials, "trial_")
 
     def figure_files(self) -> list[str]:
@@ -209,34 +146,15 @@ class WorkflowPlan:
         return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
 
     def stage_settings(self, *keys: str) -> str:
-        """Settings that a stage depends on, as JSON; without keys, all but the paths.
-
-        A stage reruns only if one of these changes. Paths are left out, since the same folder can be written in several
-        ways.
+        """Settings that a stage depends on, as JSON; without keys, all but the paths. A stage reruns only if one of
+        these changes. Paths are left out, since the same folder can be written in several ways.
         """
         chosen = set(keys) or set(type(self.settings).model_fields) - {"experiment", "results"}
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
 def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """Plan a run: read the settings and the sheet, and list the input files.
-
-    Parameters
-    ----------
-    config : mapping
-        Snakemake's `config`, including `--config`.
-    base : Path
-        Folder of the Snakefile, from which the shipped demonstration is found wherever Snakemake is run.
-
-    Returns
-    -------
-    WorkflowPlan
-
-    Raises
-    ------
-    ExperimentError
-        With every problem of the settings, or else of the sheet.
-    """
+    """Plan a run: read the settings and the sheet, and list the input files."""
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
 
@@ -300,20 +218,8 @@ def _fingerprint(inputs: Iterable[Path]) -> str:
 
 
 def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
-    """Call `make_plan`; print its problems in at most 20 lines and exit with status 1.
-
-    For the Snakefile, where an exception would be printed with Snakemake's traceback.
-
-    Parameters
-    ----------
-    config : mapping
-        Snakemake's `config`.
-    base : Path
-        Folder of the Snakefile.
-
-    Returns
-    -------
-    WorkflowPlan
+    """Call `make_plan`; print its problems in at most 20 lines and exit with status 1. For the Snakefile, where an
+    exception would be printed with Snakemake's traceback.
     """
     try:
         return make_plan(config, base)
@@ -324,13 +230,8 @@ def make_plan_or_exit(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
 
 
 def begin_run_or_exit(plan: WorkflowPlan) -> None:
-    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`.
-
-    Nothing is begun if Snakemake executes no jobs (a dry run, for example), which only its command line tells.
-
-    Parameters
-    ----------
-    plan : plan of this run.
+    """Call `begin_run`; print a refusal and exit with status 1. For the Snakefile, like `make_plan_or_exit`. Nothing is
+    begun if Snakemake executes no jobs (a dry run, for example), which only its command line tells.
     """
     from vinetrack.pipeline.run_lock import begin_run, executes_nothing
 
@@ -345,15 +246,7 @@ def begin_run_or_exit(plan: WorkflowPlan) -> None:
 
 def print_report_path_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
     """Print the path of the report as the last line of this process, if the report is newer than all inputs.
-
     Snakemake's `onsuccess` runs before its closing lines, and not at all if there was nothing to do.
-
-    Parameters
-    ----------
-    plan
-        Plan of this run.
-    quiet : bool
-        Print nothing.
     """
     if not quiet:
         atexit.register(_print_report_path, plan)

@@ -21,22 +21,14 @@ from vinetrack.planning.campaign_information import FilmingPlan, Information, fi
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.scaling_priors import burst_pressure_Pa
 
-CANDIDATE_PRESSURES = 13
-"""Candidate pressures of each vine. Chosen: neighbours differ by a factor of 1.4 in drive where the drive spans a
-factor of 50. Reasoned: at half no campaign of eight pressures is evenly spaced, at twice the search takes twice as
-long."""
+CANDIDATE_PRESSURES = 13  # Candidate pressures of each vine (chosen)
 
+# Lowest drive considered, as a fraction of the highest, where no lowest pressure is given (chosen)
 LOWEST_DRIVE_FRACTION = 0.02
-"""Lowest drive considered, as a fraction of the highest, where no lowest pressure is given. Chosen: at n = 0.4 the
-speeds then span four decades, more than a camera can film, so the camera decides. At half or twice the camera's limits
-leave the same trials."""
 
-MEASURED_YIELD_SIGMA_PA = 200.0
-"""Standard error of a yield pressure that will be measured with the campaign, Pa. Chosen: the sheet's default."""
+MEASURED_YIELD_SIGMA_PA = 200.0  # Standard error of a yield pressure that will be measured with the campaign, Pa
 
-UNLIMITED_REPLICATES = 1e7
-"""Trials of each condition in a campaign of unlimited size. Chosen: standard errors are then 3000 times smaller than
-those of one trial, so that only what no number of trials determines remains."""
+UNLIMITED_REPLICATES = 1e7  # Trials of each condition in a campaign of unlimited size (chosen)
 
 
 class CampaignError(ValueError):
@@ -45,9 +37,8 @@ class CampaignError(ValueError):
 
 @dataclass(frozen=True)
 class Scope:
-    """Limits of a campaign: pressures in Pa (NaN: as low, or as high, as possible), payloads in kg.
-
-    `pressures`, `replicates` : fewest and most. `burst_share` : largest fraction of the burst pressure.
+    """Limits of a campaign: pressures in Pa (NaN: as low, or as high, as possible), payloads in kg. `pressures`,
+    `replicates` : fewest and most. `burst_share` : largest fraction of the burst pressure.
     """
 
     pressure_Pa: tuple[float, float] = (math.nan, math.nan)
@@ -60,9 +51,8 @@ class Scope:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Conditions that can be filmed, the information of one trial of each, and the model at its assumed values.
-
-    `vine` and `payload_kg` are those of each condition; `rejected` counts conditions that cannot be filmed.
+    """Conditions that can be filmed, the information of one trial of each, and the model at its assumed values. `vine`
+    and `payload_kg` are those of each condition; `rejected` counts conditions that cannot be filmed.
     """
 
     model: Model
@@ -75,9 +65,8 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign: number of trials of each candidate condition, and the expected standard errors of n and B.
-
-    `n_error` is absolute, `B_errors` by vine are relative.
+    """A campaign: number of trials of each candidate condition, and the expected standard errors of n and B. `n_error`
+    is absolute, `B_errors` by vine are relative.
     """
 
     counts: np.ndarray
@@ -98,24 +87,13 @@ class Plan:
         return max(self.B_errors.values(), default=0.0)
 
     def meets(self, n_error: float, B_error: float) -> bool:
-        """Whether the expected standard errors are as small as wanted.
-
-        Parameters
-        ----------
-        n_error, B_error : float
-            Largest standard errors allowed: of n, absolute; of every B, relative.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the expected standard errors are as small as wanted."""
         return self.n_error <= n_error and self.B_error <= B_error
 
 
 @dataclass(frozen=True)
 class Planned:
     """Result of the search: `best`, or None where no campaign within the scope suffices; `others` in order of cost.
-
     `cheapest` is the allocation without limits on pressures and replicates, `nearest` the campaign that misses the
     wanted errors least, `endless` the largest campaign with unlimited replicates.
     """
@@ -129,24 +107,7 @@ class Planned:
 
 
 def candidates(vine_inputs: Sequence[PredictiveInputs], scope: Scope, filming: FilmingPlan) -> Candidates:
-    """Return every condition that can be filmed, with the information of a trial of it.
-
-    Parameters
-    ----------
-    vine_inputs : predictive inputs, one for each vine, all of one model.
-    scope : pressures, payloads and limits to stay within.
-    filming : how trials are filmed; decides which conditions can be filmed.
-
-    Returns
-    -------
-    Candidates
-        In the order of `vine_inputs`, then of rising pressure.
-
-    Raises
-    ------
-    CampaignError
-        If no condition can be filmed.
-    """
+    """Return every condition that can be filmed, with the information of a trial of it."""
     trials = with_names([trial for inputs in vine_inputs for trial in _conditions(inputs, scope)])
     model = joint_model(vine_inputs)
     data = filmed(model, trials, filming)
@@ -192,21 +153,7 @@ def _conditions(inputs: PredictiveInputs, scope: Scope) -> Iterator[Trial]:
 
 
 def plan(candidate_set: Candidates, scope: Scope, n_error: float, B_error: float) -> Planned:
-    """Find the campaign with the fewest trials whose expected standard errors are as small as wanted.
-
-    Parameters
-    ----------
-    candidate_set : from `candidates`.
-    scope : limits on pressures, replicates and trials.
-    n_error : float
-        Largest standard error of n, absolute.
-    B_error : float
-        Largest standard error of every B, relative.
-
-    Returns
-    -------
-    Planned
-    """
+    """Find the campaign with the fewest trials whose expected standard errors are as small as wanted."""
     designs = [_fewest_replicates(candidate_set, scope, s, n_error, B_error) for s in _shapes(candidate_set, scope)]
     sufficient = [d for d in designs if d.meets(n_error, B_error) and d.n_trials <= scope.most_trials]
     sufficient.sort(key=lambda design: (design.n_trials, -design.pressures))
@@ -304,18 +251,7 @@ def _loss(design: Plan, n_error: float, B_error: float) -> float:
 
 
 def trials_of(candidate_set: Candidates, design: Plan) -> list[Trial]:
-    """Return every trial of a campaign with a name, replicates next to each other.
-
-    Parameters
-    ----------
-    candidate_set : conditions that the campaign was chosen from.
-    design : the campaign: number of trials of each condition.
-
-    Returns
-    -------
-    list of Trial
-        `design.n_trials` of them.
-    """
+    """Return every trial of a campaign with a name, replicates next to each other."""
     trials = []
     for trial, count in zip(candidate_set.trials, design.counts.astype(int), strict=True):
         size = f"{1e3 * trial.diameter_m:g}mm_{1e6 * trial.thickness_m:g}um"

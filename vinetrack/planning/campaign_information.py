@@ -8,10 +8,6 @@ evaluated without further simulation.
 For comparison, the precision of n from steady speeds alone follows from the damping law
 
     ln (P − P_y)A = ln B + n ln ẋ_ss
-
-whose scatter comes from the between-trial deviations of B and P, and whose slope is biased by an error of the yield
-pressure. A fit to trajectories also uses the approach to the steady speed, as long as its model lacks nothing; the law
-uses less and assumes less.
 """
 
 from __future__ import annotations
@@ -35,26 +31,17 @@ from vinetrack.inference.whitening import all_products
 from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
-REST_FRAMES = 20
-"""Frames at rest before release. Chosen: their mean determines the origin to 0.22 of one frame's noise; at half 0.32,
-at twice 0.16, small beside the information of the growth."""
+REST_FRAMES = 20  # Frames at rest before release (chosen)
 
-RELEASE_FRACTION = 0.4
-"""Time of release within a frame interval, in frames. Chosen arbitrarily: the information about n and B hardly depends
-on it, since only the first frames change."""
+RELEASE_FRACTION = 0.4  # Time of release within a frame interval, in frames (chosen)
 
-FEWEST_GROWTH_FRAMES = 12
-"""Frames of growth below which a trial is not worth filming. Chosen: release, origin, the deviations of pressure and B,
-and a curve take six parameters, which leaves as many degrees of freedom. At half trials are planned that a fit can
-barely use; at twice fast vines drop out."""
+FEWEST_GROWTH_FRAMES = 12  # Frames of growth below which a trial is not worth filming (chosen)
 
 
 @dataclass(frozen=True)
 class FilmingPlan:
-    """How a campaign is filmed: frames per second, noise of a position, m, and its lag-one correlation.
-
-    A recording ends with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s`
-    after release.
+    """How a campaign is filmed: frames per second, noise of a position, m, and its lag-one correlation. A recording
+    ends with the growth, at twice `longest_s` where the growth does not end, and at the latest `stops_s` after release.
     """
 
     capture_fps: float
@@ -66,10 +53,9 @@ class FilmingPlan:
 
 @dataclass(frozen=True)
 class Information:
-    """Fisher information of one trial of each condition about the `free` parameters.
-
-    Parameters are scaled as in the fit (ln B, n over its scale). `each`, shape (n_conditions, n_free, n_free); `prior`,
-    shape (n_free,), is the prior precision: that of the yield pressures as stated.
+    """Fisher information of one trial of each condition about the `free` parameters. Parameters are scaled as in the
+    fit (ln B, n over its scale). `each`, shape (n_conditions, n_free, n_free); `prior`, shape (n_free,), is the prior
+    precision: that of the yield pressures as stated.
     """
 
     free: tuple[FreeParameter, ...]
@@ -77,17 +63,8 @@ class Information:
     prior: Floats
 
     def covariance(self, counts: Floats) -> Floats:
-        """Covariance of the free parameters after these numbers of trials.
-
-        Parameters
-        ----------
-        counts : array, shape (n_conditions,)
-            Number of trials of each condition.
-
-        Returns
-        -------
-        array, shape (n_free, n_free)
-            Scaled as in the fit; infinite on the whole diagonal where the information is singular.
+        """Covariance of the free parameters after these numbers of trials. Returns scaled as in the fit; infinite on
+        the whole diagonal where the information is singular. Shapes: counts (n_conditions,) → (n_free, n_free).
         """
         total = np.tensordot(counts, self.each, axes=1) + np.diag(self.prior)
         scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
@@ -98,19 +75,8 @@ class Information:
         return np.asarray((vectors / values) @ vectors.T * scale[:, None] * scale)
 
     def errors(self, counts: Floats) -> tuple[float, dict[str, float]]:
-        """Standard errors of n (absolute) and of B by vine (relative).
-
-        Parameters
-        ----------
-        counts : array, shape (n_conditions,)
-            Number of trials of each condition.
-
-        Returns
-        -------
-        n : float
-            Absolute standard error of n; 0 where n is not free.
-        B : dict
-            Relative standard error of B by vine.
+        """Standard errors of n (absolute) and of B by vine (relative). Returns n (absolute standard error of n; 0 where
+        n is not free), B (relative standard error of B by vine). Shapes: counts (n_conditions,).
         """
         diagonal = np.sqrt(np.diag(self.covariance(counts)))
         n = next(
@@ -121,35 +87,14 @@ class Information:
 
 
 def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
-    """Return one model with the median B of each vine and everything else shared.
-
-    Parameters
-    ----------
-    vine_inputs : predictive inputs of each vine; the model is that of the first.
-
-    Returns
-    -------
-    Model
-    """
+    """Return one model with the median B of each vine and everything else shared."""
     first = vine_inputs[0].model
     B: Value = {inputs.trial.vine: inputs.medians[DAMPING] for inputs in vine_inputs}
     return first.with_values({DAMPING: B})
 
 
 def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[FitTrial | None]:
-    """Return the data of each trial as a fit would get them, without noise; None where it is too slow or too fast.
-
-    Parameters
-    ----------
-    model : at its assumed values.
-    trials : conditions, one trial each.
-    camera : frame rate, noise, longest recording.
-
-    Returns
-    -------
-    list of FitTrial or None
-        One for each trial, in order.
-    """
+    """Return the data of each trial as a fit would get them, without noise; None where it is too slow or too fast."""
     frame_s = float(1 / camera.capture_fps)
     ends = simulate_many(model, trials, [np.array([0.0, camera.longest_s])] * len(trials))
     data: list[FitTrial | None] = []
@@ -180,18 +125,8 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
 
 
 def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -> Floats:
-    """Return the speed of the leading edge at 0.95 of the length, m/s; 0 where it does not get there.
-
-    Parameters
-    ----------
-    model : with B by vine.
-    trials : conditions.
-    longest_s : float
-        Duration of the simulation, s.
-
-    Returns
-    -------
-    array, shape (n_trials,)
+    """Return the speed of the leading edge at 0.95 of the length, m/s; 0 where it does not get there. Shape
+    (n_trials,).
     """
     times = [np.linspace(0.0, 1.0, 4000) ** 2 * longest_s] * len(trials)
     moved = simulate_many(model, trials, times)
@@ -210,20 +145,7 @@ def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -
 def information(
     model: Model, data: Sequence[FitTrial], camera: FilmingPlan, spreads: tuple[float, float]
 ) -> Information:
-    """Return the information of one trial of each condition, trial effects integrated out.
-
-    Parameters
-    ----------
-    model : at its assumed values, with B by vine.
-    data : from `filmed`, without None.
-    camera : noise of a position and its correlation.
-    spreads : (float, float)
-        Relative between-trial standard deviations of pressure and B.
-
-    Returns
-    -------
-    Information
-    """
+    """Return the information of one trial of each condition, trial effects integrated out."""
     layout = make_layout(model, data)
     predictor = Predictor(layout, data)
     trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
@@ -246,26 +168,11 @@ def _information(layout: ParameterMap, problem: MixedProblem, state: FitState, c
     return Information(layout.free, each[:, :count, :count], layout.prior_precision)
 
 
-STEADY_FRACTION = 0.97
-"""Fraction of the speed of Eq. (3) that a vine must reach before 0.95 of its length to count as steady. Chosen: as in a
-steady window, 3 % of speed are 1 % of force at n = 0.37. At half (1.5 %) fewer vines count as steady, at twice more do,
-with a bias of 2 %."""
+STEADY_FRACTION = 0.97  # Fraction of the speed of Eq. (chosen)
 
 
 def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> np.ndarray:
-    """Return which vines without payload come to within 3 % of their steady speed before the end.
-
-    Parameters
-    ----------
-    model : with B by vine.
-    trials : conditions.
-    longest_s : float
-        Duration of the simulation, s.
-
-    Returns
-    -------
-    array of bool, shape (n_trials,)
-    """
+    """Return which vines without payload come to within 3 % of their steady speed before the end. Shape (n_trials,)."""
     times = [np.linspace(0.0, longest_s, 2000)] * len(trials)
     reached = []
     for trial, moved in zip(trials, simulate_many(model, trials, times), strict=True):
@@ -276,17 +183,7 @@ def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> n
 
 
 def steady_speed(model: Model, trial: Trial) -> float:
-    """Return the tail speed of Eq. (3) of Alvarez et al. (2025), ((P − P_y)A/B)^(1/n), m/s.
-
-    Parameters
-    ----------
-    model : with damping; B by vine.
-    trial : pressure, yield pressure, diameter and vine.
-
-    Returns
-    -------
-    float
-    """
+    """Return the tail speed of Eq. (3) of Alvarez et al. (2025), ((P − P_y)A/B)^(1/n), m/s."""
     values = dict(zip(model.parameter_names, model.parameters_of(trial).tolist(), strict=True))
     force_N = max(trial.pressure_Pa - trial.yield_pressure_Pa, 0.0) * trial.area_m2
     return float((force_N / values[DAMPING]) ** (1 / values[EXPONENT]))
@@ -295,24 +192,9 @@ def steady_speed(model: Model, trial: Trial) -> float:
 def steady_error(
     model: Model, trials: Sequence[Trial], counts: Floats, spreads: tuple[float, float], steady: np.ndarray
 ) -> float:
-    """Return the standard error of n from the steady trials alone; infinite where they do not determine it.
-
-    Weighted least squares of ln F = ln B_v + n ln ẋ_ss with one error of the yield pressure for each vine.
-
-    Parameters
-    ----------
-    model : with damping; B by vine.
-    trials : conditions.
-    counts : array, shape (n_trials,)
-        Number of trials of each condition.
-    spreads : (float, float)
-        Relative between-trial standard deviations of pressure and B.
-    steady : array of bool, shape (n_trials,)
-        See `reaches_steady`.
-
-    Returns
-    -------
-    float
+    """Return the standard error of n from the steady trials alone; infinite where they do not determine it. Weighted
+    least squares of ln F = ln B_v + n ln ẋ_ss with one error of the yield pressure for each vine. Shapes: counts,
+    steady (n_trials,).
     """
     vines = list(dict.fromkeys(trial.vine for trial in trials))
     size = 1 + 2 * len(vines)

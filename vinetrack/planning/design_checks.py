@@ -26,18 +26,13 @@ from vinetrack.planning.prediction import (
 from vinetrack.planning.predictive_inputs import BAND, YIELD, PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 
-LEAST_FULL_GROWTH = 0.95
-"""Fraction of draws that must grow to the end, or a warning is given. Chosen: the usual level. At 0.9 vines that fail
-one time in ten pass without a warning, at 0.975 an uncertain yield pressure alone gives one."""
+LEAST_FULL_GROWTH = 0.95  # Fraction of draws that must grow to the end, or a warning is given (chosen)
 
-WARNING_FRACTION = 0.05
-"""Fraction of draws above which a hazard is reported. Chosen: one draw in twenty, as at the ends of the stated band. At
-half rarer hazards are reported, at twice only those of one draw in ten."""
+WARNING_FRACTION = 0.05  # Fraction of draws above which a hazard is reported (chosen)
 
-FILM_MODULUS_PA = 25e6
-"""Young's modulus of the film, 10 to 50 MPa. Chosen: near the geometric middle of that range, 22 MPa. At half the
-reported stretch doubles, at twice it halves."""
+FILM_MODULUS_PA = 25e6  # Young's modulus of the film, 10 to 50 MPa (chosen)
 
+# Effects that every vine has to some extent; the others of the catalogue may be absent
 UNIVERSAL_EFFECTS = (
     "air_drag",
     "fold_inertia",
@@ -48,7 +43,6 @@ UNIVERSAL_EFFECTS = (
     "tail_friction",
     "wall_stretch",
 )
-"""Effects that every vine has to some extent; the others of the catalogue may be absent."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +61,8 @@ class Neglected:
 
 
 def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
-    """Return warnings about a planned vine in sentences, most serious first.
-
-    Parameters
-    ----------
-    prediction : of the vine.
-
-    Returns
-    -------
-    tuple of str
-        Empty where there is no warning.
+    """Return warnings about a planned vine in sentences, most serious first. Returns empty where there is
+    no warning.
     """
     return (
         *_burst(prediction.inputs.trial),
@@ -155,19 +141,8 @@ def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
 
 
 def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
-    """Return the final speed at the medians with each of the universal effects added, largest change first.
-
-    Each is added by itself at its typical size; effects whose columns are blank are left out.
-
-    Parameters
-    ----------
-    inputs : predictive inputs of the vine.
-    at_fraction : float
-        y/L at which the final speed is taken.
-
-    Returns
-    -------
-    tuple of Neglected
+    """Return the final speed at the medians with each of the universal effects added, largest change first. Each is
+    added by itself at its typical size; effects whose columns are blank are left out.
     """
     host = host_for(inputs.model)
     without = final_m_s(inputs, inputs.model, host, at_fraction)
@@ -188,20 +163,9 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
 
 
 def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
-    """Return parameters of an effect that follow from the vine: for wall stretch κ = (1 − ν/4) D/(2Et), ν = ½.
-
-    Source: radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube.
-
-    Parameters
-    ----------
-    name : str
-        Name of an effect.
-    trial : diameter and thickness of the vine.
-
-    Returns
-    -------
-    dict
-        By `effect.parameter`, SI; empty where the defaults of the effect apply.
+    """Return parameters of an effect that follow from the vine: for wall stretch κ = (1 − ν/4) D/(2Et), ν = ½. Source:
+    radial strain of a thin-walled closed tube under hoop stress PD/2t and half of it along the tube. Returns by
+    `effect.parameter`, SI; empty where the defaults of the effect apply.
     """
     if name != "wall_stretch":
         return {}
@@ -215,20 +179,8 @@ def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
 
 
 def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """Return the final speed at the medians under this model: a payload's at the end, else the leading edge's.
-
-    Parameters
-    ----------
-    inputs : predictive inputs, whose median trial is simulated.
-    model : the model to simulate.
-    host : a model with all effects of `model`, compiled once for several.
-    at_fraction : float
-        y/L at which the speed of the leading edge is taken.
-
-    Returns
-    -------
-    float
-        0 where the vine does not grow to its end.
+    """Return the final speed at the medians under this model: a payload's at the end, else the leading edge's. Returns
+    0 where the vine does not grow to its end.
     """
     (trial,), _ = _medians(inputs)
     (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host)

@@ -32,14 +32,10 @@ from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
 from vinetrack.planning.simulated_tracks import TrackSampling, film_trials
 
-MOST_ITERATIONS = 20
-"""Iterations of a refit, at most. Chosen for time: refits start from a fit and end within ten. At half some are cut
-short, at twice only time is spent."""
+MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
 
+# Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid beyond
 FURTHEST_DRAW = 2.0
-"""Standard deviations at which draws of the true parameters are clipped, since the linearised fit is not valid beyond.
-Chosen: 5 % of draws are clipped. At half the scatter of the truth is too small, at twice one draw in thousands leaves
-the linear range."""
 
 
 class PartlyLinear(Predictor):
@@ -58,22 +54,7 @@ class PartlyLinear(Predictor):
         self, theta: Floats, trial_effects: Floats, *, trial_effects_only: bool = False, past_end: bool = False
     ) -> list[Floats]:
         """Sensitivities and residuals, as `Predictor.linearise`; the sensitivities of the old trials are constant.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
-            Release, origin and deviations of each trial.
-        trial_effects_only : bool
-            Compute only the sensitivities of the new trials to trial effects.
-        past_end : bool
-            Continue trajectories of the new trials past the end of growth.
-
-        Returns
-        -------
-        list of arrays, shape (n_points, n_columns + 1)
-            One for each trial; the last column is the residual, m.
+        Shapes: theta (n_free,); trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points, n_columns + 1).
         """
         residuals = self.residuals_of_old(theta, trial_effects)
         columns = [np.column_stack([of_fit[:, :-1], r]) for of_fit, r in zip(self.old_columns, residuals, strict=True)]
@@ -82,52 +63,20 @@ class PartlyLinear(Predictor):
         )
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of all trials, m.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
-            Release, origin and deviations of each trial.
-
-        Returns
-        -------
-        list of arrays, shape (n_points,)
+        """Measured minus predicted positions of all trials, m. Shapes: theta (n_free,); trial_effects (n_trials,
+        N_TRIAL_EFFECTS) → (n_points,).
         """
         return self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.n_old :])
 
     def residuals_of_each(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
-        """`residuals` for several sets of trial effects.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        ways : sequence of arrays, shape (n_trials, N_TRIAL_EFFECTS)
-            Sets of trial effects.
-
-        Returns
-        -------
-        list of lists of arrays, shape (n_points,)
-            One list for each set.
+        """`residuals` for several sets of trial effects. Shapes: theta (n_free,); ways (n_trials, N_TRIAL_EFFECTS) →
+        (n_points,).
         """
         return [self.residuals(theta, trial_effects) for trial_effects in ways]
 
     def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted positions of the old trials, m, to first order.
-
-        Parameters
-        ----------
-        theta : array, shape (n_free,)
-            Free parameters, scaled.
-        trial_effects : array, shape (n_trials, N_TRIAL_EFFECTS)
-            Release, origin and deviations of each trial.
-
-        Returns
-        -------
-        list of arrays, shape (n_points,)
-            One for each old trial.
+        """Measured minus predicted positions of the old trials, m, to first order. Shapes: theta (n_free,);
+        trial_effects (n_trials, N_TRIAL_EFFECTS) → (n_points,).
         """
         at = self.expansion_point
         change = np.append(theta[: at.theta.size] - at.theta, np.zeros(theta.size - at.theta.size + 1))
@@ -146,43 +95,16 @@ class DesignProblem:
 
 def expected_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
     """Return the rise of −2 ln L of every (true, refitted) pair, the truth at its best values; NaN where a refit fails.
-
     The deviations of the trials are plus or minus one standard deviation in turn, so that few draws show the average.
-
-    Parameters
-    ----------
-    bench : hypotheses, conditions, cameras.
-    design : sequence of int
-        Index of the condition of each trial.
-    draws : sequence of int
-        Numbers of the draws, part of the seed.
-    seed : int
-
-    Returns
-    -------
-    array, shape (n_draws, n, n)
+    Shape (n_draws, n, n).
     """
     return _rises(bench, design, draws, seed, thorough=False)
 
 
 def simulated_rises(bench: DesignProblem, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
     """Return the rises of `expected_rises` with random true parameters and deviations and every trajectory simulated.
-
     Only where the pressure was recorded do the old trials stay linear: to simulate with a recorded pressure takes a
-    hundred times as long.
-
-    Parameters
-    ----------
-    bench : hypotheses, conditions, cameras.
-    design : sequence of int
-        Index of the condition of each trial.
-    draws : sequence of int
-        Numbers of the draws, part of the seed.
-    seed : int
-
-    Returns
-    -------
-    array, shape (n_draws, n, n)
+    hundred times as long. Shape (n_draws, n, n).
     """
     return _rises(bench, design, draws, seed, thorough=True)
 
@@ -215,16 +137,7 @@ def _alternating(design: Sequence[int], draw: int) -> Floats:
 
 def mean_separation(rises: Floats) -> Floats:
     """Return the square root of the mean rise of −2 ln L over the draws; 0 where a wrong hypothesis fits better.
-
-    Parameters
-    ----------
-    rises : array, shape (n_draws, n, n)
-        From `expected_rises` or `simulated_rises`; NaN is ignored.
-
-    Returns
-    -------
-    array, shape (n, n)
-        In standard deviations.
+    Shapes: rises (n_draws, n, n) → (n, n).
     """
     is_known = np.isfinite(rises)
     mean = np.where(is_known, rises, 0.0).sum(axis=0) / np.maximum(is_known.sum(axis=0), 1)
@@ -233,16 +146,7 @@ def mean_separation(rises: Floats) -> Floats:
 
 def draw_parameters(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """Draw true parameters from their distribution given the trials so far; those of new vines from their prior.
-
-    Parameters
-    ----------
-    hypothesis : taken as the truth.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    array, shape (n_free,)
-        Free parameters, scaled, within their bounds.
+    Returns free parameters, scaled, within their bounds. Shape (n_free,).
     """
     old = hypothesis.fit.predictor.layout.start.size
     values, vectors = np.linalg.eigh(hypothesis.scatter_levels[0].information[:old, :old])

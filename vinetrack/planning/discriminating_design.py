@@ -8,9 +8,6 @@ with X and Z its sensitivities to the free parameters and to the trial effects u
 information of the trials so far and g_s their gradient (not zero where b is at a bound). The between-trial standard
 deviations s of pressure and B are estimated too, so that a wrong hypothesis may explain part of its misfit as scatter.
 √D² is a separation in standard deviations; of a against b and b against a the smaller counts (T-optimality).
-
-Choosing the trials is an exact design problem. It is solved by exchange: one trial after the other is replaced by the
-best candidate (Fedorov 1972, Theory of Optimal Experiments). At most one new vine is proposed.
 """
 
 from __future__ import annotations
@@ -28,42 +25,25 @@ from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis, ScatterLevel
 from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank_trial
 
-POINTS = 100
-"""Times at which a condition is evaluated; each stands for the frames around it. Chosen: sums over smooth curves are
-then exact to a thousandth. At half designs are rated to a few thousandths, at twice the search takes twice as long."""
+POINTS = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
 
-PAST_THE_END = 1.05
-"""Time at which the vine is evaluated after its end, in end times. Chosen: the position is constant there, so any later
-time gives the same."""
+PAST_THE_END = 1.05  # Time at which the vine is evaluated after its end, in end times (chosen)
 
+# Separation, in standard deviations, at which a pair has half of its largest worth (chosen)
 WELL_SEPARATED = 5.0
-"""Separation, in standard deviations, at which a pair has half of its largest worth, so that another pair gains more.
-Chosen: five sigma leave no doubt. At half a design is content with pairs at 2.5 σ; at twice it spends trials on pairs
-that are already separated."""
 
-MOST_PASSES = 4
-"""Passes of the exchange, at most. Chosen for time: it usually ends after two; at half it may stop short of the
-optimum, at twice nothing changes."""
+MOST_PASSES = 4  # Passes of the exchange, at most (chosen)
 
-GAIN = 1.005
-"""Factor by which an exchange must raise the worth. Chosen: half a per cent, so that ties do not cycle; a design is
-worse than the optimum by at most that much. At half and twice the loss halves and doubles."""
+GAIN = 1.005  # Factor by which an exchange must raise the worth (chosen)
 
-BOUND_PASSES = 4
-"""Passes that fix parameters at their bounds. Chosen: each pass fixes all that crossed a bound, and few do. At half
-some designs are rated a little too good, at twice nothing changes."""
+BOUND_PASSES = 4  # Passes that fix parameters at their bounds (chosen)
 
 
 @dataclass(frozen=True)
 class RefitTerms:
-    """Quadratic form of −2 ln L of one hypothesis refitted to the trials so far and one trial of every condition.
-
-    The first axis is that of the scatter levels. From the trials so far: `old_information`, shape (n_levels, n_free,
-    n_free), `old_gradient`, (n_levels, n_free), and `old_rise`, (n_levels,). Of one trial of each condition:
-    `information`, (n_levels, n_conditions, n_free, n_free); for the motion predicted by each hypothesis, the gradient
-    `gradient`, (n_levels, n_conditions, n_free, n), and the squared misfit before the refit, `misfit`, (n_levels,
-    n_conditions, n); and the rise by a trial whose deviations are ordinary, `scatter_rise`, (n_levels, n_conditions).
-    `down` and `up`, shape (n_free,), are the distances of the parameters to their bounds.
+    """Quadratic form of −2 ln L of one hypothesis refitted to the trials so far and one trial of every condition. The
+    first axis is that of the scatter levels. From the trials so far: `old_information`, shape (n_levels, n_free,
+    n_free), `old_gradient`, (n_levels, n_free), and `old_rise`, (n_levels,).
     """
 
     old_information: Floats
@@ -78,15 +58,7 @@ class RefitTerms:
 
     def narrowed(self, allowed: NDArray[np.int_]) -> RefitTerms:
         """Keep some of the conditions, and the parameters about which they or the trials so far have information.
-
-        Parameters
-        ----------
-        allowed : array of int, shape (n_allowed,)
-            Indices of the conditions to keep.
-
-        Returns
-        -------
-        RefitTerms
+        Shapes: allowed (n_allowed,).
         """
         has_new = np.any(self.information[0][allowed].diagonal(axis1=1, axis2=2) > 0, axis=0)
         has_old = (np.abs(self.old_gradient[0]) > 0) | (np.count_nonzero(self.old_information[0], axis=0) > 1)
@@ -110,20 +82,7 @@ def refit_terms(
     cameras: Sequence[TrackSampling],
     runs: Sequence[GrowthCourse],
 ) -> list[RefitTerms]:
-    """Return the quadratic form of each hypothesis, with one trial of each condition, at its best values so far.
-
-    Parameters
-    ----------
-    hypotheses : extended to the conditions, see `hypothesis_predictions.extend`.
-    conditions : trials that could be made.
-    cameras : of each condition.
-    runs : course of growth of each condition, see `simulated_tracks.growth_courses`.
-
-    Returns
-    -------
-    list of RefitTerms
-        One for each hypothesis.
-    """
+    """Return the quadratic form of each hypothesis, with one trial of each condition, at its best values so far."""
     data = hypotheses[0].fit.predictor.data
     times, weights = zip(*(_times(camera, run) for camera, run in zip(cameras, runs, strict=True)), strict=True)
     placeholders = [blank_trial(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
@@ -145,9 +104,8 @@ def refit_terms(
 
 
 def _times(camera: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
-    """Times since release at which a condition is evaluated, and the number of frames that each represents.
-
-    The first represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
+    """Times since release at which a condition is evaluated, and the number of frames that each represents. The first
+    represents the frames at rest, the last those after the end of growth (weight 0 where there are none).
     """
     step_s = run.near_end_s / POINTS
     moving = (np.arange(POINTS) + 0.5) * step_s
@@ -204,17 +162,8 @@ def _without_trial_effects(
 
 
 def separations(terms: Sequence[RefitTerms], designs: NDArray[np.int_]) -> Floats:
-    """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal.
-
-    Parameters
-    ----------
-    terms : from `refit_terms`.
-    designs : array of int, shape (n_designs, n_trials)
-        Index of the condition of each trial.
-
-    Returns
-    -------
-    array, shape (n_designs, n, n)
+    """Return the separation of every ordered pair (true, refitted), in standard deviations; 0 on the diagonal. Shapes:
+    designs (n_designs, n_trials) → (n_designs, n, n).
     """
     n = len(terms)
     squares = np.zeros((len(designs), n, n))
@@ -237,10 +186,9 @@ def _over_trials(by_condition: Floats, designs: NDArray[np.int_]) -> Floats:
 
 
 def _largest_gain(information: Floats, gradient: Floats, down: Floats, up: Floats) -> Floats:
-    """Largest 2 gᵀδ − δᵀIδ with every δ within its bounds, shape (n_designs,), by an active-set method.
-
-    A parameter that would cross a bound is fixed there, and the others are solved again. None is released again, which
-    seldom, and then by little, overestimates the separation.
+    """Largest 2 gᵀδ − δᵀIδ with every δ within its bounds, shape (n_designs,), by an active-set method. A parameter
+    that would cross a bound is fixed there, and the others are solved again. None is released again, which seldom, and
+    then by little, overestimates the separation.
     """
     n, size = gradient.shape
     step = np.zeros((n, size))
@@ -261,15 +209,7 @@ def _largest_gain(information: Floats, gradient: Floats, down: Floats, up: Float
 
 def worth(between: Floats) -> Floats:
     """Return the worth of designs: the sum over pairs of d²/(d² + 5²), d the smaller separation of the two directions.
-
-    Parameters
-    ----------
-    between : array, shape (n_designs, n, n)
-        Separations of ordered pairs, standard deviations.
-
-    Returns
-    -------
-    array, shape (n_designs,)
+    Shapes: between (n_designs, n, n) → (n_designs,).
     """
     n = between.shape[1]
     first, second = np.triu_indices(n, 1)
@@ -278,22 +218,8 @@ def worth(between: Floats) -> Floats:
 
 
 def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:
-    """Find the trials that separate best, by exchange of one trial at a time (Fedorov 1972).
-
-    Parameters
-    ----------
-    terms : from `refit_terms`.
-    allowed : array of int
-        Indices of the conditions to choose from.
-    trials : int
-        Number of trials, replicates counted.
-
-    Returns
-    -------
-    design : array of int, shape (trials,)
-        Indices among all conditions, increasing.
-    worth : float
-        See `worth`.
+    """Find the trials that separate best, by exchange of one trial at a time (Fedorov 1972). Returns design (indices
+    among all conditions, increasing), worth (see `worth`). Shape (trials,).
     """
     of_allowed = [of_hypothesis.narrowed(allowed) for of_hypothesis in terms]
     replicates = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
@@ -315,24 +241,7 @@ def best_design(terms: Sequence[RefitTerms], allowed: NDArray[np.int_], trials: 
 def best_new_vines(
     terms: Sequence[RefitTerms], conditions: Sequence[Condition], places: NDArray[np.int_], trials: int, most: int
 ) -> list[str]:
-    """Return the new vines in order of the worth of replicates at their best condition, best first.
-
-    Parameters
-    ----------
-    terms : from `refit_terms`.
-    conditions : trials that could be made.
-    places : array of int
-        Indices of those with new vines.
-    trials : int
-        Replicates with which each condition is rated.
-    most : int
-        Number of vines, at most.
-
-    Returns
-    -------
-    list of str
-        Names of vines.
-    """
+    """Return the new vines in order of the worth of replicates at their best condition, best first."""
     of_new_vines = [of_hypothesis.narrowed(places) for of_hypothesis in terms]
     replicates = np.repeat(np.arange(places.size)[:, None], trials, axis=1)
     order = np.argsort(-worth(separations(of_new_vines, replicates)))

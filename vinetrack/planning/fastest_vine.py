@@ -1,4 +1,5 @@
-"""The fastest vine that can be built from given films, within ranges of diameter and length, burst stress and supply.
+"""The fastest vine that can be built from given films, within ranges of diameter and length, burst stress
+and supply.
 
 For a given size a higher pressure always gives a higher speed, so the pressure is the highest that supply and wall
 allow, P = min(P_supply, f · 2tσ/D) with f the allowed fraction of the burst stress σ. Diameter and length are optimised
@@ -22,18 +23,11 @@ from vinetrack.planning.prediction import LONGEST_S, POINTS, VinePrediction, pre
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa
 
-GRID = (17, 9)
-"""Numbers of diameters and lengths in each round. Chosen: over a factor of ten, neighbouring diameters differ by 15 %.
-At half the first round may miss a narrow optimum, at twice the search takes four times as long."""
+GRID = (17, 9)  # Numbers of diameters and lengths in each round (chosen)
 
-ROUNDS = 3
-"""Rounds of the search, each a finer grid around the optimum of the one before; the last resolves sizes to a few
-thousandths. Chosen: speed is flat at its optimum, so smaller differences do not matter. At half sizes are accurate to a
-few per cent, at twice only time is spent."""
+ROUNDS = 3  # Rounds of the search, each a finer grid around the optimum of the one before (chosen)
 
-BOUND_TOLERANCE = 0.005
-"""Relative distance from a bound below which a vine counts as limited by it. Chosen: the resolution of the last round;
-only the wording depends on it."""
+BOUND_TOLERANCE = 0.005  # Relative distance from a bound below which a vine counts as limited by it (chosen)
 
 
 @dataclass(frozen=True)
@@ -49,34 +43,14 @@ class Room:
     burst_stress_Pa: float = BURST_STRESS_PA
 
     def pressure_of(self, diameter_m: float, thickness_m: float) -> float:
-        """Return the highest pressure that supply and wall allow, Pa.
-
-        P = min(P_supply, f · 2tσ/D), with f the allowed fraction of the burst stress σ.
-
-        Parameters
-        ----------
-        diameter_m, thickness_m : float
-            Size of the tube, m.
-
-        Returns
-        -------
-        float
+        """Return the highest pressure that supply and wall allow, Pa. P = min(P_supply, f · 2tσ/D), with f the allowed
+        fraction of the burst stress σ.
         """
         burst_Pa = burst_pressure_Pa(diameter_m, thickness_m) * self.burst_stress_Pa / BURST_STRESS_PA
         return min(self.pressure_Pa, self.burst_share * burst_Pa)
 
     def trial(self, diameter_m: float, thickness_m: float, length_m: float) -> Trial:
-        """Return the trial with a vine of this size at the highest pressure allowed.
-
-        Parameters
-        ----------
-        diameter_m, thickness_m, length_m : float
-            Size of the vine, m.
-
-        Returns
-        -------
-        Trial
-        """
+        """Return the trial with a vine of this size at the highest pressure allowed."""
         pressure_Pa = self.pressure_of(diameter_m, thickness_m)
         sized = replace(
             self.rig,
@@ -92,7 +66,6 @@ class Room:
 @dataclass(frozen=True)
 class Choice:
     """The fastest vine of one film; `limits` are the constraints that are active, `odds` is how often it is fastest.
-
     `others` has columns diameter, m, and lead speed, m/s, of the fastest vine of every diameter of the first round.
     """
 
@@ -112,31 +85,7 @@ def fastest(
     seed: int = 1,
     at_fraction: float = 0.95,
 ) -> tuple[Choice, ...]:
-    """Find the fastest vine of every film, fastest first.
-
-    Parameters
-    ----------
-    room : limits of what can be built.
-    stated : stated values, in place of other sources.
-    fit : a fit to predict from, if any.
-    samples : int
-        Draws for bands and odds.
-    seed : int
-        Of the random numbers.
-    at_fraction : float
-        y/L at which the final speed without payload is evaluated.
-
-    Returns
-    -------
-    tuple of Choice
-
-    Raises
-    ------
-    EffectError
-        If the rig lacks what an effect of the model needs.
-    SimulationError
-        If a vine cannot be simulated.
-    """
+    """Find the fastest vine of every film, fastest first."""
     best: list[tuple[PredictiveInputs, Floats]] = [_best(room, film, stated, fit, at_fraction) for film in room.films_m]
     odds = _odds([inputs for inputs, _ in best], samples, seed, at_fraction)
     choices = [
@@ -180,17 +129,7 @@ def _neighbours(axis: Floats, k: int, limits: tuple[float, float]) -> tuple[floa
 
 def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) -> Floats:
     """Return the final speed of every vine at its medians, m/s: a payload's at the end, else the leading edge's.
-
-    Parameters
-    ----------
-    vine_inputs : predictive inputs, all of one model.
-    at_fraction : float
-        y/L at which the final speed without payload is evaluated.
-
-    Returns
-    -------
-    array, shape (n,)
-        0 for a vine that does not grow to its end.
+    Returns 0 for a vine that does not grow to its end. Shape (n,).
     """
     trials = [inputs.trial for inputs in vine_inputs]
     model = vine_inputs[0].model

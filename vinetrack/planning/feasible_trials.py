@@ -21,46 +21,28 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
-SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2
-"""Effort of a trial: nothing new; another chamber, connector or angle; a vine that has to be made. Defined in order of
-effort; only their order matters."""
+SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
-HEADROOM = 1.25
-"""Highest candidate pressure, as a multiple of the highest used. Chosen: a modest step beyond experience. At 1.12 less
-of the model is tested, at 1.5 pressures may exceed what a rig can hold."""
+HEADROOM = 1.25  # Highest candidate pressure, as a multiple of the highest used (chosen)
 
+# Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
 LOWEST_PRESSURE_RATIO = 1.15
-"""Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure, since nearer to it the
-error of P_y dominates the motion. Chosen: an error of 3 % of P_y is then 20 % of the drive P − P_y. At 1.07 it is 40 %,
-at 1.3 slow trials are not offered."""
 
-PRESSURE_STEP_PA = 100.0
-"""Resolution of set pressures, Pa. Chosen: regulators are read to about 0.1 kPa; at half or twice, the pressures of a
-plan change by less than their errors."""
+PRESSURE_STEP_PA = 100.0  # Resolution of set pressures, Pa (chosen)
 
-PAYLOAD_KG = 0.05
-"""Payload offered where none was used yet, kg. Chosen: several times the mass of a usual tail; the user's limits
-replace it."""
+PAYLOAD_KG = 0.05  # Payload offered where none was used yet, kg (chosen)
 
-CANDIDATE_PRESSURES = 6
-"""Candidate pressures of a vine. Chosen: over a factor of ten, steps of 1.6. At half an optimum between pressures is
-missed by little (designs are flat there), at twice the search takes longer."""
+CANDIDATE_PRESSURES = 6  # Candidate pressures of a vine (chosen)
 
-MOST_NEW_VINES = 10
-"""New vines considered, at most; those of the most different sizes are taken. Chosen for time: at half a useful size
-may be missed, at twice the search takes twice as long."""
+MOST_NEW_VINES = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
 
-EQUAL_TOLERANCE = 1e-4
-"""Relative difference below which two values are equal. Chosen: below any tolerance of a workshop, above rounding."""
+EQUAL_TOLERANCE = 1e-4  # Relative difference below which two values are equal (chosen)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A trial that could be made.
-
-    `like` is the index, among the trials of the experiment, of the trial it is modelled on: for an existing vine a
-    trial with it, else one with the vine nearest in size. `changed` names the columns that differ from the rig of that
-    trial.
+    """A trial that could be made. `like` is the index, among the trials of the experiment, of the trial it is modelled
+    on: for an existing vine a trial with it, else one with the vine nearest in size.
     """
 
     trial: Trial
@@ -70,18 +52,7 @@ class Condition:
 
 
 def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
-    """Return every candidate trial; empty where the limits exclude all.
-
-    Parameters
-    ----------
-    trials : of the experiment, at least one.
-    limits : of the user.
-
-    Returns
-    -------
-    list of Condition
-        Named `next_1`, `next_2`, …
-    """
+    """Return every candidate trial; empty where the limits exclude all."""
     typical = _typical_trials(trials)
     if not typical:
         return []
@@ -109,8 +80,8 @@ def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Conditi
     ]
 
 
+# Columns of the sheet that describe a rig, with their fields of a trial
 RIG_FIELDS = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
-"""Columns of the sheet that describe a rig, with their fields of a trial."""
 
 
 def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:

@@ -20,24 +20,18 @@ from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
-LEAST_DOF = 3
-"""Least degrees of freedom of a between-trial standard deviation. Derived: below three the t distribution has no
-variance, and a fit does not estimate it with fewer."""
+LEAST_DOF = 3  # Least degrees of freedom of a between-trial standard deviation (derived)
 
-NORMAL_95 = 1.959963984540054
-"""Standard normal quantile of 0.975."""
+NORMAL_95 = 1.959963984540054  # Standard normal quantile of 0.975
 
 _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 
 
 @dataclass(frozen=True)
 class FitNumbers:
-    """The parameters of a fit, named by `keys` and `vines`; `log` marks those held as logarithms.
-
-    `mean` and `covariance` are those of the parameters of a new trial, between-trial differences included. Parameters
-    that the fit does not determine have a variance of 0 and are listed in `open`. The covariance is scaled so that its
-    normal 95 % intervals are those of the fit, which use Student's t. `spreads` are the relative between-trial standard
-    deviations of pressure and B, `spread_dof` their degrees of freedom, infinite where the fit was given them.
+    """The parameters of a fit, named by `keys` and `vines`; `log` marks those held as logarithms. `mean` and
+    `covariance` are those of the parameters of a new trial, between-trial differences included. Parameters that the fit
+    does not determine have a variance of 0 and are listed in `open`.
     """
 
     source: str
@@ -53,19 +47,7 @@ class FitNumbers:
     n_trials: int
 
     def place(self, key: str, vine: str = "") -> int | None:
-        """Return the index of a parameter, shared or of this vine; None where there is none.
-
-        Parameters
-        ----------
-        key : str
-            Name of a parameter, `effect.parameter`.
-        vine : str
-            Name of a vine.
-
-        Returns
-        -------
-        int or None
-        """
+        """Return the index of a parameter, shared or of this vine; None where there is none."""
         for k, (name, of_vine) in enumerate(zip(self.keys, self.vines, strict=True)):
             if name == key and of_vine in ("", vine):
                 return k
@@ -81,45 +63,15 @@ class FitNumbers:
 
 
 def size_of(vine: str) -> tuple[float, float] | None:
-    """Parse diameter and thickness, m, from the name of a vine; None where the name does not contain them.
-
-    Parameters
-    ----------
-    vine : str
-        Name as `vinetrack.experiment.naming` gives it.
-
-    Returns
-    -------
-    (float, float) or None
-
-    Examples
-    --------
-    >>> size_of("24mm-200um-280mm")
-    (0.024, 0.0002)
+    """Parse diameter and thickness, m, from the name of a vine; None where the name does not contain them. Returns
+    (float, float) or None.
     """
     match = _VINE.match(vine)
     return (float(match[1]) / 1e3, float(match[2]) / 1e6) if match else None
 
 
 def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
-    """Read the parameters of a fit from the content of `fit.json`.
-
-    Parameters
-    ----------
-    content : mapping
-        Content of `fit.json`.
-    source : str
-        Named in messages and origins.
-
-    Returns
-    -------
-    FitNumbers
-
-    Raises
-    ------
-    FitError
-        If there is no fit in it.
-    """
+    """Read the parameters of a fit from the content of `fit.json`."""
     if content.get("refused"):
         raise FitError(f"{source} holds no fit to predict from: {content['refused']}")
     numbers = content["numbers"]
@@ -168,16 +120,7 @@ def _widening(number: Mapping[str, Any], log: bool) -> float:
 
 
 def numbers_of(fit: Fit) -> FitNumbers:
-    """Return the parameters of a fit as `vinetrack.fit` returns it.
-
-    Parameters
-    ----------
-    fit : a fit.
-
-    Returns
-    -------
-    FitNumbers
-    """
+    """Return the parameters of a fit as `vinetrack.fit` returns it."""
     content = {
         "model": fit.model.names,
         "numbers": [number.to_json() for number in fit.numbers],
@@ -192,18 +135,7 @@ def numbers_of(fit: Fit) -> FitNumbers:
 
 
 def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """Return the fitted vine of this diameter and wall and any length, since B belongs to the tip; None without one.
-
-    Parameters
-    ----------
-    numbers : of a fit.
-    trial : diameter, thickness and vine.
-
-    Returns
-    -------
-    str or None
-        Name of the vine; one of the same length is preferred.
-    """
+    """Return the fitted vine of this diameter and wall and any length, since B belongs to the tip; None without one."""
     sizes = [
         (vine, size) for vine, size in numbers.sizes().items() if alike(size, (trial.diameter_m, trial.thickness_m))
     ]
@@ -212,53 +144,19 @@ def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
 
 
 def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
-    """Return whether two sizes are equal to five digits.
-
-    Parameters
-    ----------
-    first, second : (float, float)
-        Diameter and thickness, m.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether two sizes are equal to five digits."""
     return all(abs(a / b - 1) < 1e-5 for a, b in zip(first, second, strict=True))
 
 
 def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """Return the fitted vine nearest in ln diameter and ln thickness; None where no name contains a size.
-
-    Parameters
-    ----------
-    numbers : of a fit.
-    trial : diameter and thickness.
-
-    Returns
-    -------
-    str or None
-        Name of the vine.
-    """
+    """Return the fitted vine nearest in ln diameter and ln thickness; None where no name contains a size."""
     target = np.log([trial.diameter_m, trial.thickness_m])
     sizes = numbers.sizes()
     return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - target) ** 2)), default=None)
 
 
 def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
-    """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value.
-
-    Parameters
-    ----------
-    numbers : of a fit.
-    vine : str
-        Name of a vine.
-    stated_Pa : float
-        Yield pressure of the sheet, NaN where it has none.
-
-    Returns
-    -------
-    int or None
-    """
+    """Return the index of the yield pressure of a fitted vine; of several, the one nearest to the stated value."""
     places = [
         k
         for k, (key, name) in enumerate(zip(numbers.keys, numbers.vines, strict=True))

@@ -22,25 +22,18 @@ from vinetrack.inference.sensitivity import Predictor
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.scaling_priors import damping_prior, damping_scatter
 
-NEW_VINE_SD = 1.0
-"""Prior standard deviation of the parameters of a new vine, scaled as in the fit (of ln B, so a factor of e). Chosen:
-so wide that any trial with the vine has more information; at half or twice that stays so."""
+NEW_VINE_SD = 1.0  # Prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
 
 
+# Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
 SCATTER_FACTORS = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
-"""Factors on the between-trial standard deviations of pressure and B that a refit may estimate, since a wrong
-hypothesis explains as scatter what it can. Chosen: up to the scatter of real batches. Reasoned: without the last a
-wrong hypothesis is rated as separated where five times the scatter of B would hide it; with factors twice as large the
-rating hardly changes, since scatter costs ln L."""
 
 
 @dataclass(frozen=True)
 class ScatterLevel:
     """Likelihood of the trials so far near the best values, for one assumed pair of between-trial standard deviations.
-
     `information`, shape (n_free, n_free), and `gradient`, shape (n_free,), of half the sum of squares at the best
-    values; the gradient is not zero at a bound. `spread` are the standard deviations of pressure and ln B, `factors`
-    their ratios to the fitted ones, and `rise` the increase of −2 ln L against the fitted ones.
+    values; the gradient is not zero at a bound.
     """
 
     spread: tuple[float, float]
@@ -52,13 +45,9 @@ class ScatterLevel:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One of the tied fits, extended to further conditions.
-
-    `layout` maps the free parameters to the trials of the conditions: those of the fit first, then those of new vines.
-    All are scaled as in the fit; `theta`, shape (n_free,), are their best values. `scatter_levels` hold the likelihood
-    of the trials so far, at the fitted scatter and at larger scatter. `sd_of_new` are the standard deviations of the
-    true parameters of new vines about their values here. `rho` and `variance` are the correlation of the noise and the
-    variance of its innovations, m²; `spread` are the between-trial standard deviations of pressure and ln B.
+    """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
+    conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
+    are their best values.
     """
 
     name: str
@@ -78,53 +67,18 @@ class Hypothesis:
         return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
 
     def layout_of(self, places: Sequence[int]) -> ParameterMap:
-        """Return the parameter map of some of the conditions.
-
-        Parameters
-        ----------
-        places : sequence of int
-            Indices of the conditions.
-
-        Returns
-        -------
-        ParameterMap
-        """
+        """Return the parameter map of some of the conditions."""
         return replace(self.layout, index=self.layout.index[list(places)], base=self.layout.base[list(places)])
 
     def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
-        """Return a predictor of these trials, one for each of the conditions at `places`.
-
-        Parameters
-        ----------
-        places : sequence of int
-            Indices of the conditions.
-        items : sequence of FitTrial
-            The trial to simulate for each of them.
-
-        Returns
-        -------
-        Predictor
-            With the step sizes of the fit.
-        """
+        """Return a predictor of these trials, one for each of the conditions at `places`."""
         predictor = Predictor(self.layout_of(places), items, self.fit.predictor.host)
         predictor.steps = self.fit.predictor.steps.copy()
         return predictor
 
 
 def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
-    """Extend a fit to further conditions; new vines add parameters with priors.
-
-    Parameters
-    ----------
-    fit : one of the fits that the data do not distinguish.
-    name : str
-        Name of the hypothesis.
-    conditions : trials that could be made.
-
-    Returns
-    -------
-    Hypothesis
-    """
+    """Extend a fit to further conditions; new vines add parameters with priors."""
     old = fit.predictor.layout
     state = fit.solution.state
     numbers, index = list(old.free), []

@@ -21,35 +21,23 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.planning.predictive_inputs import BAND, PredictiveInputs
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
-LONGEST_S = 600.0
-"""Duration of a simulation, s; a vine that has not grown by then counts as never reaching its end. Chosen: a thousand
-times a usual growth. At half or twice only vines that barely grow are classed differently."""
+LONGEST_S = 600.0  # Duration of a simulation, s (chosen)
 
-POINTS = 400
-"""Times at which each draw is evaluated. Derived: linear interpolation errs by (1/400)²/8 of the curvature, so speeds
-are accurate to a thousandth up to 0.99 of the length."""
+POINTS = 400  # Times at which each draw is evaluated (derived)
 
-MOST_TENSIONS = 300
-"""Draws whose forces are evaluated, a third of a millisecond each. Chosen for time: the ends of a 90 % band are then
-known to 1.3 % of the draws. At half to 1.8 %, at twice to 0.9 %."""
+MOST_TENSIONS = 300  # Draws whose forces are evaluated, a third of a millisecond each (chosen)
 
+# Tension below which the tail is slack, as a fraction of the drive (chosen)
 ZERO_TENSION = 1e-9
-"""Tension below which the tail is slack, as a fraction of the drive, since the forces of a slack tail cancel only to
-rounding. Chosen: far above rounding of sums (1e-15), far below any force of interest."""
 
+# Compression of the tail from which the model is said to be in doubt, as a fraction of the drive ½PA (chosen)
 COMPRESSION_FRACTION = 0.01
-"""Compression of the tail from which the model is said to be in doubt, as a fraction of the drive ½PA; the weight of a
-tail without payload alone does no harm. Chosen: half of it names vines whose tail is compressed by less than its
-weight; twice it passes payloads that run ahead by 2 % of the drive."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`.
-
-    At a place that a draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge. Tensions
-    and pressures are those of the first `MOST_TENSIONS` draws, NaN where not reached; `least_tension_N` is the least up
-    to the last place. `slack` is 1 for draws whose tail is compressed, or goes slack where the model allows it.
+    """Simulated draws, SI. Arrays have shape (n_draws,), or (n_draws, n_places) along `places_m`. At a place that a
+    draw never reaches the time is inf and the speed 0. Speeds are those of the leading edge.
     """
 
     places_m: Floats
@@ -73,33 +61,7 @@ def run(
     only: Iterable[str] | None = None,
     with_tension: bool = True,
 ) -> Runs:
-    """Draw predictive inputs and simulate every draw.
-
-    Parameters
-    ----------
-    inputs : the distributions to draw from.
-    places_m : array, shape (n_places,), m
-        Growth at which values are evaluated, increasing.
-    samples : int
-        Number of draws.
-    seed : int
-        Of the random numbers.
-    only : iterable of str, optional
-        Names of the uncertainties that vary; all by default.
-    with_tension : bool
-        Whether tensions and pressures are computed, for the first `MOST_TENSIONS` draws.
-
-    Returns
-    -------
-    Runs
-
-    Raises
-    ------
-    EffectError
-        If the trial lacks what an effect of the model needs.
-    SimulationError
-        If a draw cannot be integrated.
-    """
+    """Draw predictive inputs and simulate every draw. Shapes: places_m (n_places,)."""
     trials, rows = inputs.laid_out(inputs.draw(samples, seed, only))
     moved, until_s = follow(inputs, trials, rows)
     time_s, velocity_m_s = np.full((samples, places_m.size), math.inf), np.zeros((samples, places_m.size))
@@ -128,20 +90,8 @@ def run(
 
 
 def follow(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> tuple[list[Trajectory], Floats]:
-    """Simulate every draw at `POINTS` times of its growth.
-
-    Parameters
-    ----------
-    inputs : whose model is simulated.
-    trials : sequence, n_draws
-    rows : array, shape (n_draws, n_parameters)
-        Parameters of the model, SI.
-
-    Returns
-    -------
-    trajectories : list of Trajectory
-    end_s : array, shape (n_draws,)
-        inf where a draw does not reach its end.
+    """Simulate every draw at `POINTS` times of its growth. Returns trajectories, end_s (inf where a draw does not reach
+    its end). Shapes: rows (n_draws, n_parameters) → (n_draws,).
     """
     until_longest = [np.array([0.0, LONGEST_S])] * len(trials)
     ends = simulate_many(inputs.model, trials, until_longest, parameters=rows)
@@ -189,18 +139,14 @@ def _steady(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> 
         return np.asarray((force_N / B) ** (1 / n))
 
 
-SAMPLES = 1000
-"""Draws of a prediction. Derived: the ends of the 90 % band are known to √(0.05 × 0.95/1000) = 0.7 % of the draws."""
+SAMPLES = 1000  # Draws of a prediction (derived)
 
-CONTRIBUTION_SAMPLES = 400
-"""Draws for the band of one uncertainty alone. Derived: its ends are known to 1.1 % of the draws."""
+CONTRIBUTION_SAMPLES = 400  # Draws for the band of one uncertainty alone (derived)
 
-FINAL_AT_FRACTION = 0.95
-"""y/L at which the final speed without payload is evaluated. Convention, as in a fit: the model's speed diverges at
-1."""
+FINAL_AT_FRACTION = 0.95  # y/L at which the final speed without payload is evaluated (convention)
 
+# y/L of the curves, dense at the start
 ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
-"""y/L of the curves, dense at the start. They end at 0.99, since without payload the model's speed diverges at 1."""
 
 CURVE_COLUMNS = (
     "condition",
@@ -230,10 +176,8 @@ HOOP = "hoop stress PD/2t"
 
 @dataclass(frozen=True)
 class Quantity:
-    """One predicted quantity with its 90 % band, SI.
-
-    `y_over_L` is where it is evaluated, NaN where it belongs to no place. For draws that never get there the time is
-    infinite and the speed 0.
+    """One predicted quantity with its 90 % band, SI. `y_over_L` is where it is evaluated, NaN where it belongs to no
+    place. For draws that never get there the time is infinite and the speed 0.
     """
 
     name: str
@@ -256,11 +200,8 @@ class Contribution:
 
 @dataclass(frozen=True)
 class VinePrediction:
-    """Prediction of one trial.
-
-    `curve` has a row for each place along the growth, columns `CURVE_COLUMNS`. `shares` is the uncertainty budget: the
-    band of `final` with one uncertain input each, widest first. `arrives` is the fraction of draws that grow to the
-    end, `slack` the fraction whose tail is compressed (or goes slack, where the model allows it) on the way.
+    """Prediction of one trial. `curve` has a row for each place along the growth, columns `CURVE_COLUMNS`. `shares` is
+    the uncertainty budget: the band of `final` with one uncertain input each, widest first.
     """
 
     inputs: PredictiveInputs
@@ -274,9 +215,8 @@ class VinePrediction:
 
     @property
     def final(self) -> Quantity:
-        """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`.
-
-        Where the tail may go slack, the payload moves on its own and is not simulated: then that of the leading edge.
+        """The final speed: of the payload as it leaves, else of the leading edge at `at_fraction`. Where the tail may
+        go slack, the payload moves on its own and is not simulated: then that of the leading edge.
         """
         return self[final_name(self.inputs)]
 
@@ -293,31 +233,12 @@ class VinePrediction:
 
 
 def told_by_payload(trial: Trial) -> bool:
-    """Return whether the final speed is that of a payload, which a slack tail would let move on its own.
-
-    Parameters
-    ----------
-    trial : its payload and `tail_slack`.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether the final speed is that of a payload, which a slack tail would let move on its own."""
     return trial.payload_kg > 0 and trial.tail_slack != "free"
 
 
 def final_name(inputs: PredictiveInputs) -> str:
-    """Return the name of the final speed of this trial.
-
-    Parameters
-    ----------
-    inputs : of the trial.
-
-    Returns
-    -------
-    str
-        Name of a `Quantity`.
-    """
+    """Return the name of the final speed of this trial."""
     return EJECTION if told_by_payload(inputs.trial) else EDGE
 
 
@@ -373,16 +294,7 @@ def predict_vine(
 
 def band(values: Floats) -> Floats:
     """Return the 5 %, 50 % and 95 % sample quantiles along the first axis, without interpolation (values may be inf).
-
-    Parameters
-    ----------
-    values : array, shape (n_draws, ...)
-        NaN is ignored.
-
-    Returns
-    -------
-    array, shape (3, ...)
-        NaN where all draws are NaN.
+    Returns naN where all draws are NaN. Shapes: values (n_draws, ...) → (3, ...).
     """
     is_empty = np.isnan(values).all(axis=0)
     quantiles = np.asarray(np.nanquantile(np.where(is_empty, 0.0, values), BAND, axis=0, method="inverted_cdf"))

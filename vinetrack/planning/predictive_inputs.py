@@ -18,26 +18,22 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
 
+# Names of the two inputs that belong to the trial and not to the model
 PRESSURE, YIELD = "pressure_Pa", "yield_pressure_Pa"
-"""Names of the two inputs that belong to the trial and not to the model."""
 
-BAND = (0.05, 0.5, 0.95)
-"""Convention: median and 90 % band of a prediction."""
+BAND = (0.05, 0.5, 0.95)  # Convention: median and 90 % band of a prediction
 
-_BAND_SAMPLES = 4000
-"""Draws for the bands of the inputs. Derived: their ends are known to 0.35 % of the draws."""
+_BAND_SAMPLES = 4000  # Draws for the bands of the inputs (derived)
 
-Draws = dict[str, Floats]
-"""Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure."""
+Draws = dict[str, Floats]  # Values, shape (n,), by name of a parameter (`effect.parameter`) or of a pressure
 
 Sampler = Callable[[Draws, np.random.Generator], Draws]
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """One uncertainty; `sample` returns draws in which it varies, given draws in which it does not.
-
-    `key` names its stream of random numbers: uncertainties of the same key vary together, in different vines too.
+    """One uncertainty; `sample` returns draws in which it varies, given draws in which it does not. `key` names its
+    stream of random numbers: uncertainties of the same key vary together, in different vines too.
     """
 
     name: str
@@ -61,12 +57,7 @@ class Input:
 
 @dataclass(frozen=True)
 class PredictiveInputs:
-    """The distributions from which one trial is predicted.
-
-    `trial` and `model` are at the medians; `origins` gives the origin of each input by name; `spreads` are the relative
-    between-trial standard deviations of pressure and B, which are among the uncertainties too; `notes` are sentences
-    for the user.
-    """
+    """The distributions from which one trial is predicted."""
 
     trial: Trial
     model: Model
@@ -82,22 +73,7 @@ class PredictiveInputs:
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
     def draw(self, count: int, seed: int, only: Iterable[str] | None = None) -> Draws:
-        """Draw every input `count` times; the same seed gives the same draws.
-
-        Parameters
-        ----------
-        count : int
-            Number of draws.
-        seed : int
-            The same seed gives the same draws of an uncertainty, whichever others vary.
-        only : iterable of str, optional
-            Names of the uncertainties that vary; the others stay at their medians. By default all vary.
-
-        Returns
-        -------
-        Draws
-            Within the bounds of each parameter.
-        """
+        """Draw every input `count` times; the same seed gives the same draws."""
         chosen = None if only is None else set(only)
         draws = {name: np.full(count, value) for name, value in self.medians.items()}
         for uncertainty in self.uncertainties:
@@ -106,17 +82,8 @@ class PredictiveInputs:
         return _within_bounds(draws, self.model)
 
     def laid_out(self, draws: Draws) -> tuple[list[Trial], Floats]:
-        """Return the trials and model parameters of these draws, as the simulator takes them.
-
-        Parameters
-        ----------
-        draws : from `draw`.
-
-        Returns
-        -------
-        trials : list of Trial
-            One for each draw, with its pressures.
-        parameters : array, shape (n, n_parameters), SI
+        """Return the trials and model parameters of these draws, as the simulator takes them. Returns trials (one for
+        each draw, with its pressures), parameters. Shape (n, n_parameters).
         """
         rows = np.column_stack([draws[name] for name in self.model.parameter_names])
         pressures, yields = draws[PRESSURE].tolist(), draws[YIELD].tolist()
@@ -125,18 +92,7 @@ class PredictiveInputs:
         ], rows
 
     def bands(self, seed: int = 1) -> list[Input]:
-        """Return every input with its 90 % band; fixed inputs have a band of zero width.
-
-        Parameters
-        ----------
-        seed : int
-            Of the draws.
-
-        Returns
-        -------
-        list of Input
-            B, n and the pressures first.
-        """
+        """Return every input with its 90 % band; fixed inputs have a band of zero width."""
         draws = self.draw(_BAND_SAMPLES, seed)
         names = {
             f"{effect.name}.{parameter.name}": (parameter.symbol, parameter.unit)
@@ -166,26 +122,7 @@ def wanted_model(
     further: Iterable[str] = (),
     user_effects: Mapping[str, Effect] | None = None,
 ) -> Model:
-    """Return a model of these effects and further ones, each once.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Effects of the model.
-    further : iterable of str
-        Effects added to them.
-    user_effects : mapping, optional
-        Effects of the user by name, beside the catalogue.
-
-    Returns
-    -------
-    Model
-
-    Raises
-    ------
-    EffectError
-        If a name is unknown.
-    """
+    """Return a model of these effects and further ones, each once."""
     return make_model(dict.fromkeys([*names, *further]), user_effects)
 
 
@@ -204,30 +141,7 @@ class Size:
 
 def read_sizes(text: str, further: Mapping[str, Effect] | None = None) -> tuple[str, dict[str, Size]]:
     """Parse an effect with its sizes: `NAME`, `NAME=value` or `NAME=low:high`, several parameters separated by commas.
-
-    Parameters
-    ----------
-    text : str
-        As a user writes it.
-    further : mapping, optional
-        Effects of the user by name, beside the catalogue.
-
-    Returns
-    -------
-    name : str
-        Of the effect.
-    sizes : dict
-        By `effect.parameter`; empty where the text gives none.
-
-    Raises
-    ------
-    EffectError
-        If there is no such effect or its sizes cannot be read.
-
-    Examples
-    --------
-    >>> read_sizes("reservoir_depletion=1:1.4")
-    ('reservoir_depletion', {'reservoir_depletion.gamma': Size(low=1.0, high=1.4)})
+    Returns name (of the effect), sizes (by `effect.parameter`; empty where the text gives none).
     """
     from vinetrack.effects import find_effect
 
@@ -262,10 +176,7 @@ def _size(effect: Effect, parameter: str, cell: str, bounds: tuple[float, float]
     return Size(low, high)
 
 
-LARGEST_T_DEVIATE = 20.0
-"""At which deviates of Student's t are clipped: a factor of ten in the scaling prior of B, beyond all vines. Chosen: it
-clips one draw in 400 of t with two degrees of freedom, at half one in 100, at twice one in 1600; the 90 % band ends at
-2.9."""
+LARGEST_T_DEVIATE = 20.0  # At which deviates of Student's t are clipped (chosen)
 
 
 def _deviates(draw: np.random.Generator, count: int, dof: float = math.inf) -> Floats:
@@ -276,21 +187,7 @@ def _deviates(draw: np.random.Generator, count: int, dof: float = math.inf) -> F
 
 
 def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
-    """Return a sampler that multiplies an input by a log-normal (or log-t) factor.
-
-    Parameters
-    ----------
-    name : str
-        Input that is drawn.
-    log_sigma : float
-        Standard deviation, or scale of Student's t, of the logarithm of the factor.
-    dof : float
-        Degrees of freedom; infinite for a normal distribution.
-
-    Returns
-    -------
-    Sampler
-    """
+    """Return a sampler that multiplies an input by a log-normal (or log-t) factor."""
 
     def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] * np.exp(log_sigma * _deviates(draw, draws[name].size, dof))}
@@ -299,19 +196,7 @@ def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Sampler:
 
 
 def shifted(name: str, sigma: float) -> Sampler:
-    """Return a sampler that adds a normal deviate to an input.
-
-    Parameters
-    ----------
-    name : str
-        Input that is drawn.
-    sigma : float
-        Standard deviation, SI.
-
-    Returns
-    -------
-    Sampler
-    """
+    """Return a sampler that adds a normal deviate to an input."""
 
     def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] + sigma * draw.standard_normal(draws[name].size)}
@@ -320,21 +205,7 @@ def shifted(name: str, sigma: float) -> Sampler:
 
 
 def relative(name: str, sigma: float, dof: float = math.inf) -> Sampler:
-    """Return a sampler that multiplies an input by one plus a normal (or t) deviate.
-
-    Parameters
-    ----------
-    name : str
-        Input that is drawn.
-    sigma : float
-        Relative standard deviation, or scale of Student's t.
-    dof : float
-        Degrees of freedom; infinite for a normal distribution.
-
-    Returns
-    -------
-    Sampler
-    """
+    """Return a sampler that multiplies an input by one plus a normal (or t) deviate."""
 
     def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draws[name] * (1 + sigma * _deviates(draw, draws[name].size, dof))}
@@ -343,18 +214,7 @@ def relative(name: str, sigma: float, dof: float = math.inf) -> Sampler:
 
 
 def even(name: str, size: Size) -> Sampler:
-    """Return a sampler that draws an input uniformly from a range.
-
-    Parameters
-    ----------
-    name : str
-        Input that is drawn.
-    size : range, SI.
-
-    Returns
-    -------
-    Sampler
-    """
+    """Return a sampler that draws an input uniformly from a range."""
 
     def sample(draws: Draws, draw: np.random.Generator) -> Draws:
         return {**draws, name: draw.uniform(size.low, size.high, draws[name].size)}

@@ -21,27 +21,13 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.core.units import convert
 from vinetrack.planning.scaling_priors import damping_prior
 
-FAR_OFF = 4.0
-"""Factor between implied and prior damping from which another unit is tried. Chosen: the four printed values lie within
-1.2 of the prior, films of other makers may lie further off. At 2 those would be tested, at 7 psi would not be found."""
+FAR_OFF = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
 
-NEAR = 2.5
-"""Factor to the prior within which the other unit explains the speeds. Chosen below the factor of 4 of `FAR_OFF`."""
+NEAR = 2.5  # Factor to the prior within which the other unit explains the speeds (chosen)
 
 
 def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield_pressure_Pa: float) -> float:
-    """Return the damping coefficient that a trial implies over its scaling prior; NaN without growth or drive.
-
-    Parameters
-    ----------
-    trial : its tube.
-    mean_speed_m_s : of the leading edge over the middle of its growth.
-    pressure_Pa, yield_pressure_Pa : gauge pressures.
-
-    Returns
-    -------
-    a ratio.
-    """
+    """Return the damping coefficient that a trial implies over its scaling prior; NaN without growth or drive."""
     drive_N = (pressure_Pa - yield_pressure_Pa) * trial.area_m2
     if not (drive_N > 0 and mean_speed_m_s > 0 and math.isfinite(mean_speed_m_s)):
         return math.nan
@@ -50,16 +36,7 @@ def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield
 
 
 def track_speed(track: Track) -> float:
-    """Return the mean speed of the leading edge over the middle of its travel.
-
-    Parameters
-    ----------
-    track : of an everting vine.
-
-    Returns
-    -------
-    m/s; NaN where the track does not show it.
-    """
+    """Return the mean speed of the leading edge over the middle of its travel."""
     time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
     travel_m = np.maximum.accumulate(position_m - position_m[0]) if position_m.size else position_m
     if travel_m.size < 5 or not travel_m[-1] > 0:
@@ -70,17 +47,8 @@ def track_speed(track: Track) -> float:
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
-    """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit.
-
-    The other unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
-
-    Parameters
-    ----------
-    speeds : trials with the mean speed of the leading edge, m/s; those of bodies that do not evert are ignored.
-
-    Returns
-    -------
-    problems : one warning or none.
+    """Return a warning if the speeds contradict the pressures as stated but agree with them in another unit. The other
+    unit is psi, kPa where psi are stated, or absolute instead of gauge pressure.
     """
     pairs = [(trial, speed) for trial, speed in speeds if trial.travel_ratio == 2 and trial.pressure_trace is None]
     as_stated = _middle_ratio(pairs, 1.0, 1.0)
@@ -110,9 +78,8 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
 
 
 def _middle_ratio(pairs: list[tuple[Trial, float]], factor: float, yield_factor: float) -> float:
-    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where no trial has a ratio.
-
-    A trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
+    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where no trial has a ratio. A
+    trial that moves although the pressure does not exceed the yield pressure counts as a ratio of 0.
     """
     ratios = []
     for trial, speed in pairs:

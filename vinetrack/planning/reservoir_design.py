@@ -26,90 +26,29 @@ from vinetrack.planning.design_checks import final_m_s
 from vinetrack.planning.prediction import LONGEST_S, POINTS
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
-GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}
-"""Gas laws between which every growth lies."""
+GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}  # Gas laws between which every growth lies
 
 
 def swept_m3(trial: Trial) -> float:
-    """Return the volume of the grown vine, m³.
-
-    Parameters
-    ----------
-    trial : diameter and length.
-
-    Returns
-    -------
-    float
-    """
+    """Return the volume of the grown vine, m³."""
     return trial.area_m2 * trial.length_m
 
 
 def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float, ambient_Pa: float) -> float:
-    """Return the fraction of the gauge pressure lost after the volume `swept` is filled from a closed chamber.
-
-    Parameters
-    ----------
-    pressure_Pa : float
-        Gauge pressure at the start, Pa.
-    swept : float
-        Volume filled, m³.
-    chamber_m3 : float
-        Volume of the closed chamber, m³.
-    gamma : float
-        Exponent of the gas law, 1 to 1.4.
-    ambient_Pa : float
-        Ambient pressure, absolute, Pa.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> round(gauge_loss(48e3, 61.36e-9, 3534.3e-9, 1.0, 101_325.0), 3)  # the dye injector: 5.3 %, not 1.7
-    0.053
-    """
+    """Return the fraction of the gauge pressure lost after the volume `swept` is filled from a closed chamber."""
     left_Pa = (pressure_Pa + ambient_Pa) * (chamber_m3 / (chamber_m3 + swept)) ** gamma - ambient_Pa
     return 1 - left_Pa / pressure_Pa
 
 
 def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, ambient_Pa: float) -> float:
-    """Return the volume of the closed chamber, m³, that loses exactly this fraction of its gauge pressure.
-
-    Parameters
-    ----------
-    pressure_Pa : float
-        Gauge pressure at the start, Pa.
-    swept : float
-        Volume filled, m³.
-    loss : float
-        Allowed loss, as a fraction of the gauge pressure.
-    gamma : float
-        Exponent of the gas law, 1 to 1.4.
-    ambient_Pa : float
-        Ambient pressure, absolute, Pa.
-
-    Returns
-    -------
-    float
-    """
+    """Return the volume of the closed chamber, m³, that loses exactly this fraction of its gauge pressure."""
     q = (((1 - loss) * pressure_Pa + ambient_Pa) / (pressure_Pa + ambient_Pa)) ** (1 / gamma)
     return swept * q / (1 - q)
 
 
 def chamber_by_gauge(swept: float, loss: float) -> float:
-    """Return the volume, m³, by Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, which is too small.
-
-    Parameters
-    ----------
-    swept : float
-        Volume filled, m³.
-    loss : float
-        Allowed loss, as a fraction of the gauge pressure.
-
-    Returns
-    -------
-    float
+    """Return the volume, m³, by Boyle's law with gauge instead of absolute pressure, V₁/V₂ = 1 − ε, which
+    is too small.
     """
     return swept * (1 - loss) / loss
 
@@ -124,18 +63,7 @@ class Chamber:
 
 
 def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
-    """Return the chambers to compare: the stated one, those that keep the pressure, and the one by gauge pressure.
-
-    Parameters
-    ----------
-    trial : pressure, size, ambient pressure and, where stated, chamber.
-    loss : float
-        Allowed loss, as a fraction of the gauge pressure.
-
-    Returns
-    -------
-    tuple of Chamber
-    """
+    """Return the chambers to compare: the stated one, those that keep the pressure, and the one by gauge pressure."""
     volume = swept_m3(trial)
 
     def chamber(name: str, volume_m3: float) -> Chamber:
@@ -157,22 +85,7 @@ def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
 
 
 def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
-    """Return the largest fraction of the gauge pressure lost at the medians with a supply of time constant `tau_s`.
-
-    Parameters
-    ----------
-    inputs : predictive inputs; the medians are simulated.
-    chamber_m3 : float
-        Volume of the chamber, m³.
-    tau_s : float
-        Time constant of the supply, s.
-    gamma : float
-        Exponent of the gas law.
-
-    Returns
-    -------
-    float
-    """
+    """Return the largest fraction of the gauge pressure lost at the medians with a supply of time constant `tau_s`."""
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
     (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host_for(inputs.model))
@@ -185,21 +98,7 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
 
 def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
     """Return the volume of the chamber that with such a supply loses exactly this fraction; 0 where none is needed.
-
-    Parameters
-    ----------
-    inputs : predictive inputs; the medians are simulated.
-    loss : float
-        Allowed loss, as a fraction of the gauge pressure.
-    tau_s : float
-        Time constant of the supply, s.
-    gamma : float
-        Exponent of the gas law.
-
-    Returns
-    -------
-    float
-        m³
+    Returns m³.
     """
 
     def excess_loss(log_volume: float) -> float:
@@ -215,22 +114,7 @@ def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma:
 
 
 def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fraction: float) -> float:
-    """Return the final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`.
-
-    Parameters
-    ----------
-    inputs : predictive inputs; the medians are simulated.
-    chamber_m3 : float
-        Volume of the chamber, m³.
-    gamma : float
-        Exponent of the gas law.
-    at_fraction : float
-        y/L at which the speed without payload is evaluated.
-
-    Returns
-    -------
-    float
-    """
+    """Return the final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`."""
     model = _with(inputs.model, "reservoir_depletion", gamma=gamma)
     trial = replace(inputs.trial, chamber_m3=chamber_m3)
     return final_m_s(replace(inputs, trial=trial, model=model), model, host_for(inputs.model), at_fraction)

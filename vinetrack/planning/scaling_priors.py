@@ -13,64 +13,31 @@ import math
 
 from vinetrack.core import published
 
-DIAMETER_EXPONENT = 0.75
-"""Exponent of D in the prior of B. Derived: through the printed B of the smallest and largest vine with that of t at 1
-(see `published`); `SPLIT_SIGMA` allows for another split."""
+DIAMETER_EXPONENT = 0.75  # Exponent of D in the prior of B (derived)
 
-THICKNESS_EXPONENT = 1.0
-"""Exponent of t in the prior of B. Published: the rise of B with thickness is printed as near-linear."""
+THICKNESS_EXPONENT = 1.0  # Exponent of t in the prior of B (published)
 
-SCATTER_DOF = 2
-"""Degrees of freedom of the scatter about the prior. Derived: four printed values less two fitted parameters."""
+SCATTER_DOF = 2  # Degrees of freedom of the scatter about the prior (derived)
 
-SPLIT_SIGMA = 0.25
-"""Standard error of the exponent of t against that of D, at constant sum. The printed rise with t at one diameter is
-near-linear and may have an intercept: an exponent between 0.6 and 1.4 with 90 % probability. Derived: ±0.4 at 90 % is
-±0.25 at one standard deviation (0.4/1.645)."""
+SPLIT_SIGMA = 0.25  # Standard error of the exponent of t against that of D, at constant sum
 
-PRINTED_ERROR = 0.05
-"""Relative standard error of a printed B, for which only R² is printed: about ten points that scatter by 10 to 20 %
-about the law give 3 to 6 %. Derived: 15 %/√10 = 5 %."""
+PRINTED_ERROR = 0.05  # Relative standard error of a printed B, for which only R² is printed (derived)
 
 YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
-PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)
-"""Standard error of the printed yield pressure, Pa. Derived: "about 3 kPa" is rounded to a whole number, so 1/√12
-kPa."""
+PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)  # Standard error of the printed yield pressure, Pa
 
+# Factor of the one printed yield pressure within which nine of ten other vines are assumed to lie (chosen)
 YIELD_FACTOR = 3.0
-"""Factor of the one printed yield pressure within which nine of ten other vines are assumed to lie. Chosen: at half
-(1.5) bands would be as narrow as if all films were alike, at twice (6) a band at low pressure is of no use."""
 
-BURST_STRESS_PA = 7.8e6
-"""Assumed hoop stress PD/2t at burst, Pa. Derived from one published vine, which held 7.75 MPa; at half safe vines are
-refused, at twice some that burst are planned."""
+BURST_STRESS_PA = 7.8e6  # Assumed hoop stress PD/2t at burst, Pa (derived)
 
-NINE_OF_TEN = 1.6448536269514722
-"""Half width of the central 90 % of the normal distribution, in standard deviations."""
+NINE_OF_TEN = 1.6448536269514722  # Half width of the central 90 % of the normal distribution, in standard deviations
 
-PRESSURE_SPREAD, DAMPING_SPREAD = 0.01, 0.03
-"""Relative between-trial standard deviations of pressure and B. Chosen: a regulator repeats to about one per cent, film
-and seals to a few; a fit replaces both. At half and twice, the bands of speed from this source halve and double
-(σ_v/v = σ_B/(nB))."""
+PRESSURE_SPREAD, DAMPING_SPREAD = 0.01, 0.03  # Relative between-trial standard deviations of pressure and B (chosen)
 
 
 def damping_prior(diameter_m: float, thickness_m: float) -> float:
-    """Return the prior of B of a vine of this size, N·(s/m)ⁿ.
-
-    Parameters
-    ----------
-    diameter_m, thickness_m : float
-        Size of the tube, m.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> round(damping_prior(25e-3, 100e-6), 2)
-    3.32
-    """
+    """Return the prior of B of a vine of this size, N·(s/m)ⁿ."""
     largest = max(published.DAMPING_B)
     thickness = thickness_m / (1e-6 * published.THICKNESS_UM[largest])
     diameter = diameter_m / (1e-3 * published.DIAMETER_MM[largest])
@@ -91,24 +58,9 @@ def damping_scatter() -> float:
 
 
 def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
-    """Return the standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed.
-
-    It is the prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z
-    the logarithm of the size; it grows beyond the smallest and the largest vine.
-
-    Parameters
-    ----------
-    diameter_m, thickness_m : float
-        Size of the tube, m.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> round(damping_log_sigma(25e-3, 100e-6), 3), round(damping_log_sigma(2.5e-3, 50e-6), 3)
-    (0.129, 0.18)
+    """Return the standard error (scale of Student's t) of the predicted ln B of a vine with t/D as printed. It is the
+    prediction error of a line fitted to the four printed points, σ √(1 + ¼ + (z − z̄)²/Σ(zᵢ − z̄)²) with z the
+    logarithm of the size; it grows beyond the smallest and the largest vine.
     """
     sizes = [
         math.log(damping_prior(1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]))
@@ -121,16 +73,8 @@ def damping_log_sigma(diameter_m: float, thickness_m: float) -> float:
 
 
 def split_leverage(diameter_m: float, thickness_m: float) -> float:
-    """Return the change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D as printed.
-
-    Parameters
-    ----------
-    diameter_m, thickness_m : float
-        Size of the tube, m.
-
-    Returns
-    -------
-    float
+    """Return the change of ln B if 1 is added to the exponent of t and subtracted from that of D; 0 for t/D
+    as printed.
     """
     largest = max(published.DAMPING_B)
     printed = 1e-6 * published.THICKNESS_UM[largest] / (1e-3 * published.DIAMETER_MM[largest])
@@ -139,7 +83,6 @@ def split_leverage(diameter_m: float, thickness_m: float) -> float:
 
 def exponent_sigma() -> float:
     """Return the standard error of the printed n, from the printed R² of the four fits with about ten pressures each.
-
     The standard error of a slope n of N points is n √((1 − R²)/R²/(N − 2)); the four are combined with inverse-variance
     weights.
 
@@ -157,37 +100,10 @@ def yield_log_sigma() -> float:
 
 
 def burst_pressure_Pa(diameter_m: float, thickness_m: float) -> float:
-    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine.
-
-    Parameters
-    ----------
-    diameter_m, thickness_m : float
-        Size of the tube, m.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> round(burst_pressure_Pa(25e-3, 100e-6) / 1e3, 1)
-    62.4
-    """
+    """Return the gauge pressure at which a vine of this size bursts, 2tσ/D, Pa; a guess from one vine."""
     return 2 * thickness_m * BURST_STRESS_PA / diameter_m
 
 
 def hoop_stress_Pa(pressure_Pa: float, diameter_m: float, thickness_m: float) -> float:
-    """Return the hoop stress PD/2t of the wall, Pa.
-
-    Parameters
-    ----------
-    pressure_Pa : float
-        Gauge pressure, Pa.
-    diameter_m, thickness_m : float
-        Size of the tube, m.
-
-    Returns
-    -------
-    float
-    """
+    """Return the hoop stress PD/2t of the wall, Pa."""
     return pressure_Pa * diameter_m / (2 * thickness_m)

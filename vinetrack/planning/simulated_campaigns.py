@@ -25,10 +25,9 @@ from vinetrack.tracks.position_noise import ar1_noise
 
 @dataclass(frozen=True)
 class SimulatedCampaigns:
-    """Errors of fits to `campaigns` simulated campaigns: root mean square of the true and of the stated errors.
-
-    `n_rms` and `n_stated` are absolute; `B_rms`, `B_stated` relative, by vine. `covered` is the fraction of all 95 %
-    intervals that contain the truth. `failed` counts campaigns that could not be fitted.
+    """Errors of fits to `campaigns` simulated campaigns: root mean square of the true and of the stated errors. `n_rms`
+    and `n_stated` are absolute; `B_rms`, `B_stated` relative, by vine. `covered` is the fraction of all 95 % intervals
+    that contain the truth. `failed` counts campaigns that could not be fitted.
     """
 
     campaigns: int
@@ -55,26 +54,7 @@ def simulate_campaign(
     seed: int = 1,
     watch: Callable[[], None] | None = None,
 ) -> SimulatedCampaigns:
-    """Simulate a campaign several times, fit each, and compare with the truth.
-
-    Parameters
-    ----------
-    model : the truth, with B by vine.
-    trials : all trials of the campaign, replicates included.
-    camera : frame rate, noise and longest recording.
-    spreads : (float, float)
-        Relative between-trial standard deviations of pressure and B.
-    campaigns : int
-        Number of simulated campaigns.
-    seed : int
-        Of the random numbers.
-    watch : callable, optional
-        Called after each campaign.
-
-    Returns
-    -------
-    SimulatedCampaigns
-    """
+    """Simulate a campaign several times, fit each, and compare with the truth."""
     fitted_model = replace(model, values={k: v for k, v in model.values.items() if k not in (DAMPING, EXPONENT)})
     rows: list[dict[str, tuple[float, float, bool]]] = []
     failed = 0
@@ -97,26 +77,9 @@ def make(
     draw: np.random.Generator,
     host: Model | None = None,
 ) -> list[tuple[Trial, Track]]:
-    """Simulate one campaign: its trials as the sheet states them, and their tracks.
-
-    The camera counts as calibrated: positions have no systematic error unless the sheet states one, as in
-    `vinetrack.planning.campaign_information`, whose expected errors this checks.
-
-    Parameters
-    ----------
-    model : the truth, with B by vine.
-    trials : trials of the campaign.
-    camera : frame rate, noise and longest recording; one for all, or one for each trial.
-    spreads : (float, float)
-        Relative between-trial standard deviations of pressure and B.
-    draw : numpy.random.Generator
-    host : Model, optional
-        A larger model whose compiled form is used.
-
-    Returns
-    -------
-    list of (Trial, Track)
-        Trials as the sheet states them.
+    """Simulate one campaign: its trials as the sheet states them, and their tracks. The camera counts as calibrated:
+    positions have no systematic error unless the sheet states one, as in `vinetrack.planning.campaign_information`,
+    whose expected errors this checks.
     """
     trials = [
         trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)

@@ -19,25 +19,17 @@ from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
 from vinetrack.tracks.position_noise import ar1_noise
 
-LONGEST = 1.5
-"""Longest recording, as a multiple of the longest so far. Chosen: storage and light of a camera allow a little more
-than was used. At half slow trials are not offered, at twice some that the camera may not hold."""
+LONGEST = 1.5  # Longest recording, as a multiple of the longest so far (chosen)
 
-LEAST_GROWTH = 0.3
-"""Fraction of its length that a vine must grow while filmed for a trial to be worth making. Chosen: less shows little
-more than the start. At half trials that show only the start are offered, at twice only those that nearly finish."""
+LEAST_GROWTH = 0.3  # Fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
 
-SIMULATED_TIMES = 400
-"""Times at which a condition is simulated. Derived: the end is interpolated to (1/400)²/8 of the curvature."""
+SIMULATED_TIMES = 400  # Times at which a condition is simulated (derived)
 
+# Ratio of tail speed to steady speed at the same pressure above which the model predicts compression in the tail
+# (chosen)
 LARGEST_SPEED_RATIO = 1.05
-"""Ratio of tail speed to steady speed at the same pressure above which the model predicts compression in the tail. The
-model is then in doubt, unless its tail may go slack or trials so far were of that kind. Chosen: 5 % over the steady
-speed is the model's rounding of the start; at half ordinary trials are refused, at twice trials with a compressed tail
-pass."""
 
-FEWEST_REST_FRAMES = 3
-"""Frames at rest that are planned, at least. Chosen: they determine the origin to 0.6 of one frame's noise."""
+FEWEST_REST_FRAMES = 3  # Frames at rest that are planned, at least (chosen)
 
 
 @dataclass(frozen=True)
@@ -51,18 +43,7 @@ class TrackSampling:
 
 
 def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
-    """Return how the experiment films, at the frame rate of the trial at `like`.
-
-    Parameters
-    ----------
-    data : trials of the experiment, at least one of them everting.
-    like : int
-        Index of the trial whose frame rate is taken.
-
-    Returns
-    -------
-    TrackSampling
-    """
+    """Return how the experiment films, at the frame rate of the trial at `like`."""
     everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
     moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
     return TrackSampling(
@@ -87,7 +68,6 @@ def _behind_end(trial_data: FitTrial) -> int:
 @dataclass(frozen=True)
 class GrowthCourse:
     """Course of growth of a condition: when the first hypothesis nears the end, and when the last one has ended.
-
     `ends_s` is infinite where one of them does not end in time.
     """
 
@@ -96,20 +76,8 @@ class GrowthCourse:
 
 
 def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
-    """Return the data of a candidate trial at these times; a recorded pressure is constant.
-
-    Parameters
-    ----------
-    condition : the trial that could be made.
-    time_s : array, shape (n_points,), s
-        Times since release; those up to 0 are at rest.
-    data : trials of the experiment; the noise, and whether pressure is recorded, are those of trial `condition.like`.
-    lead_position_m : array, shape (n_points,), m
-        Positions, measured or placeholders.
-
-    Returns
-    -------
-    FitTrial
+    """Return the data of a candidate trial at these times; a recorded pressure is constant. Shapes: time_s,
+    lead_position_m (n_points,).
     """
     like = data[condition.like]
     trace = None
@@ -131,18 +99,7 @@ def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], 
 def growth_courses(
     hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
 ) -> list[GrowthCourse | None]:
-    """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt.
-
-    Parameters
-    ----------
-    hypotheses : extended to the conditions; the last one decides about compression in the tail.
-    conditions : trials that could be made.
-    cameras : of each condition.
-
-    Returns
-    -------
-    list of GrowthCourse or None
-    """
+    """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt."""
     data = hypotheses[0].fit.predictor.data
     times = [np.linspace(0.0, camera.longest_s, SIMULATED_TIMES) for camera in cameras]
     items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
@@ -229,24 +186,7 @@ def film_trials(
     rng: np.random.Generator,
 ) -> list[FitTrial | None]:
     """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise.
-
-    Parameters
-    ----------
-    truth : the hypothesis taken as the truth.
-    places : sequence of int
-        Index of the condition of each trial.
-    conditions : all conditions.
-    cameras : of all conditions.
-    theta : array, shape (n_free,)
-        The true parameters, scaled.
-    deviations : array, shape (n_places, 2)
-        Of pressure, relative, and of ln B.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    list of FitTrial or None
-        One for each trial; None where the track has too few usable points for a fit.
+    Shapes: theta (n_free,); deviations (n_places, 2).
     """
     chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
     data = truth.fit.predictor.data

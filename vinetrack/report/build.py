@@ -38,15 +38,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
 
-MAX_CLIP_BYTES = 2_500_000
-"""Chosen: a sixth of the 15 MB that a report may have; a larger clip is left as a file beside it."""
+MAX_CLIP_BYTES = 2_500_000  # Chosen: a sixth of the 15 MB that a report may have
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip that plays in the page: the trial, the MP4 file, a caption, and a WebP poster.
-
-    The poster is shown until the clip plays, and in print.
+    """A clip that plays in the page: the trial, the MP4 file, a caption, and a WebP poster. The poster is shown until
+    the clip plays, and in print.
     """
 
     trial: str
@@ -57,11 +55,9 @@ class Clip:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContent:
-    """Content of the report: tables, figures and provenance of the results folder.
-
-    `recordings` has an entry for every trial with a recording; `clips` has the path of the clip of a trial relative to
-    the page, and `clip` the one that plays in it. `sections` are further parts, shown before the trials. `notes` state
-    the values assumed for blank cells of the sheet.
+    """Content of the report: tables, figures and provenance of the results folder. `recordings` has an entry for every
+    trial with a recording; `clips` has the path of the clip of a trial relative to the page, and `clip` the one that
+    plays in it. `sections` are further parts, shown before the trials.
     """
 
     name: str
@@ -82,16 +78,7 @@ class ReportContent:
 
 
 def build_report(content: ReportContent) -> str:
-    """Return the page. User text is escaped; only SVG made by the package is inserted as it is.
-
-    Parameters
-    ----------
-    content : see `ReportContent`; `trial_figures` has an SVG for each trial that is shown in full.
-
-    Returns
-    -------
-    str, an HTML document
-    """
+    """Return the page. User text is escaped; only SVG made by the package is inserted as it is."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -132,16 +119,7 @@ def build_report(content: ReportContent) -> str:
 
 
 def figure_caption(name: str) -> str:
-    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text.
-
-    Parameters
-    ----------
-    name : of the figure in the registry.
-
-    Returns
-    -------
-    str
-    """
+    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text."""
     path = files("vinetrack.report") / "captions" / f"{name}.rst"
     return " ".join(path.read_text(encoding="utf-8").split())
 

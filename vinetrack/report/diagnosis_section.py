@@ -47,7 +47,6 @@ ABOUT_POWER = (
 @dataclass(frozen=True)
 class DiagnosisResult:
     """The diagnosis, with the errors, parameters and damping laws of its models; None for parts that do not exist.
-
     `summaries` describes each effect in a sentence; `units` has symbol and unit by `effect.parameter`.
     """
 
@@ -60,16 +59,7 @@ class DiagnosisResult:
 
 
 def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
-    """Return the section on the diagnosis as text for the template; None if there is no diagnosis.
-
-    Parameters
-    ----------
-    result : None if the results folder has no diagnosis.
-
-    Returns
-    -------
-    dict for the template, or None
-    """
+    """Return the section on the diagnosis as text for the template; None if there is no diagnosis."""
     if result is None:
         return None
     diagnosis = result.diagnosis
@@ -100,16 +90,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
 
 
 def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
-    """Return the errors of every model of `ladder.csv`, mm; None if there is no ladder.
-
-    Parameters
-    ----------
-    ladder : as in `ladder.csv`.
-
-    Returns
-    -------
-    ReportTable or None
-    """
+    """Return the errors of every model of `ladder.csv`, mm; None if there is no ladder."""
     if ladder is None or not len(ladder):
         return None
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
@@ -163,16 +144,7 @@ def _round(index: int, entry: Round) -> dict[str, Any]:
 
 
 def round_question(entry: Round) -> str:
-    """Return the question of a round.
-
-    Parameters
-    ----------
-    entry : of a diagnosis.
-
-    Returns
-    -------
-    str
-    """
+    """Return the question of a round."""
     return f"which effect is missing from {listed_names(entry.model)}?"
 
 
@@ -184,17 +156,7 @@ def _upper_limits(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) ->
 def upper_limit_table(
     ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None if there are none.
-
-    Parameters
-    ----------
-    ranking : of a round.
-    units : symbol and SI unit by `effect.parameter`, for candidates without fitted numbers.
-
-    Returns
-    -------
-    ReportTable or None
-    """
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None if there are none."""
     rows = []
     for row in ranking:
         of = {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
@@ -217,16 +179,7 @@ def upper_limit_table(
 
 
 def power_entry(power: Power | None) -> dict[str, Any] | None:
-    """Return what the trials could have detected, for the template: sentences and a table of sizes; None if unknown.
-
-    Parameters
-    ----------
-    power : of a diagnosis.
-
-    Returns
-    -------
-    dict for the template, or None
-    """
+    """Return what the trials could have detected, for the template: sentences and a table of sizes; None if unknown."""
     if power is None:
         return None
     table = None
@@ -245,16 +198,7 @@ def _not_testable(ranking: Sequence[Candidate]) -> list[str]:
 
 
 def tied_pairs(entry: Round) -> list[str]:
-    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first.
-
-    Parameters
-    ----------
-    entry : a round, with its cosines.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
     names, matrix = entry.cosine_names, entry.cosines
     pairs = [
         (abs(matrix[i][j]), names[i], names[j], matrix[i][j])
@@ -269,16 +213,7 @@ def tied_pairs(entry: Round) -> list[str]:
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the next experiment for the template: text, trials, and the expected significances; None for none.
-
-    Parameters
-    ----------
-    content : `next_experiment` of `diagnosis.json`.
-
-    Returns
-    -------
-    dict for the template, or None
-    """
+    """Return the next experiment for the template: text, trials, and the expected significances; None for none."""
     if not content:
         return None
     trials = [dict(trial) for trial in content.get("trials") or []]
@@ -313,16 +248,7 @@ def _simulated(entry: Mapping[str, Any]) -> str:
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: sentences, weights and simple laws; None for none.
-
-    Parameters
-    ----------
-    content : `missing_force` of `diagnosis.json`.
-
-    Returns
-    -------
-    dict for the template, or None
-    """
+    """Return the missing force for the template: sentences, weights and simple laws; None for none."""
     if not content:
         return None
     rows = [
@@ -352,16 +278,7 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
-    """Return the change of the parameters as effects were added, one column per model; None without any.
-
-    Parameters
-    ----------
-    moved : as in `diagnosis/moved.csv`: one row per number and model, SI.
-
-    Returns
-    -------
-    ReportTable or None
-    """
+    """Return the change of the parameters as effects were added, one column per model; None without any."""
     if moved is None or not len(moved):
         return None
     steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
@@ -378,16 +295,7 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
 
 
 def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
-    """Return the damping law from steady speeds with the pressure at the vine in each model; None without laws.
-
-    Parameters
-    ----------
-    laws : as in `diagnosis/damping_laws.csv`.
-
-    Returns
-    -------
-    ReportTable or None
-    """
+    """Return the damping law from steady speeds with the pressure at the vine in each model; None without laws."""
     if laws is None or not len(laws):
         return None
     chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws

@@ -37,16 +37,7 @@ class ModelResult:
 
 
 def model_section(result: ModelResult | None) -> dict[str, Any] | None:
-    """Return the section on the model in use as text for the template; None if no model was fitted or refused.
-
-    Parameters
-    ----------
-    result : None if no model was fitted.
-
-    Returns
-    -------
-    dict for the template, or None
-    """
+    """Return the section on the model in use as text for the template; None if no model was fitted or refused."""
     if result is None:
         return None
     fit = result.fit
@@ -91,16 +82,7 @@ def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
 
 
 def verdict(comparison: pd.DataFrame) -> str:
-    """Return the position error of the model in two sentences; blank without a condition.
-
-    Parameters
-    ----------
-    comparison : as in `comparison.csv`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the position error of the model in two sentences; blank without a condition."""
     if not len(comparison):
         return ""
     worst = comparison.sort_values("rms_position_m").iloc[-1]

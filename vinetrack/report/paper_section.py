@@ -16,18 +16,7 @@ if TYPE_CHECKING:
 
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
-    """Return the section.
-
-    Parameters
-    ----------
-    table : as in `paper.csv`.
-    departures : as in `paper_departures.csv`.
-    figures : in order.
-
-    Returns
-    -------
-    ReportSection
-    """
+    """Return the section."""
     from vinetrack.paper.rows import MARKS
 
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
@@ -48,16 +37,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
 
 
 def tally(table: pd.DataFrame) -> str:
-    """Return the number of rows of each kind, as a sentence.
-
-    Parameters
-    ----------
-    table : as in `paper.csv`.
-
-    Returns
-    -------
-    str
-    """
+    """Return the number of rows of each kind, as a sentence."""
     from vinetrack.paper.rows import MARKS
 
     counts = table["mark"].value_counts()
@@ -66,16 +46,7 @@ def tally(table: pd.DataFrame) -> str:
 
 
 def table_one(table: pd.DataFrame) -> ReportTable:
-    """Return Table I of the paper, with the results of Fig. 6 and ours.
-
-    Parameters
-    ----------
-    table : as in `paper.csv`.
-
-    Returns
-    -------
-    ReportTable
-    """
+    """Return Table I of the paper, with the results of Fig. 6 and ours."""
     by_row = _by_row(table)
     body = [
         (
@@ -106,17 +77,7 @@ def table_one(table: pd.DataFrame) -> ReportTable:
 
 
 def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> list[ReportTable]:
-    """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2).
-
-    Parameters
-    ----------
-    table : as in `paper.csv`.
-    departures : as in `paper_departures.csv`.
-
-    Returns
-    -------
-    list of ReportTable, of positions and of speeds
-    """
+    """Return Table II of the paper, positions and speeds, with ours and the effects of departures from Eq. (2)."""
     by_row = _by_row(table)
     head = ("pressure, kPa", "printed", "here", "chamber not refilled", "tail that cannot push", "both")
     made = []
@@ -166,16 +127,7 @@ _ERRORS = (
 
 
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
-    """Return all rows of `paper.csv`, in one table for each part of the paper.
-
-    Parameters
-    ----------
-    table : as in `paper.csv`.
-
-    Returns
-    -------
-    list of ReportTable, one per part of the paper
-    """
+    """Return all rows of `paper.csv`, in one table for each part of the paper."""
     head = ("what", "printed", "here (95 %)", "kind", "how obtained, and remarks")
     made = []
     parts = table["where"].map(_part)
@@ -196,6 +148,7 @@ def every_row(table: pd.DataFrame) -> list[ReportTable]:
     return made
 
 
+# Parts of the paper, with their sections and figures
 _PARTS = {
     "Table I": ("Table I",),
     "Protocol": ("Section III-D", "Section III-E"),
@@ -206,7 +159,6 @@ _PARTS = {
     "Fig. 9": ("Fig. 9",),
     "Chamber and injector": ("Section III-B", "Section V-B"),
 }
-"""Parts of the paper, with their sections and figures."""
 
 _ELSEWHERE = "The fast vine, air drag, pressures"
 

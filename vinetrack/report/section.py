@@ -10,8 +10,7 @@ from urllib.parse import quote
 
 from vinetrack.report.svg import inline_svg
 
-_UNESCAPED = ",;:!*'()/ -._~+@=$?"
-"""Characters that need no escaping in a quoted URL."""
+_UNESCAPED = ",;:!*'()/ -._~+@=$?"  # Characters that need no escaping in a quoted URL
 
 
 @dataclass(frozen=True)
@@ -49,16 +48,7 @@ class ReportSection:
 
 
 def figure_entry(figure: ReportFigure) -> dict[str, Any]:
-    """Return a figure for the template.
-
-    Parameters
-    ----------
-    figure : with the SVG as written by matplotlib.
-
-    Returns
-    -------
-    dict for the template
-    """
+    """Return a figure for the template."""
     from markupsafe import Markup
 
     return {
@@ -72,17 +62,7 @@ def figure_entry(figure: ReportFigure) -> dict[str, Any]:
 
 
 def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, Any]:
-    """Return a section for the template, without figures that are too large for a page.
-
-    Parameters
-    ----------
-    section : of the page.
-    largest_svg_bytes : maximum size of a figure in the page.
-
-    Returns
-    -------
-    dict for the template
-    """
+    """Return a section for the template, without figures that are too large for a page."""
     return {
         "key": section.key,
         "title": section.title,
@@ -93,17 +73,7 @@ def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, A
 
 
 def data_uri(name: str, text: str) -> str:
-    """Return a file as a data URI, in the shorter of two encodings.
-
-    Parameters
-    ----------
-    name : of the file; its suffix gives the type.
-    text : its content.
-
-    Returns
-    -------
-    str, a data URI
-    """
+    """Return a file as a data URI, in the shorter of two encodings."""
     kind = "application/json" if name.endswith(".json") else "text/csv"
     escaped = quote(text, safe=_UNESCAPED)
     encoded = "base64," + base64.b64encode(text.encode("utf-8")).decode("ascii")

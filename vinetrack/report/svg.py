@@ -17,19 +17,15 @@ from xml.etree import ElementTree
 
 from vinetrack.figures.page_tokens import TOKENS
 
-Command = tuple[str, tuple[float, ...]]
-"""A command of a path and its numbers: M, L, Q, C or Z in absolute coordinates, pt."""
+Command = tuple[str, tuple[float, ...]]  # A command of a path and its numbers
 
 _THEME_COLOURS = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
 
-_WEBP_QUALITY = 45
-"""WebP quality, 0 to 100; chosen: strips are mostly noise, and their edge is preserved at this quality."""
+_WEBP_QUALITY = 45  # WebP quality, 0 to 100
 
-_MAX_MARKER_COMMANDS = 8
-"""Commands up to which a filled shape counts as a marker, which may be merged; chosen: a diamond has 5."""
+_MAX_MARKER_COMMANDS = 8  # Commands up to which a filled shape counts as a marker, which may be merged
 
-_MAX_PATH_COMMANDS = 20_000
-"""Commands of a merged path; chosen: browsers slow down on paths of several hundred thousand."""
+_MAX_PATH_COMMANDS = 20_000  # Commands of a merged path
 
 _COUNTS = {"M": 2, "L": 2, "Q": 4, "C": 6, "Z": 0}
 _TOKEN = re.compile(r"[MLHVCQZz]|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -55,20 +51,9 @@ class _Element:
 
 
 def inline_svg(svg: str, prefix: str, description: str) -> str:
-    """Return an SVG file as an element for inline use in a page.
-
-    Neutral colours become those of the page, so that it follows a dark scheme. The style sheet of the page sets the
-    size by `--wide`, at which text in the picture is as large as that of the page.
-
-    Parameters
-    ----------
-    svg : a file as matplotlib writes it.
-    prefix : prepended to every identifier, because several pictures share one page.
-    description : text alternative of the picture.
-
-    Returns
-    -------
-    str, an `svg` element
+    """Return an SVG file as an element for inline use in a page. Neutral colours become those of the page, so that it
+    follows a dark scheme. The style sheet of the page sets the size by `--wide`, at which text in the picture is as
+    large as that of the page.
     """
     body, width_pt, height_pt = compact_svg(svg, prefix, _THEME_COLOURS)
     label, box = escape(description, quote=True), f"0 0 {width_pt:g} {height_pt:g}"
@@ -76,23 +61,7 @@ def inline_svg(svg: str, prefix: str, description: str) -> str:
 
 
 def compact_svg(svg: str, prefix: str, colours: Mapping[str, str]) -> tuple[str, float, float]:
-    """Return the content of the root element, and the picture's width and height, pt.
-
-    Parameters
-    ----------
-    svg, prefix : as of `inline_svg`.
-    colours : replacements of colours, by hexadecimal code in lower case.
-
-    Returns
-    -------
-    body : str
-    width, height : float, pt
-
-    Raises
-    ------
-    ValueError
-        If it is not such a file.
-    """
+    """Return the content of the root element, and the picture's width and height, pt. Returns body, width, height."""
     try:
         root = ElementTree.fromstring(svg)
     except ElementTree.ParseError as error:
@@ -185,16 +154,7 @@ def _marker(shape: ElementTree.Element, style: dict[str, str], place: Mapping[st
 
 
 def recoded_image(href: str) -> str:
-    """Return a PNG in a data URI as WebP; unchanged if that is not smaller, or if it is not a PNG.
-
-    Parameters
-    ----------
-    href : a data URI.
-
-    Returns
-    -------
-    str, a data URI
-    """
+    """Return a PNG in a data URI as WebP; unchanged if that is not smaller, or if it is not a PNG."""
     from PIL import Image
 
     head, _, data = href.partition("base64,")
@@ -260,24 +220,7 @@ def _short_style(style: Mapping[str, str], colours: Mapping[str, str]) -> str:
 
 
 def parse_path(d: str) -> list[Command]:
-    """Return the commands of a path in absolute coordinates, as matplotlib writes them: M, L, Q, C and Z.
-
-    Parameters
-    ----------
-    d : attribute `d` of a path.
-
-    Returns
-    -------
-    list of Command, pt
-
-    >>> parse_path("M 1 2 L 3 4 z")
-    [('M', (1.0, 2.0)), ('L', (3.0, 4.0)), ('Z', ())]
-
-    Raises
-    ------
-    ValueError
-        If it has any other command.
-    """
+    """Return the commands of a path in absolute coordinates, as matplotlib writes them: M, L, Q, C and Z."""
     commands: list[Command] = []
     letter, numbers = "", [0.0][:0]
     for token in _TOKEN.findall(d):
@@ -295,36 +238,14 @@ def parse_path(d: str) -> list[Command]:
 
 
 def moved(commands: Sequence[Command], x: float, y: float) -> list[Command]:
-    """Return the commands with every point moved by (x, y), pt.
-
-    Parameters
-    ----------
-    commands : letter and numbers of each, pt.
-    x, y : the shift, pt.
-
-    Returns
-    -------
-    list of Command, pt
-    """
+    """Return the commands with every point moved by (x, y), pt."""
     return [(letter, tuple(v + (x, y)[i % 2] for i, v in enumerate(numbers))) for letter, numbers in commands]
 
 
 def write_path(commands: Sequence[Command]) -> str:
-    """Return the `d` of a path: relative steps on a grid of 0.1 pt (0.13 pixels of a screen, 35 µm on paper).
-
-    Every step begins at the rounded end of the previous one, so that rounding errors do not accumulate. Steps of zero
-    length are left out, except those that make a dot.
-
-    Parameters
-    ----------
-    commands : absolute coordinates, pt.
-
-    Returns
-    -------
-    str, attribute `d` of a path
-
-    >>> write_path([("M", (10.04, 20.0)), ("L", (10.04, 25.5)), ("L", (12.0, 25.5)), ("Z", ())])
-    'M10 20v5.5h2z'
+    """Return the `d` of a path: relative steps on a grid of 0.1 pt (0.13 pixels of a screen, 35 µm on paper). Every
+    step begins at the rounded end of the previous one, so that rounding errors do not accumulate. Steps of zero length
+    are left out, except those that make a dot.
     """
     parts: list[str] = []
     here, start, last = (0, 0), (0, 0), ""
@@ -351,16 +272,7 @@ def write_path(commands: Sequence[Command]) -> str:
 
 
 def circle_diameter(commands: Sequence[Command]) -> float | None:
-    """Return the diameter of a circle about the origin as matplotlib draws its round markers, pt; None for others.
-
-    Parameters
-    ----------
-    commands : absolute coordinates, pt.
-
-    Returns
-    -------
-    float, pt, or None
-    """
+    """Return the diameter of a circle about the origin as matplotlib draws its round markers, pt; None for others."""
     ends = [numbers[-2:] for letter, numbers in commands if letter == "C"]
     if len(ends) != 8 or any(letter not in "MCZ" for letter, _ in commands):
         return None

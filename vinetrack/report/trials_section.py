@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from vinetrack.report.build import ReportContent
 
-MAX_SVG_BYTES = 1_500_000
-"""Chosen: a tenth of the 15 MB that a report may have; a larger figure is left as a file beside it."""
+MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 CALIBRATION_NAMES = {
     "charuco": "ChArUco board",
@@ -46,6 +45,7 @@ SHARED_ERROR = (
     "independent of it."
 )
 
+# Methods for recordings, as (heading, paragraph) pairs
 METHODS = (
     (
         "Edge",
@@ -61,13 +61,11 @@ METHODS = (
         "plane, fitted to the corners of the target; without a target, with a single scale.",
     ),
 )
-"""Methods for recordings, as (heading, paragraph) pairs."""
 
 
 @dataclass(frozen=True)
 class TrackedRecording:
     """A recording in the report: its strip as SVG ("" for none), the flags of its frames, and its calibration.
-
     `calibration` was written by the recording's stage: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
     n_corners, n_pictures, notes`; None if there is none.
     """
@@ -78,19 +76,7 @@ class TrackedRecording:
 
 
 def count_frames(flags: Iterable[str]) -> str:
-    """Return the number of frames, and of those with each flag, as text.
-
-    Parameters
-    ----------
-    flags : of every frame, separated by semicolons; blank for none.
-
-    Returns
-    -------
-    str
-
-    >>> count_frames(["before_release", "", "", "doubtful", "lost;gap"])
-    '5 frames: 1 before release, 1 doubtful, 1 without the edge, 1 gap'
-    """
+    """Return the number of frames, and of those with each flag, as text."""
     flags = list(flags)
     counted = Counter(part for flag in flags for part in split_flags(flag))
     parts = [f"{count} {FLAG_WORDS.get(flag, flag)}" for flag, count in counted.items()]
@@ -98,16 +84,7 @@ def count_frames(flags: Iterable[str]) -> str:
 
 
 def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[str, Any]]:
-    """Return one row per calibration, with its results and its trials.
-
-    Parameters
-    ----------
-    recordings : by name of trial.
-
-    Returns
-    -------
-    list of dict for the template, one per calibration
-    """
+    """Return one row per calibration, with its results and its trials."""
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, recording in recordings.items():
         calibration = recording.calibration
@@ -151,24 +128,14 @@ def _is_number(value: Any) -> bool:
     return value is not None and math.isfinite(value)
 
 
-MAX_TRIAL_FIGURES_BYTES = 10_000_000
-"""Total size of the figures of single trials; derived: 15 MB of a report minus 5 MB for the rest with 200 trials."""
+MAX_TRIAL_FIGURES_BYTES = 10_000_000  # Total size of the figures of single trials
 
-MAX_DATA_ROWS, MAX_DATA_ROWS_TOTAL = 240, 24_000
-"""Maximum rows of motion data in the page, per trial and in total; chosen: as many as figures show; files have all."""
+MAX_DATA_ROWS, MAX_DATA_ROWS_TOTAL = 240, 24_000  # Maximum rows of motion data in the page, per trial and in total
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
-    """Return all trials for the template, and the number of trials whose figures were left out for size.
-
-    Parameters
-    ----------
-    content : of the report.
-
-    Returns
-    -------
-    entries : list of dict for the template
-    n_left_out : int, trials whose figures exceed `MAX_TRIAL_FIGURES_BYTES` in total
+    """Return all trials for the template, and the number of trials whose figures were left out for size. Returns
+    entries, n_left_out.
     """
     entries, left_out, weight = [], 0, 0
     for row in rows(content.trials):
@@ -259,16 +226,7 @@ def speed_sparkline(
     height_px: int = 30,
 ) -> str:
     """Return speed against time as a small SVG, with the steady window thick; blank if there is nothing to draw.
-
-    Parameters
-    ----------
-    time_s, speed_m_s : shape (n_points,), NaN where unknown.
-    steady_s : begin and end of the steady window, NaN for none.
-    width_px, height_px : size of the picture.
-
-    Returns
-    -------
-    str, an `svg` element
+    Shapes: time_s, speed_m_s (n_points,).
     """
     good = np.isfinite(time_s) & np.isfinite(speed_m_s)
     time_s, speed_m_s = time_s[good], speed_m_s[good]

@@ -197,16 +197,7 @@ class Results:
         return self.folder / "fit.json"
 
     def trajectories(self, condition: str) -> Path:
-        """Return the file of measured and modelled trajectories of one condition.
-
-        Parameters
-        ----------
-        condition : its name.
-
-        Returns
-        -------
-        path, CSV.
-        """
+        """Return the file of measured and modelled trajectories of one condition."""
         return result_file(self.folder / "comparison", condition, ".csv")
 
     @property
@@ -220,16 +211,7 @@ class Results:
         return self.folder / "ladder.csv"
 
     def diagnosed(self, name: str) -> Path:
-        """Return a file of the folder `diagnosis`.
-
-        Parameters
-        ----------
-        name : name of the file, with suffix.
-
-        Returns
-        -------
-        path.
-        """
+        """Return a file of the folder `diagnosis`."""
         return self.folder / "diagnosis" / name
 
     @property
@@ -238,16 +220,7 @@ class Results:
         return self.folder / "diagnosis" / "final_fit.json"
 
     def predictions(self, trial: str) -> Path:
-        """Return the file of one trial with the predictions of the initial and the final model.
-
-        Parameters
-        ----------
-        trial : its name.
-
-        Returns
-        -------
-        path, CSV.
-        """
+        """Return the file of one trial with the predictions of the initial and the final model."""
         return result_file(self.folder / "diagnosis" / "predictions", trial, ".csv")
 
     @property
@@ -256,16 +229,7 @@ class Results:
         return self.folder / "overlays"
 
     def overlay(self, trial: str) -> Path:
-        """Return the clip of one trial with the edges drawn.
-
-        Parameters
-        ----------
-        trial : its name.
-
-        Returns
-        -------
-        path, MP4.
-        """
+        """Return the clip of one trial with the edges drawn."""
         return result_file(self.overlays, trial, ".mp4")
 
     @property
@@ -279,70 +243,23 @@ class Results:
         return self.folder / "report.html"
 
     def track(self, trial: str) -> Path:
-        """Return the file of the positions of one leading edge.
-
-        Parameters
-        ----------
-        trial : its name.
-
-        Returns
-        -------
-        path, CSV.
-        """
+        """Return the file of the positions of one leading edge."""
         return result_file(self.folder / "tracks", trial, ".csv")
 
     def kinematics(self, trial: str) -> Path:
-        """Return the file of the motion of one leading edge.
-
-        Parameters
-        ----------
-        trial : its name.
-
-        Returns
-        -------
-        path, CSV.
-        """
+        """Return the file of the motion of one leading edge."""
         return result_file(self.folder / "kinematics", trial, ".csv")
 
     def analysed(self, trial: str) -> Path:
-        """Return the file with a trial's contribution to the tables of the experiment.
-
-        Parameters
-        ----------
-        trial : its name.
-
-        Returns
-        -------
-        path, JSON.
-        """
+        """Return the file with a trial's contribution to the tables of the experiment."""
         return result_file(self.folder / "analysed", trial, ".json")
 
     def strip_figure(self, trial: str, suffix: str) -> Path:
-        """Return the strip figure of one recording with its tracked edge.
-
-        Parameters
-        ----------
-        trial : its name.
-        suffix : with its dot.
-
-        Returns
-        -------
-        path.
-        """
+        """Return the strip figure of one recording with its tracked edge."""
         return result_file(self.folder / "figures", f"strip_{trial}", suffix)
 
     def figure(self, name: str, suffix: str) -> Path:
-        """Return a figure of the whole experiment.
-
-        Parameters
-        ----------
-        name : of the figure.
-        suffix : with its dot.
-
-        Returns
-        -------
-        path.
-        """
+        """Return a figure of the whole experiment."""
         return result_file(self.folder / "figures", name, suffix)
 
     @property
@@ -351,36 +268,12 @@ class Results:
         return self.folder / "figures" / "campaign.json"
 
     def trial_figure(self, trial: str, suffix: str) -> Path:
-        """Return the figure of one trial.
-
-        Parameters
-        ----------
-        trial : its name.
-        suffix : with its dot.
-
-        Returns
-        -------
-        path.
-        """
+        """Return the figure of one trial."""
         return result_file(self.folder / "figures", f"trial_{trial}", suffix)
 
 
 def read_result(path: Path) -> pd.DataFrame:
-    """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool.
-
-    Parameters
-    ----------
-    path : a CSV file of a results folder.
-
-    Returns
-    -------
-    table : in the units of its columns.
-
-    Raises
-    ------
-    ResultsError
-        If the file does not exist or cannot be read.
-    """
+    """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool."""
     import pandas as pd
 
     try:
@@ -403,15 +296,8 @@ def read_result(path: Path) -> pd.DataFrame:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that a stage wrote; see `read_result`.
-
-    Parameters
-    ----------
-    path : a JSON file of a results folder.
-
-    Returns
-    -------
-    content : SI units; None for an unknown number.
+    """Read a JSON file that a stage wrote; see `read_result`. Returns content : SI units; None for an
+    unknown number.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -423,16 +309,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
-    """Return a table without rows.
-
-    Parameters
-    ----------
-    columns : names of the columns.
-
-    Returns
-    -------
-    table : columns typed as by `read_result`.
-    """
+    """Return a table without rows."""
     import pandas as pd
 
     return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})

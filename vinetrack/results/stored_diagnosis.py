@@ -12,22 +12,7 @@ if TYPE_CHECKING:
 
 
 def read_diagnosis(results: Results) -> Diagnosis | None:
-    """Read `diagnosis.json` and `ladder.csv`.
-
-    Parameters
-    ----------
-    results : the folder.
-
-    Returns
-    -------
-    Diagnosis or None
-        None if there is none; its `refused` holds the reason if the diagnosis failed.
-
-    Raises
-    ------
-    ResultsError
-        If the file is not a diagnosis.
-    """
+    """Read `diagnosis.json` and `ladder.csv`."""
     from vinetrack.diagnosis.result import Diagnosis
 
     if not results.diagnosis.exists():

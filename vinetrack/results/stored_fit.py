@@ -16,22 +16,7 @@ if TYPE_CHECKING:
 
 
 def read_fit(results: Results) -> FitSummary:
-    """Read `fit.json`.
-
-    Parameters
-    ----------
-    results : the folder.
-
-    Returns
-    -------
-    FitSummary
-        Its `refused` holds the reason if the model could not be fitted.
-
-    Raises
-    ------
-    ResultsError
-        If the model has not been fitted, or the file is not a fit.
-    """
+    """Read `fit.json`."""
     from vinetrack.inference.fit_summary import FitSummary
 
     content = read_json(results.fit)
@@ -42,15 +27,5 @@ def read_fit(results: Results) -> FitSummary:
 
 
 def unreadable_file_error(path: Path, error: Exception) -> ResultsError:
-    """Return the error for a file of the results with unexpected content.
-
-    Parameters
-    ----------
-    path : the file.
-    error : exception raised while reading it.
-
-    Returns
-    -------
-    ResultsError
-    """
+    """Return the error for a file of the results with unexpected content."""
     return ResultsError(f"{path} cannot be read ({error!r}): delete it and run snakemake again")

@@ -10,15 +10,12 @@ from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.schema import COLUMNS
 
-MIN_PICTURES = 5
-"""Pictures from which a folder counts as a recording; chosen: a track needs as many frames. With half, a folder of two
-photographs would be one; with twice, a short burst would be missed."""
+MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
 
-MAX_FOLDER_DEPTH = 4
-"""Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures. At half such a hierarchy
-is missed; twice only makes the search longer."""
+MAX_FOLDER_DEPTH = 4  # Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
 
 _NUMBER = r"(?P<number>\d+(?:[.p]\d+)?)"
+# Column of a number with a unit, by the unit in lower case
 _COLUMN_BY_UNIT: dict[str, str] = {
     "kpa": "pressure_kPa",
     "psi": "pressure_psi",
@@ -34,8 +31,8 @@ _COLUMN_BY_UNIT: dict[str, str] = {
     "cm": "length_cm",
     "in": "diameter_in",
 }
-"""Column of a number with a unit, by the unit in lower case."""
 
+# Column of a number after a letter or word; a unit after the number overrides that of the column
 _COLUMN_BY_LETTER = {
     "d": "diameter_mm",
     "dia": "diameter_mm",
@@ -49,39 +46,18 @@ _COLUMN_BY_LETTER = {
     "specimen": "specimen",
     "tube": "specimen",
 }
-"""Column of a number after a letter or word; a unit after the number overrides that of the column."""
 
 _WORD = re.compile(rf"(?P<letter>[a-z]*?){_NUMBER}(?P<unit>[a-zµ]*)", re.IGNORECASE)
 
 
 def list_recordings(folder: Path) -> list[str]:
-    """Return the recordings below a folder, as relative paths in natural order.
-
-    Parameters
-    ----------
-    folder : of an experiment, with or without a sheet.
-
-    Returns
-    -------
-    paths with slashes
-        Films, folders of at least `MIN_PICTURES` pictures and stacks of pictures; results, the calibration and
-        hidden files are left out.
-    """
+    """Return the recordings below a folder, as relative paths in natural order."""
     names = [path.relative_to(folder).as_posix() for path in _recordings(folder, MAX_FOLDER_DEPTH)]
     return sorted(names, key=_natural_order)
 
 
 def list_pictures(folder: Path) -> list[str]:
-    """Return single pictures and films that may show a ruler or a board, as paths relative to the folder.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-
-    Returns
-    -------
-    paths with slashes : pictures in the folder itself and everything in `calibration`.
-    """
+    """Return single pictures and films that may show a ruler or a board, as paths relative to the folder."""
     kinds = _suffixes("IMAGES")
     films = _suffixes("CONTAINERS")
     pictures = [path for path in _entries(folder) if path.is_file() and path.suffix.lower() in kinds]
@@ -93,16 +69,7 @@ def list_pictures(folder: Path) -> list[str]:
 
 
 def list_tables(folder: Path) -> list[str]:
-    """Return tables that may be pressure traces, as paths relative to the folder.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-
-    Returns
-    -------
-    paths with slashes : CSV files in the folder and in those directly in it, except sheet and corrections.
-    """
+    """Return tables that may be pressure traces, as paths relative to the folder."""
     folders = [folder, *(path for path in _entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
     tables = [path for place in folders for path in _entries(place) if path.suffix.lower() == ".csv"]
     names = (path.relative_to(folder).as_posix() for path in tables)
@@ -110,20 +77,7 @@ def list_tables(folder: Path) -> list[str]:
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return a trial name for each recording: that of its file, with those of its folders if two are the same.
-
-    Parameters
-    ----------
-    recordings : relative paths.
-    taken : names of existing trials.
-
-    Returns
-    -------
-    one name each: letters, digits, _ and -.
-
-    >>> trial_names(["videos/d12 24kPa.mp4", "monday/1.mp4", "tuesday/1.mp4"])
-    ['d12_24kPa', 'monday_1', 'tuesday_1']
-    """
+    """Return a trial name for each recording: that of its file, with those of its folders if two are the same."""
     stems = [_clean(_stem(recording)) for recording in recordings]
     used = {name.lower() for name in taken}
     names = []
@@ -140,23 +94,9 @@ def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[st
 
 
 def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
-    """Return the cells of a trial sheet given by the names of recordings.
-
-    Only numbers with a letter or a unit are read: a bare number counts replicates. A quantity that all names give in
-    the same other unit keeps it (`pressure_psi`); a mixture of units is converted to that of the sheet.
-
-    Parameters
-    ----------
-    recordings : relative paths; names of folders are read too, but the file name has precedence.
-
-    Returns
-    -------
-    one mapping each, column to cell.
-
-    >>> columns_from_names(["videos/d12_24kPa_1.mp4", "d24-20g-2p5psi.mp4"])
-    [{'diameter_mm': '12', 'pressure_kPa': '24'}, {'diameter_mm': '24', 'payload_g': '20', 'pressure_kPa': '17.2369'}]
-    >>> columns_from_names(["tuesday 12 mm 24 kPa 20 g a.mp4"])
-    [{'diameter_mm': '12', 'pressure_kPa': '24', 'payload_g': '20'}]
+    """Return the cells of a trial sheet given by the names of recordings. Only numbers with a letter or a unit are
+    read: a bare number counts replicates. A quantity that all names give in the same other unit keeps it
+    (`pressure_psi`); a mixture of units is converted to that of the sheet.
     """
     rows = [_columns_from_name(recording) for recording in recordings]
     units: dict[str, set[str]] = {}
@@ -175,8 +115,8 @@ def columns_from_names(recordings: Sequence[str]) -> list[dict[str, str]]:
 
 
 _UNITS = "|".join(sorted(_COLUMN_BY_UNIT, key=len, reverse=True))
+# A number and its unit separated by a blank, `24 kPa`
 _SPACED_UNIT = re.compile(rf"(?<![A-Za-z0-9])(\d+(?:[.p]\d+)?)[_\s]+({_UNITS})(?![A-Za-z0-9])", re.IGNORECASE)
-"""A number and its unit separated by a blank, `24 kPa`."""
 
 
 def _columns_from_name(recording: str) -> dict[str, str]:
@@ -233,19 +173,7 @@ def _converted(cell: str, name: str, column: str) -> str:
 
 
 def units_of(column: str) -> list[str]:
-    """Return the units in which a column may be written, its own first; none if it has no unit.
-
-    Parameters
-    ----------
-    column : its name in the sheet.
-
-    Returns
-    -------
-    keys of `UNITS`.
-
-    >>> units_of("payload_g"), units_of("bends")
-    (['g', 'mg', 'oz', 'lb', 'kg'], [])
-    """
+    """Return the units in which a column may be written, its own first; none if it has no unit."""
     unit_of_column = split_unit(column)[1]
     if unit_of_column not in UNITS or COLUMNS[column].kind != "number":
         return []

@@ -30,21 +30,12 @@ from vinetrack.video.quick_look import proposed_axis
 from vinetrack.video.recording_facts import size_problems, tracked_facts
 from vinetrack.video.track import Tracking, track_recording
 
-JPEG_QUALITY = 90
-"""JPEG quality, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks under the magnifier; at 45 it does, and above
-90 only the size grows."""
-CACHED_CLIPS = 2
-"""Recordings whose frames are cached; chosen: the current and the previous one. A thousand frames take about 100 MB;
-with one, going back decodes again, with four memory doubles."""
-THUMBNAIL_PX = 220
-"""Width of the pictures in the list; chosen: as wide as its column."""
-BLANK_GREY = 128
-"""Grey level of the strip where no frame was decoded. Chosen: mid-grey; nothing depends on it."""
-PATH_STEP_PX = 4.0
-"""Spacing of the points of a curve sent to the page, px. Chosen: straight segments deviate by less than 0.1 px at radii
-above 20 px; at half there are twice as many points, at twice the deviation is four times as large."""
-STRIP_PX = 1600
-"""Longest side of a strip; chosen: twice the page's width on a common screen."""
+JPEG_QUALITY = 90  # JPEG quality, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks under the magnifier
+CACHED_CLIPS = 2  # Recordings whose frames are cached; chosen: the current and the previous one
+THUMBNAIL_PX = 220  # Width of the pictures in the list; chosen: as wide as its column
+BLANK_GREY = 128  # Grey level of the strip where no frame was decoded (chosen)
+PATH_STEP_PX = 4.0  # Spacing of the points of a curve sent to the page, px (chosen)
+STRIP_PX = 1600  # Longest side of a strip; chosen: twice the page's width on a common screen
 
 
 @dataclass(frozen=True)
@@ -74,21 +65,7 @@ class ClipStore:
         self._lock = threading.Lock()
 
     def clip(self, recording: str) -> DecodedClip:
-        """Return a decoded recording, from the cache if possible.
-
-        Parameters
-        ----------
-        recording : path relative to the folder.
-
-        Returns
-        -------
-        DecodedClip
-
-        Raises
-        ------
-        RecordingError
-            If it cannot be decoded.
-        """
+        """Return a decoded recording, from the cache if possible."""
         path = safe_join(self.folder, recording)
         key = (recording, path.stat().st_mtime_ns if path.exists() else 0)
         with self._lock:
@@ -100,51 +77,16 @@ class ClipStore:
             return self._clips[key]
 
     def thumbnail(self, recording: str) -> bytes:
-        """Return the first frame as a small JPEG, without decoding more.
-
-        Parameters
-        ----------
-        recording : path relative to the folder.
-
-        Returns
-        -------
-        bytes : JPEG.
-
-        Raises
-        ------
-        RecordingError
-            If no frame can be decoded.
-        """
+        """Return the first frame as a small JPEG, without decoding more."""
         return jpeg(_first_frame(safe_join(self.folder, recording)), THUMBNAIL_PX)
 
     def picture(self, name: str) -> NDArray[Any]:
-        """Return a single picture, or the first frame of a film, as grey levels.
-
-        Parameters
-        ----------
-        name : path relative to the folder.
-
-        Returns
-        -------
-        array, shape (height, width)
-
-        Raises
-        ------
-        RecordingError
-            If it cannot be read.
-        """
+        """Return a single picture, or the first frame of a film, as grey levels. Shape (height, width)."""
         return _first_frame(safe_join(self.folder, name))
 
     def board(self, name: str) -> dict[str, Any] | None:
         """The printed board in a picture or at the beginning of a film, as `experiment.yaml` names it, without sizes.
-
-        Parameters
-        ----------
-        name : path relative to the folder.
-
-        Returns
-        -------
-        mapping of JSON types; None if there is no board.
+        Returns mapping of JSON types; None if there is no board.
         """
         target = find_board(self.picture(name))
         if target is None:
@@ -175,18 +117,7 @@ def _decoded(path: Path) -> DecodedClip:
 
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:
-    """Return a grey picture as JPEG.
-
-    Parameters
-    ----------
-    picture : grey levels, shape (height, width).
-    widest : maximum width, px.
-    white : grey level shown white; if None, for 16 bits the brightest.
-
-    Returns
-    -------
-    bytes
-    """
+    """Return a grey picture as JPEG. Shapes: picture (height, width)."""
     import cv2
 
     if picture.dtype != np.uint8:
@@ -199,16 +130,8 @@ def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None =
 
 
 def axis_json(axis: Axis) -> dict[str, Any]:
-    """Return an axis for the page, px to a hundredth.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
-    mapping of JSON types: `from_px`, `to_px`, for a curve `via_px` and equally spaced points along it, `path_px`; and
-        `width_px`, None if unknown.
+    """Return an axis for the page, px to a hundredth. Returns mapping of JSON types: `from_px`, `to_px`, for a curve
+    `via_px` and equally spaced points along it, `path_px`; and: `width_px`, None if unknown.
     """
     width = round(axis.width_px, 2) if math.isfinite(axis.width_px) else None
     ends: dict[str, Any] = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
@@ -220,26 +143,8 @@ def axis_json(axis: Axis) -> dict[str, Any]:
 
 
 def track_row(folder: Path, index: int) -> dict[str, Any]:
-    """Track the recording of one row, which may be incomplete: strip, edge and notes.
-
-    Parameters
-    ----------
-    folder : with the sheet and settings of the draft.
-    index : of the row.
-
-    Returns
-    -------
-    mapping of JSON types
-        Without a scale positions are in pixels, without a rate times are in frames, see `scaled` and `timed`. Flags
-        are those of the tracker alone: outliers and frames that only `tracks.frame_timing.correct_frames` finds,
-        which needs the noise of positions, are marked where the trial is analysed.
-
-    Raises
-    ------
-    ExperimentError
-        If the settings cannot be read.
-    RecordingError
-        If the recording cannot be tracked.
+    """Track the recording of one row, which may be incomplete: strip, edge and notes. Returns mapping of JSON types:
+    Without a scale positions are in pixels, without a rate times are in frames, see `scaled` and `timed`.
     """
     from vinetrack.core.tables import read_table
     from vinetrack.experiment.other_units import in_sheet_units

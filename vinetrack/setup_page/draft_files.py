@@ -20,8 +20,7 @@ from vinetrack.setup_page.clip_names import list_recordings
 from vinetrack.setup_page.settings_draft import read_settings_text, shared_values
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
 
-FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)
-"""The only files that are written."""
+FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
 
 
 @dataclass(frozen=True)
@@ -35,21 +34,7 @@ class Draft:
 
 
 def open_draft(folder: Path) -> Draft:
-    """Read the files of a folder, and add a row for every recording that has none.
-
-    Parameters
-    ----------
-    folder : of recordings, with or without a sheet and settings.
-
-    Returns
-    -------
-    Draft
-
-    Raises
-    ------
-    ExperimentError
-        If the folder does not exist, has neither recordings nor a sheet, or a file in it cannot be read.
-    """
+    """Read the files of a folder, and add a row for every recording that has none."""
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         remedy = "name the folder that holds the recordings"
@@ -69,16 +54,7 @@ def open_draft(folder: Path) -> Draft:
 
 
 def files_stamp(folder: Path) -> str:
-    """Return a fingerprint of the present files.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-
-    Returns
-    -------
-    hexadecimal digits.
-    """
+    """Return a fingerprint of the present files."""
     digest = hashlib.sha256()
     for name in FILES:
         path = folder / name
@@ -87,22 +63,7 @@ def files_stamp(folder: Path) -> str:
 
 
 def write_draft(folder: Path, draft: Draft) -> list[str]:
-    """Write the files that differ from the present ones; nothing else in the folder is changed.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-    draft : new contents, with the fingerprint of the files that were read.
-
-    Returns
-    -------
-    names of the files that were written.
-
-    Raises
-    ------
-    ExperimentError
-        If the files have been changed since.
-    """
+    """Write the files that differ from the present ones; nothing else in the folder is changed."""
     if files_stamp(folder) != draft.stamp:
         message = "has changed since it was read, and is left as it is"
         name = SHEET if (folder / SHEET).exists() else SETTINGS
@@ -121,16 +82,7 @@ def write_draft(folder: Path, draft: Draft) -> list[str]:
 
 
 def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
-    """Return whether two sheets have the same columns and cells, whatever their format.
-
-    Parameters
-    ----------
-    first, other : sheets.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether two sheets have the same columns and cells, whatever their format."""
     if first.columns != other.columns or len(first.rows) != len(other.rows):
         return False
     return all(
@@ -142,17 +94,7 @@ def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
 
 @contextmanager
 def draft_folder(folder: Path, draft: Draft) -> Iterator[Path]:
-    """Make a temporary folder with this draft and links to everything else, for `check` and the tracker.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-    draft : as it would be written.
-
-    Yields
-    ------
-    Path : a temporary folder of the same name.
-    """
+    """Make a temporary folder with this draft and links to everything else, for `check` and the tracker."""
     with tempfile.TemporaryDirectory(prefix="vinetrack-setup-") as temporary:
         copy = Path(temporary) / (folder.resolve().name or "experiment")
         copy.mkdir()

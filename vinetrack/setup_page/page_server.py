@@ -32,11 +32,9 @@ from vinetrack.video.frames import RecordingError
 log = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).with_name("templates")
-MAX_REQUEST_BYTES = 20_000_000
-"""Chosen: a sheet of ten thousand rows takes a few megabytes; half would suffice, twice only uses more memory."""
+MAX_REQUEST_BYTES = 20_000_000  # Chosen: a sheet of ten thousand rows takes a few megabytes
 
-REQUEST_HEADER = "X-Vinetrack"
-"""Header required for requests that change or compute something: other web pages cannot send it (CSRF protection)."""
+REQUEST_HEADER = "X-Vinetrack"  # Header required for requests that change or compute something
 
 CONTENT_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 CONTENT_SECURITY_POLICY = (
@@ -199,42 +197,12 @@ def _frame(clips: ClipStore, recording: str, number: int) -> bytes:
 
 
 def start_server(folder: Path, port: int | None = None) -> SetupServer:
-    """Return a server for a folder that does not answer requests yet.
-
-    Parameters
-    ----------
-    folder : of recordings.
-    port : 0 for any free one; None for the first free one of a range.
-
-    Returns
-    -------
-    SetupServer
-
-    Raises
-    ------
-    PageError
-        If the port is taken.
-    """
+    """Return a server for a folder that does not answer requests yet."""
     return serve_on_free_port(lambda number: SetupServer(folder, number), port)
 
 
 def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
-    """Serve until Ctrl-C (or SIGTERM).
-
-    Parameters
-    ----------
-    folder : of recordings.
-    say : prints a line.
-    port : as of `start_server`.
-    browser : whether a browser is opened.
-
-    Raises
-    ------
-    ExperimentError
-        If the folder has no recording, or a file in it cannot be read.
-    PageError
-        If the port is taken.
-    """
+    """Serve until Ctrl-C (or SIGTERM)."""
     page_state(folder)
     server = start_server(folder, port)
     threading.Thread(target=warm_up, daemon=True, name=f"{THREAD_PREFIX}warm-up").start()

@@ -20,6 +20,7 @@ from vinetrack.setup_page.draft_files import Draft, draft_folder, open_draft, sa
 from vinetrack.setup_page.settings_draft import shared_values, with_shared
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
 
+# Columns that the page always shows, whether or not the sheet has them
 OFFERED_COLUMNS = (
     "capture_fps",
     *REQUIRED_COLUMNS,
@@ -29,25 +30,10 @@ OFFERED_COLUMNS = (
     "exposure_us",
     "pressure_trace",
 )
-"""Columns that the page always shows, whether or not the sheet has them."""
 
 
 def page_state(folder: Path) -> dict[str, Any]:
-    """Return the initial state of the page.
-
-    Parameters
-    ----------
-    folder : of recordings, with or without a sheet and settings.
-
-    Returns
-    -------
-    mapping of JSON types.
-
-    Raises
-    ------
-    ExperimentError
-        If the folder holds no recording, or a file in it cannot be read.
-    """
+    """Return the initial state of the page. Returns mapping of JSON types."""
     draft = open_draft(folder)
     present = read_draft(folder)
     content = parse_yaml(draft.settings, SETTINGS).content
@@ -110,22 +96,7 @@ def _correction(point: Mapping[str, Any]) -> Correction:
 
 
 def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
-    """Return the draft sent by the page; comments and keys unknown to the page come from the files.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-    content : `sheet`, `shared`, `calibration`, `axis`, `corrections` and `stamp` of the page.
-
-    Returns
-    -------
-    Draft
-
-    Raises
-    ------
-    ExperimentError
-        If a file cannot be read, or a key cannot be set without damaging the file.
-    """
+    """Return the draft sent by the page; comments and keys unknown to the page come from the files."""
     from_files = open_draft(folder)
     sent = content["sheet"]
     columns = tuple(str(column) for column in sent["columns"])
@@ -143,17 +114,8 @@ def draft_from_json(folder: Path, content: Mapping[str, Any]) -> Draft:
 
 
 def draft_problems(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
-    """Return the messages of `vinetrack check` for a draft, each problem with the field concerned.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-    draft : as it would be written.
-    thorough : whether recordings are opened too.
-
-    Returns
-    -------
-    mapping of JSON types: `problems` (severity, trial, column, text, field), `notes`, `understood`.
+    """Return the messages of `vinetrack check` for a draft, each problem with the field concerned. Returns mapping of
+    JSON types: `problems` (severity, trial, column, text, field), `notes`, `understood`.
     """
     notes: list[str] = []
     understood: list[str] = []
@@ -184,16 +146,7 @@ def _scale_missing(draft: Draft) -> list[Problem]:
 
 
 def problems_json(error: ExperimentError) -> list[dict[str, Any]]:
-    """Return the problems of a draft that cannot be read at all.
-
-    Parameters
-    ----------
-    error : the exception.
-
-    Returns
-    -------
-    list of mappings of JSON types, as of `draft_problems`.
-    """
+    """Return the problems of a draft that cannot be read at all."""
     return [_problem_json(problem, None) for problem in error.problems]
 
 

@@ -14,8 +14,8 @@ from vinetrack.core.yaml_edit import with_value
 from vinetrack.experiment.folder import SETTINGS
 from vinetrack.experiment.schema import COLUMNS, SHARED
 
+# Keys of a new file: what all trials of most campaigns share
 FIRST_KEYS = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
-"""Keys of a new file: what all trials of most campaigns share."""
 
 _HEAD = """\
 # What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
@@ -31,21 +31,7 @@ axis:
 
 
 def read_settings_text(folder: Path) -> str:
-    """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-
-    Returns
-    -------
-    YAML
-
-    Raises
-    ------
-    ExperimentError
-        If it exists but cannot be read, or is not YAML.
-    """
+    """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill."""
     path = folder / SETTINGS
     if not path.exists():
         return first_settings()
@@ -73,16 +59,7 @@ def _comment(key: str) -> str:
 
 
 def shared_values(text: str) -> dict[str, Any]:
-    """Return the columns that the settings set for all trials, under the names (and units) used there.
-
-    Parameters
-    ----------
-    text : of `experiment.yaml`.
-
-    Returns
-    -------
-    dict of YAML values by key, without blank keys.
-    """
+    """Return the columns that the settings set for all trials, under the names (and units) used there."""
     quantities = {split_unit(name)[0] for name in SHARED}
     content = parse_yaml(text, SETTINGS).content
     return {
@@ -93,22 +70,7 @@ def shared_values(text: str) -> dict[str, Any]:
 
 
 def with_shared(text: str, values: Mapping[str, str]) -> str:
-    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept.
-
-    Parameters
-    ----------
-    text : of `experiment.yaml`.
-    values : cells by column, whose name may be in another unit; a blank cell clears the key.
-
-    Returns
-    -------
-    YAML
-
-    Raises
-    ------
-    ExperimentError
-        If a key cannot be set without damaging the file.
-    """
+    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept."""
     content = parse_yaml(text, SETTINGS).content
     for key, cell in values.items():
         for other in [name for name in content if name != key and _same_quantity(str(name), key)]:

@@ -12,18 +12,7 @@ from vinetrack.setup_page.draft_files import open_draft, write_draft
 
 
 def write_templates(folder: Path, say: Callable[[str], None]) -> None:
-    """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept.
-
-    Parameters
-    ----------
-    folder : of recordings.
-    say : prints a line.
-
-    Raises
-    ------
-    ExperimentError
-        If the folder has no recording, or a file in it cannot be read.
-    """
+    """Write the sheet and settings of a folder of recordings, with blanks to fill; existing content is kept."""
     draft = open_draft(folder)
     written = write_draft(folder, draft)
     rows = draft.sheet.rows

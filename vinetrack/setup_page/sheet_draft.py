@@ -14,8 +14,8 @@ from vinetrack.core.units import split_unit
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.setup_page.clip_names import columns_from_names, trial_names
 
+# Columns of a new sheet: the names, and what differs between trials in most campaigns
 FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
-"""Columns of a new sheet: the names, and what differs between trials in most campaigns."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,7 @@ class SheetDraft:
 
 
 def read_draft(folder: Path) -> SheetDraft:
-    """Read the sheet of a folder as a draft; without rows if there is none.
-
-    Parameters
-    ----------
-    folder : of the experiment.
-
-    Returns
-    -------
-    SheetDraft : every column and cell, known or not.
-
-    Raises
-    ------
-    ExperimentError
-        If the sheet cannot be read, or has cells without a column, which would be lost.
-    """
+    """Read the sheet of a folder as a draft; without rows if there is none."""
     path = folder / SHEET
     if not path.exists():
         return SheetDraft(FIRST_COLUMNS, ())
@@ -68,18 +54,7 @@ def read_draft(folder: Path) -> SheetDraft:
 
 
 def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mapping[str, object]) -> SheetDraft:
-    """Return the draft with a row added for each recording that has none, filled in from the recordings' names.
-
-    Parameters
-    ----------
-    draft : its rows are kept.
-    recordings : relative paths.
-    shared : values in `experiment.yaml`; an equal value from a name is left out.
-
-    Returns
-    -------
-    SheetDraft
-    """
+    """Return the draft with a row added for each recording that has none, filled in from the recordings' names."""
     named = {_path(row.get("video", "")) for row in draft.rows}
     new = [recording for recording in recordings if _path(recording) not in named]
     if not new:

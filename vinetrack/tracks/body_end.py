@@ -9,32 +9,18 @@ import numpy as np
 from vinetrack.core.records import Floats, Track, join_flags
 from vinetrack.tracks.position_noise import rough_noise
 
+# Distance behind its furthest place, in standard deviations of a position and as a part of its travel, at which a body
+# has turned back (chosen)
 BACK_SIGMAS, BACK_TRAVEL_PART = 8.0, 0.02
-"""Distance behind its furthest place, in standard deviations of a position and as a part of its travel, at which a body
-has turned back. Chosen: two such points in a row never come by chance. By reasoning: at half outliers end tracks; at
-twice the first points of a bounce stay."""
+# Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
 STILL_SIGMAS, FEWEST_STILL = 5.0, 3
-"""Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop. Chosen as in the
-fit of growing vines. By reasoning: at half noise hides the stop; at twice slow motion passes for one."""
+# Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt (chosen)
 ABRUPT_STEP_PART = 0.5
-"""Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt. Chosen: friction
-brings a body to rest over many steps. By reasoning: at half a body that slides to rest loses its end; at twice impacts
-between frames are missed."""
-FEWEST_LEFT = 5
-"""Fewest points that must be left. Derived: those that a track needs."""
+FEWEST_LEFT = 5  # Fewest points that must be left (derived)
 
 
 def flag_end_of_body(track: Track) -> Track:
-    """Flag points after the end of the body's motion `after_end`, and report the end in the notes.
-
-    Parameters
-    ----------
-    track : of a body that moves one way; positions may be NaN.
-
-    Returns
-    -------
-    Track
-    """
+    """Flag points after the end of the body's motion `after_end`, and report the end in the notes."""
     rows = np.flatnonzero(track.usable)
     y = track.lead_position_m[rows]
     if rows.size <= FEWEST_LEFT:

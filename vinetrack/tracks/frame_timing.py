@@ -7,13 +7,7 @@ dropped frame shows as one step of double length, and everything after it is one
 A jump is tested against the jump that a smooth motion with the track's own noise could show: by least squares of a
 parabola with a step on the nearest points on both sides. Times are changed only where a single outlier would not
 explain the jump as well and points farther away agree: noise may have heavy tails. Outliers are rejected first
-(`outliers`): a dropped frame displaces all later points, an outlier does not. An outlier that lies where the point
-before lies may be a copy, and is examined again once copies have been judged. No fault is reported where the motion is
-slow compared with the noise, where it accelerates so fast that a long step may be the motion itself (release), or where
-the times are irregular.
-
-The tracker of recordings examines single steps with `step_gaps`, before positions are in metres; what that has marked
-as a gap is not reported again by `correct_frames`.
+(`outliers`): a dropped frame displaces all later points, an outlier does not.
 """
 
 from __future__ import annotations
@@ -29,78 +23,45 @@ from vinetrack.core.records import Floats, Track, join_flags, with_flag
 from vinetrack.tracks.outliers import local_noise, reject_outliers
 from vinetrack.tracks.position_noise import THIRD_DIFFERENCE_SD, robust_position_noise
 
+# Step of a frame, in standard deviations of a position, above which motion is well above the noise (chosen)
 CLEAR_STEP_SIGMAS = 8.0
-"""Step of a frame, in standard deviations of a position, above which motion is well above the noise. Chosen: 5.7
-standard errors of a step, which is the difference of two positions."""
 
-DROP_RATIO = 1.6
-"""Ratio of a step to its neighbours above which frames were dropped. Chosen between 1, a steady step, and 2, a step
-over one dropped frame, nearer to 2 since speed rises from frame to frame at release. By reasoning: at half every step
-is a suspect, at twice (3.2) only two dropped frames in a row are found."""
+DROP_RATIO = 1.6  # Ratio of a step to its neighbours above which frames were dropped (chosen)
 
-JUMP_SIGMAS = 5.5
-"""Least significance of a jump, in standard errors: 4e-8 by chance, 1e-4 over a long campaign's frames. Derived from
-the normal distribution, two-sided. By reasoning: at half (2.8) one step in 170 passes; at twice, steps below eleven
-standard errors of a jump remain."""
+JUMP_SIGMAS = 5.5  # Least significance of a jump, in standard errors (derived)
 
+# A copy stands still to within this part of a step, and the step must be this significant (chosen)
 STILL_PART, STILL_SIGMAS = 0.25, 5.0
-"""A copy stands still to within this part of a step, and the step must be this significant; a copy is nearly exact.
-Chosen. By reasoning: at half, positions rounded to a tenth of a step hide copies; at twice, slow frames of a motion
-that stops and goes pass for copies."""
 
+# Ratio of the step just before an apparent inserted copy to those around it, above which the point before the copy was
+# seen ahead of its time (chosen)
 AHEAD_RATIO = 1.4
-"""Ratio of the step just before an apparent inserted copy to those around it, above which the point before the copy was
-seen ahead of its time. Chosen between a usual step, 1, and a step ahead, 2. By reasoning: near 1 real copies in
-accelerating motion are kept as points ahead; beyond 2 no point ahead is recognised."""
 
-COPY_SIGMAS = 3.5
-"""Least significance of the step back after an inserted copy. Chosen: 2e-4 by chance, for steps that already stand
-still. By reasoning: at half one in 25 such steps changes the times; at twice copies in noisy tracks stay."""
+COPY_SIGMAS = 3.5  # Least significance of the step back after an inserted copy (chosen)
 
-SIDE_POINTS = (8, 5, 3)
-"""Points used on either side, fewer where release or the end of growth is near. Chosen: a parabola with a step has four
-parameters, so that 2 × 3 points are the fewest that show scatter, and over 2 × 8 the speed changes little. By
-reasoning: half as many find fewer jumps in noise; twice as many leave no parabola near release."""
+SIDE_POINTS = (8, 5, 3)  # Points used on either side, fewer where release or the end of growth is near (chosen)
 
-LEAST_SIDE_PART = 0.75
-"""Least motion of each side, as a part of a clear step. Chosen. By reasoning: at half, jumps are looked for where one
-step hardly stands out of the noise; at twice (1.5), only where motion is 12 standard deviations a frame."""
+LEAST_SIDE_PART = 0.75  # Least motion of each side, as a part of a clear step (chosen)
 
-LARGEST_SPEED_RATIO = 1.8
-"""Largest ratio of the speeds just before and just after: beyond it a long step may be the motion itself. Chosen just
-below 2, the ratio of a double step. By reasoning: at half nothing passes; at twice a release passes for a dropped
-frame."""
+LARGEST_SPEED_RATIO = 1.8  # Largest ratio of the speeds just before and just after (chosen)
 
+# Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump (chosen)
 LARGEST_MISFIT_PART = 0.1
-"""Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump. Chosen: a jump of
-one step is then ten times the scatter. By reasoning: at half, tracks with noise of 5 % of a step are not corrected; at
-twice, stop-and-go motion is."""
 
+# A single outlier must leave this many times the sum of squares that a jump leaves (chosen)
 OUTLIER_RATIO, OUTLIER_SIGMAS = 3.0, 4.0
-"""A single outlier must leave this many times the sum of squares that a jump leaves, and this many squared standard
-deviations more, to be ruled out. Chosen. By reasoning: at half, outliers change times; at twice, dropped frames in
-noisy tracks stay."""
 
+# Points on either side that must show at least this part of the jump too, where they are conclusive (chosen)
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
-"""Points on either side that must show at least this part of the jump too, where they are conclusive. Chosen: 48 points
-know a step three times better than 16, and one cubic still follows them away from release. By reasoning: at half they
-repeat the nearest points; at twice few motions follow one cubic, and the test is inconclusive."""
 
+# Factor on JUMP_SIGMAS for a jump that points farther away cannot confirm, as near release (measured)
 SURE_FACTOR = 2.0
-"""Factor on JUMP_SIGMAS for a jump that points farther away cannot confirm, as near release: a few points with heavy
-tails produce what the normal distribution never does. Measured: in 100 campaigns with heavy-tailed noise and all their
-frames (null:heavy_tails of `benchmarks/hidden_effects.py`, tuning seeds 20600 to 20699) times were changed for four
-jumps of 5.9 to 9.8 standard errors, none of them sure by this. Each of 38 campaigns with dropped frames
-(frames:dropped, 20600 to 20639) has a jump that is. At half all are sure, at twice those near release never are."""
 
+# Deviation of a spacing from a whole number of frames, as a part of it, below which the spacing is even (chosen)
 UNEVEN_PART = 0.05
-"""Deviation of a spacing from a whole number of frames, as a part of it, below which the spacing is even: printed times
-are rounded. Chosen: times printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: at half such
-times count as uneven and are left unchanged; at twice irregular times are corrected as if even."""
 
 
-_Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
-"""Frame numbers and positions before and after."""
+_Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # Frame numbers and positions before and after
 
 
 class _Jump(NamedTuple):
@@ -122,20 +83,7 @@ class _Fault:
 
 
 def correct_frames(track: Track) -> Track:
-    """Flag repeated frames and gaps of a track, and correct its times.
-
-    Parameters
-    ----------
-    track : A row for every frame; positions may be NaN.
-
-    Returns
-    -------
-    Track
-        `rejected` on outliers; `duplicate` on repeated frames; `gap` on the first row after a gap in the times;
-        `gap;retimed` on the first row after dropped frames that the times did not show. Each is reported in `notes`,
-        except gaps in the times that were marked before. A repeated frame that was inserted is set half a frame after
-        the frame it repeats, so that times still increase.
-    """
+    """Flag repeated frames and gaps of a track, and correct its times."""
     return reject_outliers(_correct_timing(reject_outliers(track, spare_copies=True)))
 
 
@@ -159,17 +107,7 @@ def _correct_timing(track: Track) -> Track:
 
 
 def frames_surely_missing(track: Track) -> bool:
-    """Whether frames are missing beyond doubt: at least one jump is confirmed by more than the nearest points.
-
-    Parameters
-    ----------
-    track : Track
-        With its times corrected by `correct_frames`, or by the tracker, which uses the pictures.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether frames are missing beyond doubt: at least one jump is confirmed by more than the nearest points."""
     rows = np.flatnonzero(track.usable)
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / float(np.median(np.diff(track.time_s))))
     noise_m, rho = _noise(track)
@@ -186,10 +124,9 @@ def frames_surely_missing(track: Track) -> bool:
 
 
 def _noise(track: Track) -> tuple[Floats, float]:
-    """Standard deviation of a position at each row of a track, m, and the lag-one correlation of the noise.
-
-    It is that of the whole track, or of the points around where that is larger: an edge far from the lamp is noisier
-    than at rest, and its noise makes jumps there.
+    """Standard deviation of a position at each row of a track, m, and the lag-one correlation of the noise. It is that
+    of the whole track, or of the points around where that is larger: an edge far from the lamp is noisier than at rest,
+    and its noise makes jumps there.
     """
     usable = track.usable
     y = track.lead_position_m[usable]
@@ -202,9 +139,8 @@ def _noise(track: Track) -> tuple[Floats, float]:
 
 
 def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: float) -> Track:
-    """Move later times back behind repeated pictures, where the motion says that they were inserted.
-
-    A repeated picture shows that a frame is a copy, not whether it took the place of another.
+    """Move later times back behind repeated pictures, where the motion says that they were inserted. A repeated picture
+    shows that a frame is a copy, not whether it took the place of another.
     """
     for row in np.flatnonzero(with_flag(track.flag, "duplicate")):
         with_copy = track.usable
@@ -231,16 +167,7 @@ def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
 
 
 def frames_are(frames: int) -> str:
-    """A number of frames as the beginning of a sentence, with its verb.
-
-    Parameters
-    ----------
-    frames : how many.
-
-    Returns
-    -------
-    str : with its verb.
-    """
+    """A number of frames as the beginning of a sentence, with its verb."""
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
@@ -266,7 +193,6 @@ def _next_fault(track: Track, after: int, step_s: float, noise_m: Floats, rho: f
 
 def _suspect_steps(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
     """Steps that differ clearly from the smaller or larger of their neighbours, and from the noise: a first screening.
-
     A point with a large stated error, such as one that a door half hides, makes no step that is conclusive about
     frames.
     """
@@ -343,10 +269,9 @@ def _repeated_frame(
 
 
 def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float) -> _Jump | None:
-    """Jump of position between two sides of a smooth motion.
-
-    The widest sides that follow one parabola are used. None where there are no such sides, where either moves slowly
-    compared with the noise, or where their speeds differ so much that a jump cannot be told from acceleration.
+    """Jump of position between two sides of a smooth motion. The widest sides that follow one parabola are used. None
+    where there are no such sides, where either moves slowly compared with the noise, or where their speeds differ so
+    much that a jump cannot be told from acceleration.
     """
     for points in SIDE_POINTS:
         sides = (frame[left][-points:], y[left][-points:]), (frame[right][:points], y[right][:points])
@@ -359,10 +284,9 @@ def _jump(frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, r
 
 
 def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
-    """Whether a single outlier explains these points about as well as a jump between the sides does.
-
-    Both add one parameter to a plain parabola, so that their residuals are comparable. Errors with heavy tails put a
-    point one step ahead or behind now and then; after a jump all later points are displaced.
+    """Whether a single outlier explains these points about as well as a jump between the sides does. Both add one
+    parameter to a plain parabola, so that their residuals are comparable. Errors with heavy tails put a point one step
+    ahead or behind now and then; after a jump all later points are displaced.
     """
     (t_left, y_left), (t_right, y_right) = sides
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
@@ -374,10 +298,9 @@ def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
 
 
 def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
-    """Jump between points i and i + 1 from many more points on either side, ±∞ where those are inconclusive.
-
-    They are conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few
-    nearby outliers made up is then gone.
+    """Jump between points i and i + 1 from many more points on either side, ±∞ where those are inconclusive. They are
+    conclusive where one cubic and a step follow all of them to within the noise: an apparent jump that a few nearby
+    outliers made up is then gone.
     """
     first = max(i + 1 - WIDE_SIDE_POINTS, 0)
     near = slice(first, i + 1 + WIDE_SIDE_POINTS)

@@ -21,30 +21,13 @@ from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_press
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
 
-LARGEST_TDMS_BYTES = 200_000_000
-"""Largest TDMS file that is read. Chosen: an hour of three channels at 2 kHz. At half long logs are refused, at twice a
-wrong file takes a minute."""
+LARGEST_TDMS_BYTES = 200_000_000  # Largest TDMS file that is read (chosen)
+# Lines within which the header of a text export is looked for, below its title and remarks (chosen)
 HEADER_WITHIN_LINES = 20
-"""Lines within which the header of a text export is looked for, below its title and remarks. Chosen: exports have one
-or two lines of title; twice or half changes nothing for them."""
 
 
 def load_track(trial: Trial) -> Track:
-    """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one.
-
-    Parameters
-    ----------
-    trial : of the sheet, with `track` and perhaps `pressure_trace`, `point_mass` and `frames_used`.
-
-    Returns
-    -------
-    the track, positions in m.
-
-    Raises
-    ------
-    TrackError
-        One sentence with a remedy, if either file cannot be used.
-    """
+    """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
     if trial.track is None:
         raise TrackError("is blank: this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
@@ -59,28 +42,9 @@ def load_track(trial: Trial) -> Track:
 
 
 def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
-    """Read positions measured elsewhere; the kind of file is recognised from its content.
-
-    Accepted are a CSV with `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and
-    Tracker's text export (columns t, x, y or t and one coordinate, with or without a title above). Points in a plane
-    are projected on the principal axis of their motion. `flag` is blank throughout; `edge_px` is NaN except in a
-    project.
-
-    Parameters
-    ----------
-    path : the file.
-    point_mass : name of the point mass of a project; the one with the most points where blank.
-    frames_used : first and last frame of a project, or row of a table counted from 0, that are used.
-
-    Returns
-    -------
-    the track, s and m.
-
-    Raises
-    ------
-    TrackError
-        One sentence with a remedy: not readable, fewer than 5 points, time that does not increase, a cell that is not
-        a number, pressure out of range.
+    """Read positions measured elsewhere; the kind of file is recognised from its content. Accepted are a CSV with
+    `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and Tracker's text export
+    (columns t, x, y or t and one coordinate, with or without a title above).
     """
     if path.suffix.lower() == ".trz":
         raise TrackError("is a packed Tracker project: unpack it and name the .trk inside")
@@ -101,13 +65,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
 
 
 def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
-    """Flag the rows before and after those used.
-
-    Raises
-    ------
-    TrackError
-        If fewer than 5 points are left.
-    """
+    """Flag the rows before and after those used."""
     if frames_used is None:
         return track
     rows = np.arange(track.time_s.size)
@@ -145,20 +103,8 @@ def _read_positions(table: Table) -> Track:
 
 
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
-    """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels.
-
-    Parameters
-    ----------
-    path : the file.
-
-    Returns
-    -------
-    times in s and gauge pressures in Pa, two arrays, shape (n,).
-
-    Raises
-    ------
-    TrackError
-        One sentence with a remedy.
+    """Read a pressure trace: a CSV with `time_s, pressure_kPa`, or a TDMS file with such channels. Returns times in s
+    and gauge pressures in Pa, two arrays, shape (n,).
     """
     try:
         table = parse_table(_as_csv(path) if path.suffix.lower() == ".tdms" else read_text(path))
@@ -174,23 +120,9 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
 
 
 def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
-    """Interpolate a pressure trace linearly on the times of a track; trace and track share one clock.
-
-    Beyond the ends of the trace its first and last values are held, which a note reports.
-
-    Parameters
-    ----------
-    track : what the pressure belongs to.
-    time_s, pressure_Pa : the trace, shape (n,), times increasing.
-
-    Returns
-    -------
-    the track with `pressure_Pa`, shape (n_frames,).
-
-    Raises
-    ------
-    TrackError
-        If trace and track have no time in common.
+    """Interpolate a pressure trace linearly on the times of a track; trace and track share one clock. Beyond the ends
+    of the trace its first and last values are held, which a note reports. Shapes: time_s, pressure_Pa (n,) →
+    (n_frames,).
     """
     start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
     if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):

@@ -21,51 +21,33 @@ from vinetrack.core.records import Floats
 from vinetrack.tracks.outliers import FEWEST_POINTS, LEAST_SHARE, local_fit, local_noise
 from vinetrack.tracks.position_noise import robust_position_noise
 
-FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
-"""Weights of a fourth difference; for white noise of variance 1 it has the variance 70."""
+FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth difference
 
-DEVIANCE_DROP = 28.0
-"""Fall of −2 ln L above which noise that varies is used. Derived: χ² with one degree of freedom exceeds 10.8 once in a
-thousand experiments; times 2.6, since differences share points: they are correlated by −0.8, 0.4, −0.11 and 0.01 from
-one to the next ones, and 1 + 2 Σ ρ² = 2.6."""
+DEVIANCE_DROP = 28.0  # Fall of −2 ln L above which noise that varies is used (derived)
 
-LEAST_SD_RATIO = 1.25
-"""Least ratio of the largest to the smallest standard deviation of the points (95 and 5 %). Chosen: weights that ignore
-a ratio of 1.25 lose 1 % of the information."""
+LEAST_SD_RATIO = 1.25  # Least ratio of the largest to the smallest standard deviation of the points (chosen)
 
-WINSORISING_SIGMAS = 4.0
-"""Standard deviations of their surroundings to which residuals are winsorised: heavy tails are not noise that
-varies."""
+WINSORISING_SIGMAS = 4.0  # Standard deviations of their surroundings to which residuals are winsorised
 
-FEWEST_DIFFERENCES = 20
-"""Fewest fourth differences of a trial from which its noise is estimated. Chosen: twenty differences estimate a
-standard deviation to 16 % (1/√40). By reasoning: at half, shapes come from scatter; at twice, short tracks get none."""
+FEWEST_DIFFERENCES = 20  # Fewest fourth differences of a trial from which its noise is estimated (chosen)
 
+# Grid points of τ, by factors of 1.19 from a thirtieth to thirty times what makes both parts equal at the higher
+# speeds, and of s, by factors of 1.12; the best τ is then refined by a parabola (derived)
 BLUR_GRID_SIZE, SCALE_GRID_SIZE = 41, 61
-"""Grid points of τ, by factors of 1.19 from a thirtieth to thirty times what makes both parts equal at the higher
-speeds, and of s, by factors of 1.12; the best τ is then refined by a parabola. Derived: 60^(1/60) and 900^(1/40) a
-step."""
 
-COARSE_STEP = 5
-"""Every fifth value of s is tried before those between. Chosen: near the root of half their number, where both passes
-try as few; on tracks of every kind of noise the result is that of all values."""
+COARSE_STEP = 5  # Every fifth value of s is tried before those between (chosen)
 
 _SCALE_GRID = np.geomspace(1 / 30, 2.0, SCALE_GRID_SIZE)
 
-UNEVEN_PART = 0.05
-"""Part of a frame by which spacings may differ in a fourth difference: printed times are rounded. Chosen as in
-`frame_timing`."""
+UNEVEN_PART = 0.05  # Part of a frame by which spacings may differ in a fourth difference (chosen)
 
-STATED_PART = 0.9
-"""Least part of a trial's points whose standard deviation must be stated. Chosen: the median of the stated ones fills
-the gaps."""
+STATED_PART = 0.9  # Least part of a trial's points whose standard deviation must be stated (chosen)
 
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Standard deviations `sd_m` of every point, one array, shape (n_points,), for each trial.
-
-    `blur_s` is τ, 0 where the standard deviations follow those stated.
+    """Standard deviations `sd_m` of every point, one array, shape (n_points,), for each trial. `blur_s` is τ, 0 where
+    the standard deviations follow those stated.
     """
 
     sd_m: tuple[Floats, ...]
@@ -74,9 +56,8 @@ class NoiseShape:
 
 @dataclass(frozen=True)
 class _Differences:
-    """Fourth differences of a trial, scaled to the noise of one position, m; which are used; speeds, m/s.
-
-    All arrays have shape (n_points,).
+    """Fourth differences of a trial, scaled to the noise of one position, m; which are used; speeds, m/s. All arrays
+    have shape (n_points,).
     """
 
     distance_m: Floats
@@ -87,16 +68,8 @@ class _Differences:
 def noise_shape(
     time_s: Sequence[Floats], position_m: Sequence[Floats], stated_m: Sequence[Floats | None]
 ) -> NoiseShape | None:
-    """Find how the noise of an experiment's tracks varies; None where equal noise describes them as well.
-
-    Parameters
-    ----------
-    time_s, position_m : one array, shape (n_points,), a trial; s and m, finite, in order of time.
-    stated_m : standard deviations that the files state, NaN where unknown; None where a trial has none.
-
-    Returns
-    -------
-    the shape, or None.
+    """Find how the noise of an experiment's tracks varies; None where equal noise describes them as well. Shapes:
+    time_s, position_m (n_points,).
     """
     if not time_s or min(times.size for times in time_s) < FEWEST_POINTS:
         return None
@@ -115,16 +88,7 @@ def noise_shape(
 
 def ar1_difference_gain(rho: float) -> float:
     """Ratio of the standard deviation of a fourth difference for AR(1) noise to that for white noise of the same size.
-
     Var(aᵀe) = aᵀ C a with a the weights of the five points and C_jk = ρ^|j−k|.
-
-    Parameters
-    ----------
-    rho : lag-one correlation of the noise, 0 to below 1.
-
-    Returns
-    -------
-    standard deviation of a fourth difference over that for white noise of the same size; 1 for ρ = 0.
     """
     steps = np.arange(FOURTH_DIFFERENCE.size)
     covariance = rho ** np.abs(np.subtract.outer(steps, steps))
@@ -154,9 +118,8 @@ def _running_median(values: Floats) -> Floats:
 
 
 def _best_scale(differences: _Differences, extra_m: Floats) -> tuple[float, float]:
-    """−2 ln L of a trial's differences with sd² = s² + extra², minimised over s, and that s.
-
-    Every fifth s is tried, then those about the best of them: −2 ln L has one valley.
+    """−2 ln L of a trial's differences with sd² = s² + extra², minimised over s, and that s. Every fifth s is tried,
+    then those about the best of them: −2 ln L has one valley.
     """
     square, extra_square = differences.distance_m[differences.use] ** 2, extra_m[differences.use] ** 2
     typical = math.sqrt(float(np.mean(square))) + 1e-300

@@ -22,70 +22,38 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Track, hand_corrected, join_flags
 from vinetrack.tracks.position_noise import robust_position_noise
 
-HALF_WIDTH = 6
-"""Neighbours on either side. Chosen: twelve leave eight degrees of freedom beside a cubic. With three on either side
-two outliers among them outvote the rest; with twelve on either side a cubic no longer follows a release."""
+HALF_WIDTH = 6  # Neighbours on either side (chosen)
 
-NOISE_HALF_WIDTH = 20
-"""Points on either side from whose residuals the local noise is estimated. Chosen: 41 points estimate it to 18 % (the
-median of absolute values has 0.37 of the efficiency of the mean square), and noise that depends on speed changes little
-over them."""
+NOISE_HALF_WIDTH = 20  # Points on either side from whose residuals the local noise is estimated (chosen)
 
-NOISE_DEGREES_OF_FREEDOM = 15.0
-"""Degrees of freedom of that local noise: 0.37 × 41. Derived."""
+NOISE_DEGREES_OF_FREEDOM = 15.0  # Degrees of freedom of that local noise: 0.37 × 41 (derived)
 
-FALSE_ALARM_RATE = 1e-3
-"""Probability that normal noise costs a track a single point. Chosen: one campaign of 24 trials in forty loses one,
-which widens no interval; at a hundred times less the limit rises from 7.5 to 10.7 standard deviations for 500
-points."""
+FALSE_ALARM_RATE = 1e-3  # Probability that normal noise costs a track a single point (chosen)
 
-LEAST_SHARE = 0.75
-"""Least share of the neighbours that must lie on the cubic. Chosen: nine of twelve, so that three of them may be
-outliers too; at a corner of the motion more than three lie on the other side of a point that is off the cubic."""
+LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (chosen)
 
-NEAREST, FEWEST_NEAR = 4, 3
-"""Of this many nearest neighbours, so many must lie on the cubic too: just behind the end of growth nine points of the
-motion can outvote the standstill that the point belongs to (measured: 5 of 160 tracks lost a point without this)."""
+NEAREST, FEWEST_NEAR = 4, 3  # Of this many nearest neighbours, so many must lie on the cubic too
 
-BIWEIGHT_CUTOFF = 6.0
-"""Residual, in standard deviations of the noise, from which a neighbour has no weight. Chosen: 4.685 is Tukey's for 95
-% efficiency, wider since only points far off matter here."""
+BIWEIGHT_CUTOFF = 6.0  # Residual, in standard deviations of the noise, from which a neighbour has no weight (chosen)
 
+# Within this many points of an end the motion may have stopped or begun between two frames (chosen)
 END_POINTS, END_STEPS = 2, 1.5
-"""Within this many points of an end the motion may have stopped or begun between two frames: so many frames' steps for
-each point from the end are then no sign of an outlier, behind the motion at the end of a track and ahead of it at the
-beginning. Chosen: growth ends or begins within a frame, which displaces the last points by up to a step each. By
-reasoning: without it the last point before a stop is rejected; at twice, outliers of three steps at the ends stay."""
 
+# Distance to the point before, in steps of the motion, below which a point may be a repeated frame (chosen)
 COPY_STEPS = 0.3
-"""Distance to the point before, in steps of the motion, below which a point may be a repeated frame: `frame_timing`
-judges it first, and what it does not take for a copy is examined again. Chosen as `STILL_PART` there, a little wider.
-By reasoning: at half, copies are rejected as outliers before they are judged; at twice, outliers that happen to lie
-near the point before interfere while frames are judged."""
 
-MOST_ROUNDS = 4
-"""Most rounds of rejection. Measured on three campaigns with 2 % of outliers: three rounds leave nothing to reject."""
+MOST_ROUNDS = 4  # Most rounds of rejection (measured)
 
-FEWEST_POINTS = 2 * HALF_WIDTH + 1
-"""Fewest points of a window: the point and its neighbours. Derived from HALF_WIDTH."""
+FEWEST_POINTS = 2 * HALF_WIDTH + 1  # Fewest points of a window: the point and its neighbours (derived)
 
-MOST_NAMED = 8
-"""Most points named in the sentence about a campaign; a track's notes name all of its own. Chosen: what fits on two
-lines."""
+MOST_NAMED = 8  # Most points named in the sentence about a campaign; a track's notes name all of its own (chosen)
 
-MOST_REJECTED = 0.1
-"""Largest share of points that may be rejected; beyond it the test does not describe the track, and none is. Chosen:
-five times the densest that was tried."""
+MOST_REJECTED = 0.1  # Largest share of points that may be rejected (chosen)
 
 
 @dataclass(frozen=True)
 class LocalFit:
-    """Comparison of every point with the cubic through its neighbours; arrays of shape (n_points,).
-
-    `residual_m` is the point minus the cubic, `gain` the standard deviation of that for white noise of standard
-    deviation 1; `spread_m` is the root mean square of the neighbours about the cubic, `share` the part of them that lie
-    on it, `near` how many of the nearest four do; `speed_m_s` is the slope of the cubic.
-    """
+    """Comparison of every point with the cubic through its neighbours; arrays of shape (n_points,)."""
 
     residual_m: Floats
     gain: Floats
@@ -96,16 +64,8 @@ class LocalFit:
 
 
 def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
-    """Compare every point with a robust cubic through its twelve nearest neighbours.
-
-    Parameters
-    ----------
-    time_s, position_m : shape (n_points,), s and m, finite, in order of time; at least `FEWEST_POINTS`.
-    noise_m : standard deviation of a position, the least scale of the residuals.
-
-    Returns
-    -------
-    residuals and what they are compared with, a value for each point.
+    """Compare every point with a robust cubic through its twelve nearest neighbours. Shapes: time_s, position_m
+    (n_points,).
     """
     n = time_s.size
     begin = np.clip(np.arange(n) - HALF_WIDTH, 0, n - FEWEST_POINTS)
@@ -148,15 +108,7 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
 
 def local_noise(distance_m: Floats, half_width: int = NOISE_HALF_WIDTH) -> Floats:
     """Estimate the standard deviation around each point by a running median, which is 0.6745 of it for normal noise.
-
-    Parameters
-    ----------
-    distance_m : absolute residuals, shape (n_points,), m.
-    half_width : points on either side.
-
-    Returns
-    -------
-    standard deviation around each point, shape (n_points,), m.
+    Shapes: distance_m (n_points,) → (n_points,).
     """
     width = min(2 * half_width + 1, distance_m.size)
     view = np.median(np.lib.stride_tricks.sliding_window_view(distance_m, width), axis=1) / 0.6745
@@ -165,19 +117,9 @@ def local_noise(distance_m: Floats, half_width: int = NOISE_HALF_WIDTH) -> Float
 
 
 def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> NDArray[np.bool_]:
-    """Mark the points that lie far off the motion around them.
-
-    The largest deviations are rejected first, others only if they remain without those: an outlier spoils its
-    neighbours.
-
-    Parameters
-    ----------
-    time_s, position_m : arrays, shape (n_points,), s and m, finite, in order of time.
-    spare_copies : leave points that lie where the point before lies, as repeated frames do.
-
-    Returns
-    -------
-    mask, shape (n_points,)
+    """Mark the points that lie far off the motion around them. The largest deviations are rejected first, others only
+    if they remain without those: an outlier spoils its neighbours. Shapes: time_s, position_m (n_points,) →
+    (n_points,).
     """
     from scipy.stats import t
 
@@ -198,17 +140,7 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
 
 
 def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
-    """Flag the outliers of a track `rejected`, and name them in its notes; points corrected by hand stay.
-
-    Parameters
-    ----------
-    track : a row for every frame; positions may be NaN.
-    spare_copies : leave points that may be repeated frames, until those have been judged.
-
-    Returns
-    -------
-    a copy, or the track itself where no point is wild.
-    """
+    """Flag the outliers of a track `rejected`, and name them in its notes; points corrected by hand stay."""
     rows = np.flatnonzero(track.usable)
     is_wild = find_outliers(track.time_s[rows], track.lead_position_m[rows], spare_copies=spare_copies)
     outlying = rows[is_wild]
@@ -225,16 +157,7 @@ def reject_outliers(track: Track, *, spare_copies: bool = False) -> Track:
 
 
 def rejected_points_note(tracks: Mapping[str, Track]) -> str:
-    """Name the rejected points of tracks by trial in one sentence; blank where there are none.
-
-    Parameters
-    ----------
-    tracks : by name of trial, as `reject_outliers` returns them.
-
-    Returns
-    -------
-    the sentence, or blank.
-    """
+    """Name the rejected points of tracks by trial in one sentence; blank where there are none."""
     places = [
         f"{name} at {place}"
         for name, track in tracks.items()
@@ -294,9 +217,8 @@ def _cubic(away: Floats, coefficients: Floats) -> Floats:
 
 
 def _normal_solution(sums: Floats, right: Floats) -> Floats:
-    """Coefficients, (n_windows, 4), of the normal equations with these sums of powers 0 to 6 and right sides.
-
-    The system is scaled to a unit diagonal, with a ridge of 1e-10, and factored as L D Lᵀ in all windows at once.
+    """Coefficients, (n_windows, 4), of the normal equations with these sums of powers 0 to 6 and right sides. The
+    system is scaled to a unit diagonal, with a ridge of 1e-10, and factored as L D Lᵀ in all windows at once.
     """
     scale = 1 / np.sqrt(sums[:, ::2])
     lower, pivots = np.empty((4, 4, len(sums))), np.empty((4, len(sums)))

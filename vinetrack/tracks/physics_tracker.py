@@ -39,24 +39,8 @@ class _Axes:
 
 
 def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
-    """Read the track of a `.trk` project: one point mass, projected on the axis of its motion.
-
-    It is the one named `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
-
-    Parameters
-    ----------
-    text : content of the file, XML.
-    point_mass : its name; the one with the most marks where blank.
-    frames_used : first and last frame; all where None.
-
-    Returns
-    -------
-    the track: s, m, and `edge_px` along the principal axis of the motion.
-
-    Raises
-    ------
-    TrackError
-        If it is no project, holds no point mass or was never calibrated.
+    """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
+    `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
     """
     panel = _parse_panel(text)
     name, marks, others = _choose_mass(panel, point_mass)
@@ -207,16 +191,7 @@ def _number(node: Element, name: str) -> float:
 
 
 def is_export_header(line: str) -> bool:
-    """Whether a line names the columns of a text export: t, and x or y.
-
-    Parameters
-    ----------
-    line : of a text file.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a line names the columns of a text export: t, and x or y."""
     names = {name for cell in re.split(r"[\t;,]", line) if (name := _column(cell)[0])}
     return "t" in names and bool(names & {"x", "y"})
 
@@ -234,21 +209,7 @@ def _column(cell: str) -> tuple[str, str]:
 
 
 def read_export(table: Table) -> Track:
-    """Read the track of Tracker's text export; a blank coordinate is a frame without a point.
-
-    Parameters
-    ----------
-    table : its cells.
-
-    Returns
-    -------
-    the track, s and m.
-
-    Raises
-    ------
-    TrackError
-        If a unit is not understood, or see `new_track`.
-    """
+    """Read the track of Tracker's text export; a blank coordinate is a frame without a point."""
     columns: dict[str, tuple[str, str]] = {}
     for column in table.columns:
         name, unit = _column(column)
@@ -281,16 +242,9 @@ def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
 
 
 def _project_on_axis(points: Floats) -> tuple[Floats, str]:
-    """Positions along the principal axis of the motion, and a sentence saying so; NaN rows stay NaN.
-
-    Parameters
-    ----------
-    points : shape (n, 1) or (n, 2). A single coordinate keeps its zero; points in a plane start from the first.
-
-    Returns
-    -------
-    position, note
-        Shape (n,), with a net displacement that is not negative; the note is blank where nothing was done.
+    """Positions along the principal axis of the motion, and a sentence saying so; NaN rows stay NaN. Returns position,
+    note: Shape (n,), with a net displacement that is not negative; the note is blank where nothing was done. Shapes:
+    points (n, 1).
     """
     known = np.all(np.isfinite(points), axis=1)
     if not known.any():

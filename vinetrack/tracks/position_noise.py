@@ -15,70 +15,39 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track
 
-ENOUGH_REST_FRAMES = 60
-"""Frames at rest from which their noise alone counts as that of the track. Chosen: two stretches of 32, less rounding;
-they estimate a standard deviation to 9 %. By reasoning: at half to 13 %; at twice, motion, which a cubic may miss,
-enters more tracks."""
+ENOUGH_REST_FRAMES = 60  # Frames at rest from which their noise alone counts as that of the track (chosen)
 
-REST_MARGIN_FRAMES = 3
-"""Frames left out before the corner between rest and motion. Chosen: the corner is found to within about two frames. By
-reasoning: at half, motion enters the noise; at twice, three frames are lost."""
+REST_MARGIN_FRAMES = 3  # Frames left out before the corner between rest and motion (chosen)
 
-LONG_TRACK_POINTS = 90
-"""Moving points from which stretches are twice as long. Chosen: seven stretches of 12 determine σ; from there on longer
-ones, which show slow correlation, gain more than further ones. Half or twice changes which tracks get them."""
+LONG_TRACK_POINTS = 90  # Moving points from which stretches are twice as long (chosen)
 
-REST_STRETCH, REST_ORDER = 32, 1
-"""Points in a stretch at rest and degree of its polynomial. Chosen: a line takes up drift, and 32 points show
-correlations up to ρ = 0.9 (correlation length 10 frames). By reasoning: at half, slow noise passes for drift."""
+REST_STRETCH, REST_ORDER = 32, 1  # Points in a stretch at rest and degree of its polynomial (chosen)
 
-MOVING_STRETCH, MOVING_ORDER = 12, 3
-"""The same in motion. Chosen: a cubic follows a release over twelve frames, and eight degrees of freedom remain. By
-reasoning: at half two remain; at twice curvature passes for noise."""
+MOVING_STRETCH, MOVING_ORDER = 12, 3  # The same in motion (chosen)
 
 RHO_GRID = np.linspace(0.0, 0.95, 20)
-PRIOR_RHO_SD = 0.5
-"""Standard deviation of the normal prior of ρ about 0. Chosen: flat where there are data; short tracks are shrunk to
-white noise. By reasoning: at half ρ = 0.7 costs 7.8 of −2 ln L in place of 2.0, at twice 0.5."""
+PRIOR_RHO_SD = 0.5  # Standard deviation of the normal prior of ρ about 0
 
-SHORTEST_MOTION = 12
-"""Points in motion below which the whole track is used. Chosen: one stretch in motion."""
+SHORTEST_MOTION = 12  # Points in motion below which the whole track is used (chosen)
 
+# Correlation above which the noise may be motion that a cubic does not follow (chosen)
 SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
-"""Correlation above which the noise may be motion that a cubic does not follow, and the length of the shorter stretches
-that then decide. Chosen: at ρ = 0.85 noise persists for six frames, half a stretch; seven points are the fewest on
-which a cubic leaves three degrees of freedom. By reasoning: a lower limit replaces truly slow noise by too small a ρ, a
-higher one lets curvature pass for noise."""
 
-THIRD_DIFFERENCE_SD = math.sqrt(20.0)
-"""Standard deviation of third differences of white noise of unit variance. Derived: 1² + 3² + 3² + 1² = 20."""
+THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences of white noise of unit variance
 
+# Factor by which the median third difference may underestimate correlated noise (derived)
 THIRD_DIFFERENCE_ALLOWANCE = 1.84
-"""Factor by which the median third difference may underestimate correlated noise. Derived: at ρ = 0.6 third differences
-have 1/1.84² of the variance of white noise."""
 
-SAME_STEP_TOLERANCE = 0.01
-"""Relative difference within which two rounding steps are the same. Chosen: steps in pixels are known to a thousandth,
-decimals exactly; half or twice distinguishes the same."""
+SAME_STEP_TOLERANCE = 0.01  # Relative difference within which two rounding steps are the same (chosen)
 
+# Noise of a track, in errors of rounding, below which most of it is rounding (derived)
 ROUNDING_DOMINATES = math.sqrt(2.0)
-"""Noise of a track, in errors of rounding, below which most of it is rounding. Derived: noise as large as that error
-gives √2 of it in total, and shows in spite of the rounding."""
 
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """Estimate the standard deviation and lag-one correlation of the random error of single positions.
-
-    Parameters
-    ----------
-    time_s, position_m : arrays, shape (n,), s and m, finite, in order of time.
-
-    Returns
-    -------
-    noise_m
-        Standard deviation, m. 0 where the positions are exact or fewer than 5.
-    correlation
-        Lag-one correlation, 0 to 0.95; shrunk to 0 where the track is short.
+    """Estimate the standard deviation and lag-one correlation of the random error of single positions. Returns noise_m
+    (standard deviation, m. 0 where the positions are exact or fewer than 5), correlation (lag-one correlation, 0 to
+    0.95; shrunk to 0 where the track is short). Shapes: time_s, position_m (n,).
     """
     noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
     return (rounding_m, 0.0) if noise_m < rounding_m else (noise_m, correlation)
@@ -104,19 +73,10 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
 
 
 def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
-    """Estimate `position_noise`, bounded so that a fault in a short track does not pass for noise.
-
-    The bound is the median third difference, which a single fault hardly changes, times THIRD_DIFFERENCE_ALLOWANCE; of
-    positions that are rounded, and mostly at rest, it carries no information.
-
-    Parameters
-    ----------
-    time_s, position_m : arrays, shape (n,), s and m, finite, in order of time.
-
-    Returns
-    -------
-    noise_m : float, m
-    correlation : float
+    """Estimate `position_noise`, bounded so that a fault in a short track does not pass for noise. The bound is the
+    median third difference, which a single fault hardly changes, times THIRD_DIFFERENCE_ALLOWANCE; of positions that
+    are rounded, and mostly at rest, it carries no information. Returns noise_m, correlation. Shapes: time_s, position_m
+    (n,).
     """
     noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
     correlation = 0.0 if noise_m < rounding_m else correlation
@@ -130,16 +90,8 @@ def _frames_at_rest(position_m: Floats) -> int:
 
 
 def rounding_noise(position_m: Floats) -> float:
-    """Estimate the standard deviation of the error of rounded positions (whole pixels, printed decimals).
-
-    Parameters
-    ----------
-    position_m : array, shape (n,), m, finite, in order of time.
-
-    Returns
-    -------
-    float, m
-        0 where they are not rounded, or where it does not show.
+    """Estimate the standard deviation of the error of rounded positions (whole pixels, printed decimals). Returns 0
+    where they are not rounded, or where it does not show. Shapes: position_m (n,).
     """
     floor_m = _rounding_step(position_m) / math.sqrt(12)
     if floor_m == 0:
@@ -151,16 +103,7 @@ def rounding_noise(position_m: Floats) -> float:
 
 def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
-
-    Parameters
-    ----------
-    tracks : sequence of arrays, shape (n_points,), m
-        Positions of each track.
-
-    Returns
-    -------
-    float, m
-        0 where most are not rounded, or to different steps, or are noisier than that.
+    Returns 0 where most are not rounded, or to different steps, or are noisier than that. Shapes: tracks (n_points,).
     """
     limit = ROUNDING_DOMINATES / math.sqrt(12)
     noises = sorted(
@@ -175,10 +118,8 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
 
 
 def _shows_rounding(position_m: Floats, floor_m: float) -> bool:
-    """Whether positions that are all multiples of a step are so from rounding.
-
-    Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero except a
-    few at a corner.
+    """Whether positions that are all multiples of a step are so from rounding. Exact positions at one speed are
+    multiples of their step too, but smooth: their third differences are zero except a few at a corner.
     """
     uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
     allowed = 5 if position_m.size >= SHORTEST_MOTION else 0
@@ -186,9 +127,8 @@ def _shows_rounding(position_m: Floats, floor_m: float) -> bool:
 
 
 def _rounding_step(position_m: Floats) -> float:
-    """Step of which all positions are multiples (whole pixels, printed decimals), m; 0 where there is none.
-
-    Rounding to a step q adds an error of standard deviation q/√12, which frames at rest cannot show.
+    """Step of which all positions are multiples (whole pixels, printed decimals), m; 0 where there is none. Rounding to
+    a step q adds an error of standard deviation q/√12, which frames at rest cannot show.
     """
     values = np.unique(position_m)
     if values.size < 3:
@@ -209,17 +149,8 @@ def _rounding_step(position_m: Floats) -> float:
 
 
 def rough_noise(position_m: Floats) -> float:
-    """Estimate the noise from the median third difference, as if it were white.
-
-    Third differences of white noise have variance 20σ², and the median of |x| is 0.6745 of a normal standard deviation.
-
-    Parameters
-    ----------
-    position_m : shape (n,), m, finite.
-
-    Returns
-    -------
-    standard deviation of a position, m; 0 for fewer than five points.
+    """Estimate the noise from the median third difference, as if it were white. Third differences of white noise have
+    variance 20σ², and the median of |x| is 0.6745 of a normal standard deviation. Shapes: position_m (n,).
     """
     if position_m.size < 5:
         return 0.0
@@ -228,18 +159,9 @@ def rough_noise(position_m: Floats) -> float:
 
 
 def rest_points(position_m: Floats) -> int:
-    """Count the points at the start that are at rest; 0 where the track starts in motion.
-
-    The track leaves rest where it rises above the resting level for good; the corner is then that of the best
-    flat-then-straight line through the points up to there.
-
-    Parameters
-    ----------
-    position_m : shape (n,), m, finite, in order of time.
-
-    Returns
-    -------
-    points, counted from the first.
+    """Count the points at the start that are at rest; 0 where the track starts in motion. The track leaves rest where
+    it rises above the resting level for good; the corner is then that of the best flat-then-straight line through the
+    points up to there. Shapes: position_m (n,).
     """
     n = position_m.size
     if n < 5:
@@ -338,38 +260,16 @@ def _parabola_vertex(x: Floats, score: Floats, best: int) -> float:
 
 
 def track_noise(track: Track) -> tuple[float, float]:
-    """Estimate the noise of a track's usable points; see `position_noise`.
-
-    Parameters
-    ----------
-    track : A track; only its usable points are read.
-
-    Returns
-    -------
-    noise_m
-        Standard deviation, m. 0 where the positions are exact or fewer than 5.
-    correlation
-        Lag-one correlation, 0 to 0.95; shrunk to 0 where the track is short.
+    """Estimate the noise of a track's usable points; see `position_noise`. Returns noise_m (standard deviation, m. 0
+    where the positions are exact or fewer than 5), correlation (lag-one correlation, 0 to 0.95; shrunk to 0 where the
+    track is short).
     """
     usable = track.usable
     return position_noise(track.time_s[usable], track.lead_position_m[usable])
 
 
 def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
-    """Draw stationary first-order autoregressive noise, as simulated tracks have it.
-
-    Parameters
-    ----------
-    count : number of positions.
-    sd : standard deviation of each, m.
-    correlation : lag-one correlation, above -1 and below 1.
-    draw : random numbers; `count` normal deviates are taken.
-
-    Returns
-    -------
-    array, shape (count,), m: the first is a draw from the stationary distribution, every other one is `correlation`
-    times its predecessor plus an innovation of variance (1 − correlation²)·sd².
-    """
+    """Draw stationary first-order autoregressive noise, as simulated tracks have it. Shape (count,)."""
     from scipy.signal import lfilter
 
     white = draw.standard_normal(count)

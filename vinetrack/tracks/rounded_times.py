@@ -11,42 +11,18 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 
-FEWEST_TIMES = 8
-"""Fewest times from which an even series is recognised. Measured: of 3,000 series whose steps are one digit or two at
-random 83 % are taken for even with 8 times, 7 % with 20, 0.03 % with 40; none of them is then moved by more than three
-quarters of a digit. Chosen: a short film of few digits is restored, at the price of such as these."""
+FEWEST_TIMES = 8  # Fewest times from which an even series is recognised (measured)
 
-TOLERANCE_DIGITS = 0.75
-"""Last digits by which a time may deviate from the series. Derived: half a digit by rounding, and half of that again by
-which the series itself, fitted to rounded times, may be off; truncated times deviate by the same, apart from a shift
-that has no consequence."""
+TOLERANCE_DIGITS = 0.75  # Last digits by which a time may deviate from the series (derived)
 
-LEAST_DIGIT_PART = 0.01
-"""Last digit, as a part of a frame, from which times are restored. Chosen: half a hundredth of a frame is 0.3 mm at 60
-m/s; at half nothing is gained below that, at twice 0.6 mm stay."""
+LEAST_DIGIT_PART = 0.01  # Last digit, as a part of a frame, from which times are restored (chosen)
 
-MOST_DECIMALS = 7
-"""Decimals from which a time does not count as rounded. Chosen: a tenth of a microsecond, 6 µm at 60 m/s."""
+MOST_DECIMALS = 7  # Decimals from which a time does not count as rounded (chosen)
 
 
 def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
-    """Times of evenly spaced frames before they were rounded, and a sentence that says so.
-
-    Parameters
-    ----------
-    time_s : array, shape (n,), s
-
-    Returns
-    -------
-    time_s : array, shape (n,), s
-        Unchanged where they are not rounded, or not evenly spaced.
-    note : str
-        Blank where nothing was done.
-
-    Examples
-    --------
-    >>> unrounded_times(np.round(np.arange(100) / 240, 3))[1]
-    'Times are rounded to 1 ms; evenly spaced ones, 4.17 ms apart, are used instead.'
+    """Times of evenly spaced frames before they were rounded, and a sentence that says so. Returns time_s (unchanged
+    where they are not rounded, or not evenly spaced), note (blank where nothing was done). Shapes: time_s (n,) → (n,).
     """
     digit_s = _last_digit_s(time_s) if time_s.size >= FEWEST_TIMES else 0.0
     if digit_s == 0:

@@ -20,56 +20,36 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track, Trial
 
-WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)
-"""Windows, in frames, of the filters that are compared. Chosen: what spreadsheets and filters offer; longer windows
-leave of a growth of a hundred frames little to fit."""
+WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)  # Windows, in frames, of the filters that are compared (chosen)
 
-DEGREES = (0, 2)
-"""Degrees of the polynomials; 0 is the moving average. Derived: in an odd window, the value in the middle of degree 1
-equals that of 0, of 3 that of 2."""
+DEGREES = (0, 2)  # Degrees of the polynomials; 0 is the moving average (derived)
 
-LOWEST_FREQUENCY = 0.06
-"""Lowest frequency, in cycles a frame, at which the spectra are compared. Chosen: slower oscillations are motion; at
-half the release and the end of growth pass for noise, at twice a third of the spectrum of a window of three is left."""
+LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spectra are compared (chosen)
 
-FEWEST_FRAMES = 40
-"""Fewest frames of a stretch without gaps. Chosen: twenty frequencies; at half hardly any hole shows, at twice fast
-vines drop out."""
+FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
 
+# Median deviation of the spacings, as a part of their median, above which a track is not used (chosen)
 UNEVEN_PART = 0.02
-"""Median deviation of the spacings, as a part of their median, above which a track is not used. Chosen: positions
-between uneven frames are not those of a filter, and motion adds noise to them. At half clocks that jitter by a per cent
-drop out, at twice more count."""
 
-CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))
-"""Lag-one correlations of noise that was not smoothed. Chosen: a grid, fine enough for ln L to differ by less than the
-level required."""
+CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))  # Lag-one correlations of noise that was not smoothed (chosen)
 
+# Exponent with which the spectrum of a motion that is rougher than its noise falls, such as that of a tube that sticks
+# and slips and is read fifty times a second (derived)
 MOTION_POWER_LAW = 4.0
-"""Exponent with which the spectrum of a motion that is rougher than its noise falls, such as that of a tube that sticks
-and slips and is read fifty times a second. Derived: that of a jump of the speed."""
 
-LEAST_POWER = 1e-5
-"""Part of its power that smoothed noise keeps in a hole. Derived: 1/N⁴ of a taper over N of 20 samples and more."""
+LEAST_POWER = 1e-5  # Part of its power that smoothed noise keeps in a hole (derived)
 
+# Number of the longest stretches that are compared (chosen)
 MOST_STRETCHES, ROUNDS = 12, 30
-"""Number of the longest stretches that are compared, and rounds in which the amplitudes of the components of their
-spectra are found. Chosen for time: a tenth of a second. Measured (eight campaigns, tuning seeds 20610 to 20625): with
-40 stretches ln L gained 0.6 to 1.8 times as much and no verdict changed; with half as many it gains about half."""
 
+# Gain of ln L over noise without holes, and over every other filter, above which positions count as smoothed (chosen)
 SURE_GAIN = 30.0
-"""Gain of ln L over noise without holes, and over every other filter, above which positions count as smoothed. Chosen:
-tapered neighbours count twice, so that it is a probability of e⁻¹⁵ for each of twenty windows. Measured (laboratories
-with 8 to 12 trials, tuning seeds 20620 to 20625): smoothed positions gain 48 to 1400, those of eight other kinds 15 at
-most; two of twelve gained 12 and 13 less than another filter, and are passed over. At half or twice all these stay
-so."""
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """A filter: polynomials of this degree (0 is a moving average) through a window of so many frames.
-
-    Every `decimation`-th smoothed frame carries the information of all.
+    """A filter: polynomials of this degree (0 is a moving average) through a window of so many frames. Every
+    `decimation`-th smoothed frame carries the information of all.
     """
 
     window: int
@@ -95,28 +75,15 @@ class Smoothing:
 
 
 def _filter_weights(window: int, degree: int) -> Floats:
-    """Weight of each frame of a window in the value in its middle of a polynomial through them.
-
-    They are those of Savitzky and Golay (Anal. Chem. 36, 1627, 1964). SciPy has them too, but takes half a second to
-    load.
+    """Weight of each frame of a window in the value in its middle of a polynomial through them. They are those of
+    Savitzky and Golay (Anal. Chem. 36, 1627, 1964). SciPy has them too, but takes half a second to load.
     """
     places = np.linspace(-1, 1, window)
     return np.asarray(np.linalg.pinv(np.vander(places, degree + 1))[-1])
 
 
 def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
-    """Find the filter with which the positions of a campaign were smoothed; None where they were not.
-
-    Parameters
-    ----------
-    pairs : trials of one campaign with their tracks; recordings, whose positions nobody smoothed, are skipped.
-    rounding_m : error of rounding where it is most of their noise, from `common_rounding_noise`.
-
-    Returns
-    -------
-    Smoothing or None
-        None for rounded positions too: rounding leaves a slow motion without high frequencies as well.
-    """
+    """Find the filter with which the positions of a campaign were smoothed; None where they were not."""
     if rounding_m > 0:
         return None
     spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
@@ -162,9 +129,8 @@ def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
 
 
 def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats]) -> float:
-    """Log-likelihood of the spectra as sums of the given shape, white noise and rough motion, with free amplitudes.
-
-    The amplitudes maximise it by multiplicative updates (Févotte, Bertin & Durrieu, Neural Computation 21, 793, 2009).
+    """Log-likelihood of the spectra as sums of the given shape, white noise and rough motion, with free amplitudes. The
+    amplitudes maximise it by multiplicative updates (Févotte, Bertin & Durrieu, Neural Computation 21, 793, 2009).
     """
     total = 0.0
     for (frequency, power), shape in zip(spectra, shapes, strict=True):

@@ -12,28 +12,20 @@ import numpy as np
 from vinetrack.core.records import Bools, Floats, Indices
 from vinetrack.tracks.frame_timing import CLEAR_STEP_SIGMAS, DROP_RATIO, frames_are
 
-SMALLEST_STEP_PX = 2.0
-"""Smallest step of a recording that can show a missing frame. Chosen: blur and film texture move an edge by some tenths
-of a pixel. By reasoning: at half a slow tip that sticks and slips passes for one; at twice slow recordings are left
-unchanged."""
+SMALLEST_STEP_PX = 2.0  # Smallest step of a recording that can show a missing frame (chosen)
 
+# Range of the four steps around a long one, as a part of their median, below which the motion is steady (chosen)
 EVEN_STEP_RANGE = 0.35
-"""Range of the four steps around a long one, as a part of their median, below which the motion is steady. Chosen: at
-release steps grow by more. By reasoning: at half only steady growth shows missing frames; at twice release does."""
 
+# A long step this near to a whole number of steps, and no more than so many, is counted in (chosen)
 WHOLE_STEP_TOLERANCE, MOST_MISSING_STEPS = 0.2, 4
-"""A long step this near to a whole number of steps, and no more than so many, is counted in; another is only reported.
-Chosen: beyond four the motion between is a guess. By reasoning: at half speeds that change are only reported; at twice
-every long step is counted in, one of 1.6 as two."""
 
 
 @dataclass(frozen=True)
 class MissingFrames:
-    """Missing frames of a recording; all arrays of shape (n_frames,).
-
-    `slot` counts capture periods from the first frame, missing ones included; `gap` marks frames before which some are
-    missing or may be, `retimed` those from which `slot` was corrected. `notes` report what the recording's own periods
-    did not show.
+    """Missing frames of a recording; all arrays of shape (n_frames,). `slot` counts capture periods from the first
+    frame, missing ones included; `gap` marks frames before which some are missing or may be, `retimed` those from which
+    `slot` was corrected.
     """
 
     slot: Indices
@@ -45,21 +37,9 @@ class MissingFrames:
 def count_missing(
     edge_px: Floats, sigma_px: Floats, slot: Indices, number: Indices, repeated: Bools, moving: tuple[int, int]
 ) -> MissingFrames:
-    """Count in the frames that steps of the motion show to be missing.
-
-    A step is compared with two on each side, which must agree (EVEN_STEP_RANGE) and be clear of the stated errors.
-
-    Parameters
-    ----------
-    edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
-    slot : capture periods from the first frame, from the recording, shape (n_frames,).
-    number : of each frame in the recording, shape (n_frames,); frames that were left out are not gaps.
-    repeated : mask of frames that repeat the one before, shape (n_frames,).
-    moving : first and last frame in which the edge is on its way.
-
-    Returns
-    -------
-    MissingFrames
+    """Count in the frames that steps of the motion show to be missing. A step is compared with two on each side, which
+    must agree (EVEN_STEP_RANGE) and be clear of the stated errors. Shapes: edge_px, sigma_px, slot, number, repeated
+    (n_frames,).
     """
     n = len(edge_px)
     gap, retimed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)

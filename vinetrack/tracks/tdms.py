@@ -18,15 +18,13 @@ from vinetrack.core.records import Floats
 from vinetrack.core.units import convert, split_unit
 from vinetrack.tracks.track_checks import TrackError
 
-LEAD_IN_BYTES = 28
-"""Bytes of a segment's lead-in. Source: the format's description."""
+LEAD_IN_BYTES = 28  # Bytes of a segment's lead-in
+# Content of a segment, by bits of its lead-in
 _META, _NEW_LIST, _RAW, _INTERLEAVED, _BIG_ENDIAN, _DAQMX = 1 << 1, 1 << 2, 1 << 3, 1 << 5, 1 << 6, 1 << 7
-"""Content of a segment, by bits of its lead-in. Source: the format's description."""
+# Marks in place of a layout, or of a segment's length
 _NO_RAW, _AS_BEFORE, _TO_THE_END = 0xFFFFFFFF, 0, 0xFFFFFFFFFFFFFFFF
-"""Marks in place of a layout, or of a segment's length. Source: the format's description."""
 _TYPES = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8", 25: "f4", 26: "f8"}
-_TEXT, _BOOLEAN, _TIME_STAMP = 0x20, 0x21, 0x44
-"""Type codes of text, Booleans and time stamps. Source: the format's description."""
+_TEXT, _BOOLEAN, _TIME_STAMP = 0x20, 0x21, 0x44  # Type codes of text, Booleans and time stamps
 _DAQMX_LAYOUTS = {0x1269, 0x1369}
 
 
@@ -41,23 +39,9 @@ class _Channel:
 
 
 def tdms_columns(data: bytes) -> dict[str, Floats]:
-    """Read the channels of a file that are as long as its pressure.
-
-    A channel is named as in the file, with its unit appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a
-    time, `time_s` comes from the waveform's start and increment.
-
-    Parameters
-    ----------
-    data : the file.
-
-    Returns
-    -------
-    values by column, each of shape (n_samples,).
-
-    Raises
-    ------
-    TrackError
-        In one sentence, where the file is none, is cut short or holds what is not read.
+    """Read the channels of a file that are as long as its pressure. A channel is named as in the file, with its unit
+    appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a time, `time_s` comes from the waveform's start and
+    increment. Returns values by column, each of shape (n_samples,).
     """
     try:
         channels = _channels(data)

@@ -9,19 +9,12 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track, plain_track
 
-FEWEST_POINTS = 5
-"""Fewest points of a track. Derived: a cubic and one to spare."""
+FEWEST_POINTS = 5  # Fewest points of a track (derived)
 
-LARGEST_PRESSURE_KPA = 1000.0
-"""Largest gauge pressure in kPa that is accepted. Chosen: ten times what vines bear; Pa in place of kPa are larger from
-1 kPa on. At half or twice only that message changes."""
+LARGEST_PRESSURE_KPA = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
 
-VACUUM_KPA = -101.4
-"""Least gauge pressure that is accepted; sensors do read a little below zero. Derived: minus the standard atmosphere,
-101.325, rounded away from zero."""
-LARGEST_NUMBER = 1e9
-"""Largest time or position, s or m; anything larger is no measurement and would overflow when squared and summed.
-Chosen: squares and their sums then stay far below 1e308."""
+VACUUM_KPA = -101.4  # Least gauge pressure that is accepted; sensors do read a little below zero (derived)
+LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 
 class TrackError(Exception):
@@ -29,18 +22,7 @@ class TrackError(Exception):
 
 
 def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
-    """Refuse times that do not increase from row to row.
-
-    Parameters
-    ----------
-    time_s : shape (n,), s.
-    lines : line of each row in its file, for the message.
-
-    Raises
-    ------
-    TrackError
-        Naming the first row that is not later than the one before.
-    """
+    """Refuse times that do not increase from row to row. Shapes: time_s (n,)."""
     wrong = np.flatnonzero(np.diff(time_s) <= 0)
     if len(wrong):
         i = int(wrong[0]) + 1
@@ -51,18 +33,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
-    """Refuse pressures outside what the sheet allows; NaN passes.
-
-    Parameters
-    ----------
-    pressure_kPa : shape (n,), gauge, kPa.
-    lines : line of each row in its file, for the message.
-
-    Raises
-    ------
-    TrackError
-        Naming the first reading below vacuum or above `LARGEST_PRESSURE_KPA`.
-    """
+    """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
     wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < VACUUM_KPA))
     if len(wrong):
         i = int(wrong[0])
@@ -83,24 +54,8 @@ def new_track(
     pressure_Pa: Floats | None = None,
     notes: Iterable[str] = (),
 ) -> Track:
-    """Make a track with blank flags, after the checks that all kinds of file share.
-
-    Parameters
-    ----------
-    time_s, lead_position_m : shape (n,), s and m; positions are NaN where there is none.
-    sigma_m : standard error of each position, shape (n,), m; unknown if None.
-    edge_px : position along the growth axis of the picture, shape (n,), px; unknown if None.
-    pressure_Pa : gauge pressure, shape (n,), Pa; none if None.
-    notes : sentences about the track.
-
-    Returns
-    -------
-    the track.
-
-    Raises
-    ------
-    TrackError
-        If it has fewer than 5 points with a position, times that do not increase, or numbers beyond all measure.
+    """Make a track with blank flags, after the checks that all kinds of file share. Shapes: time_s, lead_position_m,
+    sigma_m, edge_px, pressure_Pa (n,).
     """
     known = np.isfinite(lead_position_m)
     if np.sum(known) < FEWEST_POINTS:

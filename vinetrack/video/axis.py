@@ -21,30 +21,19 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.order_kernels import monotone_path_sums, passing_times
 from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
 
+# Least share of all change that one front explains where nothing else of weight moves (chosen)
 LEAST_FRONT_SHARE = 0.45
-"""Least share of all change that one front explains where nothing else of weight moves. Chosen: a swinging door takes a
-fifth; by reasoning, at half a door is taken for the axis, at twice payloads make a recording disorderly."""
-MOST_TURN_DEG = 8.0
-"""Largest angle by which a given axis is turned onto the motion. Chosen: one drawn by hand over some hundred pixels
-errs by a degree or two; with half, an axis 5 degrees off stays off; with twice, a wide strip lets in what crosses
-it."""
+MOST_TURN_DEG = 8.0  # Largest angle by which a given axis is turned onto the motion (chosen)
+# Fractions of a recording, from its start, that may be orderly where the whole is not (chosen)
 BEGINNINGS = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Fractions of a recording, from its start, that may be orderly where the whole is not. Chosen: steps of about a
-quarter; more cost time alone."""
+# Fewest and most times that a line is refined on the pixels that agree with it (chosen)
 FEWEST_REFINEMENTS, MOST_REFINEMENTS = 3, 20
-"""Fewest and most times that a line is refined on the pixels that agree with it. Chosen: a line moves less than a pixel
-after the third; the band widens by a seventh each time, from 3 % of the picture's diagonal to the fifth that it may be
-in 15. With at most half of them wide tubes are seen in part, with twice nothing changes."""
-BAND_GROWTH = 1.05
-"""Growth of that band in one refinement above which another follows. Chosen: between none and the seventh by which it
-widens within a tube. By reasoning: at twice the growth wide tubes are seen in part, at half refinements are spent on
-noise."""
+BAND_GROWTH = 1.05  # Growth of that band in one refinement above which another follows (chosen)
 
 
 @dataclass(frozen=True)
 class Axis:
     """A line in the picture along which a vine grows: `from_px` and `to_px` are (x, y), pixel centres at integers.
-
     `width_px` is the width of what moves along it, NaN where unknown.
     """
 
@@ -80,57 +69,22 @@ class Axis:
         return np.array([-along[1], along[0]])
 
     def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
-        """Return picture coordinates of points given along and across the axis.
-
-        Parameters
-        ----------
-        along_px : distance from `from_px`, any shape, px.
-        across_px : distance beside the axis, px; a number or of a shape that broadcasts.
-
-        Returns
-        -------
-        (x, y), shape (..., 2), px.
-        """
+        """Return picture coordinates of points given along and across the axis. Shape (..., 2)."""
         along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
         start = np.asarray(self.from_px, dtype=float)
         return start + along[..., None] * self.direction + across[..., None] * self.normal
 
     def moved(self, dx_px: float, dy_px: float) -> Axis:
-        """Shift the axis into a picture whose origin is elsewhere.
-
-        Parameters
-        ----------
-        dx_px, dy_px : what is added to both ends, px.
-
-        Returns
-        -------
-        the axis.
-        """
+        """Shift the axis into a picture whose origin is elsewhere."""
         a, b = self.from_px, self.to_px
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-FrontShare = Callable[[Axis], float]
-"""Function from an axis to its share of change that is a front passing once; see `front_share`."""
+FrontShare = Callable[[Axis], float]  # Function from an axis to its share of change that is a front passing once
 
 
 def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
-    """Find the growth axis from the motion.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
-    grows : True for a tube, which stays where it has grown; False for a body, which passes.
-
-    Returns
-    -------
-    the axis, px.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves, or what moves follows no line.
-    """
+    """Find the growth axis from the motion. Shapes: luma (n_frames, height, width)."""
     small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
     if len(small.frames) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
@@ -162,24 +116,9 @@ def _line_of_beginning(small: SmallPictures, whole: _Line, grows: bool) -> _Line
 
 
 def front_share(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
-    """Share of the change along an axis that is one front passing once.
-
-    Only pixels whose change lasts count (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that
-    change count.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
-    axis : in the picture, px.
-
-    Returns
-    -------
-    0 to 1; less than LEAST_FRONT_SHARE where the vine bends or sweeps away.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves along the axis.
+    """Share of the change along an axis that is one front passing once. Only pixels whose change lasts count
+    (`SmallPictures.grown`); if hardly any of it lasts (MIN_GROWN_PART), all that change count. Shapes: luma (n_frames,
+    height, width).
     """
     small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
     scaled = _in_small_pictures(axis, small.factor)
@@ -203,24 +142,10 @@ def _pixels_near(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Float
 
 
 def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
-    """Move and turn a given axis onto the line of what moves within its width, and make it as wide as that.
-
-    The ends keep their places along the axis: only the position across is corrected, by up to half of `given.width_px`
-    and MOST_TURN_DEG. Of several bodies within the width, the one that collects more change and lies nearer is taken.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
-    given : axis in the picture, with the width of the strip to search in, px.
-
-    Returns
-    -------
-    the axis; the given one where no line passes near it.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves within the width.
+    """Move and turn a given axis onto the line of what moves within its width, and make it as wide as that. The ends
+    keep their places along the axis: only the position across is corrected, by up to half of `given.width_px` and
+    MOST_TURN_DEG. Of several bodies within the width, the one that collects more change and lies nearer is taken.
+    Shapes: luma (n_frames, height, width).
     """
     small = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
     scaled, factor = _in_small_pictures(given, small.factor), small.factor
@@ -296,9 +221,8 @@ def _line_through(small: SmallPictures, changed: Pixels, early_first: bool = Fal
 def _line_near(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, given: Axis, half_width: float
 ) -> _Line | None:
-    """Refine the line near a given one along which most change is collected in order; None where there is none.
-
-    All in the small pictures. Lines that leave the middle of the given width count less, down to a half at its border.
+    """Refine the line near a given one along which most change is collected in order; None where there is none. All in
+    the small pictures. Lines that leave the middle of the given width count less, down to a half at its border.
     """
     band = float(np.clip(0.25 * half_width, 2.0, 6.0))
     start = float(np.arctan2(given.direction[1], given.direction[0]))
@@ -350,19 +274,9 @@ def _best_line(
 def pixels_on_front(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
-    """Find the pixels that change when the best monotone path along a line passes them.
-
-    Parameters
-    ----------
-    x, y : places of pixels that change, shape (n_pixels,), px.
-    time, weight : time of change, counted in pictures, and its weight; shape (n_pixels,).
-    n_times : number of pictures.
-    angle, middle : direction of the line, rad, and a point on it, px.
-    band : distance from the line within which pixels count, px.
-
-    Returns
-    -------
-    mask of the pixels on the front, shape (n_pixels,), and the places of all along and across the line, px.
+    """Find the pixels that change when the best monotone path along a line passes them. Returns mask of the pixels on
+    the front, shape (n_pixels,), and the places of all along and across the line, px. Shapes: x, y, time, weight
+    (n_pixels,).
     """
     along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
     across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)

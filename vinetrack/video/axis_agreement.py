@@ -9,40 +9,18 @@ import numpy as np
 
 from vinetrack.core.records import Trial
 
-ASKEW_DEG = 10.0
-"""Angle between a recording's axis and that of most others above which the recording is named. Chosen: axes found from
-the motion err by a degree or two, and a door that swings in front of a tip turns them by 30 or more. At half, axes of
-short growth are named; at twice, one that leads past the tube's far end is not."""
-FEWEST_ALIKE = 3
-"""Fewest recordings whose axes agree from which the others are judged. Chosen: two may agree by chance. By reasoning:
-with two, a pair of wrong ones accuses a right one; with six, small campaigns are never judged."""
+ASKEW_DEG = 10.0  # Angle between a recording's axis and that of most others above which the recording is named (chosen)
+FEWEST_ALIKE = 3  # Fewest recordings whose axes agree from which the others are judged (chosen)
 
 
 def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
-    """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line.
-
-    Parameters
-    ----------
-    from_px, to_px : its ends (x, y), px.
-    bends : whether it is a curve.
-
-    Returns
-    -------
-    degrees.
-    """
+    """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line."""
     return math.nan if bends else math.degrees(math.atan2(to_px[1] - from_px[1], to_px[0] - from_px[0]))
 
 
 def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
-    """Recordings whose axis differs from that of most others, where most agree.
-
-    Parameters
-    ----------
-    slopes_deg : direction of the axis by name of recording, from `slope_deg`.
-
-    Returns
-    -------
-    their names, and how many recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
+    """Recordings whose axis differs from that of most others, where most agree. Returns their names, and how many
+    recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
     """
     straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
     agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
@@ -53,18 +31,8 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
 
 
 def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:
-    """Trials whose axis was found askew to that of most others that grow at the same angle.
-
-    Bodies that fly free and trials with a given axis are not compared.
-
-    Parameters
-    ----------
-    slopes_deg : direction of the axis by name of trial, from `slope_deg`, of those that have one.
-    trials : of the experiment.
-
-    Returns
-    -------
-    names, and how many others agree, for every growth angle at which any is askew.
+    """Trials whose axis was found askew to that of most others that grow at the same angle. Bodies that fly free and
+    trials with a given axis are not compared.
     """
     by_angle: dict[float, dict[str, float]] = {}
     for trial in trials:

@@ -22,17 +22,10 @@ from vinetrack.video.target_corners import (
     markers_seen,
 )
 
-FEWEST_MARKERS = 6
-"""Fewest markers that distinguish a board from chance. Chosen: of OpenCV's families one word in some hundreds is met by
-chance in a cluttered picture; with half, clutter may pass; with twice, a board half hidden is missed."""
-LEAST_AGREEMENT = 0.8
-"""Least share of the markers that must lie where a board has them. Chosen as in `charuco_corners`; at half a wrong
-layout of the same count may pass, twice cannot be."""
-MOST_SQUARES = 40
-"""Most squares along a side. Chosen: boards of more have markers of a few pixels. At half a long ruler of squares is
-missed; twice doubles the search."""
-HIDDEN_MARKERS = 2
-"""Markers at the end of a board that may be hidden. Chosen: one row of a small board."""
+FEWEST_MARKERS = 6  # Fewest markers that distinguish a board from chance (chosen)
+LEAST_AGREEMENT = 0.8  # Least share of the markers that must lie where a board has them (chosen)
+MOST_SQUARES = 40  # Most squares along a side (chosen)
+HIDDEN_MARKERS = 2  # Markers at the end of a board that may be hidden (chosen)
 
 
 @dataclass(frozen=True)
@@ -47,16 +40,7 @@ class BoardSeen:
 
 
 def find_board(picture: NDArray[Any]) -> BoardSeen | None:
-    """Find the printed board in a picture.
-
-    Parameters
-    ----------
-    picture : grey levels, shape (height, width).
-
-    Returns
-    -------
-    BoardSeen; None where there is none.
-    """
+    """Find the printed board in a picture. Shapes: picture (height, width)."""
     grey = eight_bits(picture)
     seen = [(*markers_seen(grey, _largest(family)), family) for family in OTHER_DICTIONARIES]
     corners, ids, family = max(seen, key=lambda markers: len(markers[1]))

@@ -17,57 +17,32 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.strip import Strip
 
-SEARCH_ACROSS_PX = 8
-"""Distance across the axis by which the body may deviate in the search. Chosen: a body that moves 8 px across in a
-frame leaves the strip soon. By reasoning: at half, tumbling bodies are lost; at twice the search takes twice the
-time."""
-SEARCH_ALONG_PX = 14
-"""Distance along the axis searched about the expected place. Chosen: speeds change by less than 14 px a frame between
-frames. By reasoning: at half, sudden stops are lost; at twice, a similar neighbour may be taken."""
-MOST_STEPS = 8
-"""Most Gauss-Newton steps of a registration. Chosen: they converge quadratically from within a pixel; more cost time
-alone."""
+SEARCH_ACROSS_PX = 8  # Distance across the axis by which the body may deviate in the search (chosen)
+SEARCH_ALONG_PX = 14  # Distance along the axis searched about the expected place (chosen)
+MOST_STEPS = 8  # Most Gauss-Newton steps of a registration (chosen)
 
-TEMPLATE_UPDATES = 3
-"""Times that the template is replaced by the median of the patches found. Chosen: each removes most of the noise of the
-one before; more cost time alone."""
+TEMPLATE_UPDATES = 3  # Times that the template is replaced by the median of the patches found (chosen)
 
-MISPLACED_PX = 0.5
-"""Misplacement that the weights of the template allow for. Chosen: the error of a first, coarse place. By reasoning: at
-half, edges of the body count too little; at twice, background beside it counts too much."""
-POOR_MATCH = 0.6
-"""Correlation with the template below which a point is doubtful. Chosen above LOST_MATCH: two thirds of the variance is
-then unexplained (1 − 0.6²). By reasoning: below LOST_MATCH no point is ever doubtful; nearer to 1 every blurred one
-is."""
-LOST_MATCH = 0.4
-"""Correlation below which the patch found is not the body. Chosen: a body cut in half by the picture's edge keeps about
-0.5; at 0.2 textures of the background pass for a body, at 0.6 nothing is ever doubtful."""
-ABSENT_RATIO = 0.7
-"""Ratio of the background's residual to the template's below which the body is absent. Chosen: at 1 noise decides where
-body and background are alike; at half, a body that has left counts until its place is quiet."""
+MISPLACED_PX = 0.5  # Misplacement that the weights of the template allow for (chosen)
+POOR_MATCH = 0.6  # Correlation with the template below which a point is doubtful (chosen)
+LOST_MATCH = 0.4  # Correlation below which the patch found is not the body (chosen)
+ABSENT_RATIO = 0.7  # Ratio of the background's residual to the template's below which the body is absent (chosen)
+# Distance behind its furthest place at which a body has turned back, in px and in standard errors (chosen)
 BACK_PX, BACK_SIGMA = 3.0, 6.0
-"""Distance behind its furthest place at which a body has turned back, in px and in standard errors. Chosen: a
-registration errs by 0.1 px; at twice a bounce goes unnoticed for some frames, at half one bad frame ends the track."""
+# Cost of a step back on the coarse path (chosen)
 BACK_COST_PER_PX = 0.05
-"""Cost of a step back on the coarse path, for each pixel, in units of the score of a frame in which the body is
-visible. Chosen: a bounce of 100 px pays within five frames, a hop back to a hand that let go does not."""
 
+# Roughness, as the standard deviation of single places, in px and in steps of a frame, above which what is followed is
+# not one body; and the fewest fourth differences from which it is estimated (chosen)
 HOP_NOISE_PX, HOP_NOISE_STEPS, FEWEST_DIFFERENCES = 3.0, 0.5, 5
-"""Roughness, as the standard deviation of single places, in px and in steps of a frame, above which what is followed is
-not one body; and the fewest fourth differences from which it is estimated. Chosen: a registration errs by 0.1 px, and
-hops between bodies by their distance. By reasoning: at half, motion that sticks and slips at random is refused; at
-twice, bodies hardly further apart than they are long are followed in turns."""
 
-MARGIN_PX = 2.0
-"""Distance beside the body's width at which a row counts half. Chosen: blur and an axis a little off. By reasoning: at
-half, sides of tumbling bodies are cut off; at twice, a neighbour 10 px beside is part of the body."""
+MARGIN_PX = 2.0  # Distance beside the body's width at which a row counts half (chosen)
 
 
 @dataclass(frozen=True)
 class BodyEnd:
-    """Last frame of a body's motion along the strip, where the recording goes on.
-
-    The body `turns_back` there, or is not seen again.
+    """Last frame of a body's motion along the strip, where the recording goes on. The body `turns_back` there, or is
+    not seen again.
     """
 
     last_frame: int
@@ -76,13 +51,9 @@ class BodyEnd:
 
 @dataclass(frozen=True)
 class BodyFit:
-    """Position of the body along the strip; arrays of shape (n_frames,).
-
-    `position_px` is the column of the template's centre at mid-exposure, `across_px` its place across, `sigma_px` the
-    random error along, `match` the correlation with the template. `unsure` marks frames where that is poor or the body
-    is cut by the strip's end; `unseen` marks frames in which the body is not visible, or that come after the end of its
-    motion along the strip. `end` says how that ended, None where it lasts as long as the recording. `half_px` is half
-    the length of the template.
+    """Position of the body along the strip; arrays of shape (n_frames,). `position_px` is the column of the template's
+    centre at mid-exposure, `across_px` its place across, `sigma_px` the random error along, `match` the correlation
+    with the template.
     """
 
     position_px: Floats
@@ -96,21 +67,7 @@ class BodyFit:
 
 
 def track_body(strip: Strip) -> BodyFit:
-    """Register the moving body of a strip against itself.
-
-    Parameters
-    ----------
-    strip : along the axis, wide enough for the body.
-
-    Returns
-    -------
-    place, error, correlation and flags of every frame.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves along the strip, or several bodies do and none can be told from the others.
-    """
+    """Register the moving body of a strip against itself."""
     from vinetrack.video.frames import RecordingError
 
     pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
@@ -146,18 +103,8 @@ def track_body(strip: Strip) -> BodyFit:
 
 
 def hops_between_bodies(along: Floats, seen: NDArray[np.bool_]) -> bool:
-    """Whether places scatter about any smooth motion by as much as they advance.
-
-    Fourth differences cancel a cubic motion, and have 70 times the variance of single places.
-
-    Parameters
-    ----------
-    along : place along the strip, shape (n_frames,), px.
-    seen : mask of the frames that count, shape (n_frames,).
-
-    Returns
-    -------
-    bool
+    """Whether places scatter about any smooth motion by as much as they advance. Fourth differences cancel a cubic
+    motion, and have 70 times the variance of single places. Shapes: along, seen (n_frames,).
     """
     if len(along) < 5:
         return False
@@ -199,9 +146,8 @@ def _row_weights(rows: int, width_px: float) -> NDArray[np.float32]:
 
 
 def _body_end(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> BodyEnd | None:
-    """Where the body's motion along the strip ends, None where the recording ends first.
-
-    It ends where the body turns back (a bounce), and where it is not recognised again (it tips over, or is gone).
+    """Where the body's motion along the strip ends, None where the recording ends first. It ends where the body turns
+    back (a bounce), and where it is not recognised again (it tips over, or is gone).
     """
     recognised = np.flatnonzero(~unseen & (match >= POOR_MATCH))
     if len(recognised) < 3:
@@ -220,7 +166,6 @@ def _coarse_path(
     pictures: NDArray[np.float32], noise: float, rows: NDArray[np.float32]
 ) -> tuple[Floats, int, NDArray[np.float32]]:
     """Centre of the body by frame, to a few pixels; half its length along the axis; and the background of the strip.
-
     The background is the median over frames spread evenly over the changes, so that a body that rests for long does not
     become part of it.
     """
@@ -331,9 +276,8 @@ def _register(
     picture: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32],
     slope_along: NDArray[np.float32], slope_across: NDArray[np.float32], guess: Floats, half: int,
 ) -> tuple[Floats, float, float]:  # fmt: skip
-    """Gauss-Newton on place, gain and level with Cauchy weights 1/(1 + (r/3s)²).
-
-    Returns the place, its error along the axis and the correlation.
+    """Gauss-Newton on place, gain and level with Cauchy weights 1/(1 + (r/3s)²). Returns the place, its error along the
+    axis and the correlation.
     """
     place = guess.astype(float).copy()
     design = np.stack([slope_along, slope_across, template, np.ones_like(template)]).reshape(4, -1).astype(float)

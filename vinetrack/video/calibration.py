@@ -1,4 +1,5 @@
-"""Calibrate a recording: metres a pixel in the plane of growth, the error of that scale, and the place of each pixel.
+"""Calibrate a recording: metres a pixel in the plane of growth, the error of that scale, and the place of
+each pixel.
 
 `calibrate` reads the settings: a ChArUco board or a checkerboard in a picture, a clip or the recording itself, held in
 the plane in which the vine grows; two points and the distance between them; or the scale itself. The error of the scale
@@ -24,34 +25,19 @@ from vinetrack.video.frames import RecordingError, inspect_recording, iterate_fr
 from vinetrack.video.plane_map import PlaneMap, fit_planes
 from vinetrack.video.target_corners import CornersError, charuco_corners, checkerboard_corners
 
-CLICK_SIGMA_PX = 0.5
-"""Standard error of a point picked by hand in a picture. Chosen: a hand points to about a pixel. At half or twice the
-stated error of such a scale halves or doubles."""
-CORNER_BIAS_PX = 0.02
-"""Bias that the corners at one end of a target may share (uneven light, blur), however many there are. Chosen: a
-fiftieth of a pixel, the size of what light from one side leaves. At half or twice the least error of a scale halves or
-doubles."""
-STATIONARY_PX = 0.5
-"""Motion of the corners over a clip above which the target was moved. Chosen: ten times the noise of a corner, far
-below an intended motion. By reasoning: at half a shaken tripod counts as a moved target; at twice slowly moved targets
-are averaged."""
+CLICK_SIGMA_PX = 0.5  # Standard error of a point picked by hand in a picture
+CORNER_BIAS_PX = 0.02  # Bias that the corners at one end of a target may share (chosen)
+STATIONARY_PX = 0.5  # Motion of the corners over a clip above which the target was moved (chosen)
+# Root mean square distance of the corners from the model above which the board is another one (chosen)
 LARGEST_REPROJECTION_PX = 2.0
-"""Root mean square distance of the corners from the model above which the board is another one. Chosen: a wrong count
-of squares puts corners whole squares away, noise a fraction of a pixel. Half or twice changes only what bent boards
-pass."""
 
-MOST_PICTURES_READ = 10
-"""Most pictures of a clip that are read. Chosen: the error of averaged corners falls with the root of their number, and
-CORNER_BIAS_PX remains; time grows in proportion."""
+MOST_PICTURES_READ = 10  # Most pictures of a clip that are read (chosen)
 
+# First frames of a recording in which a target is looked for, while nothing hides it yet (chosen)
 SEARCHED_FRAMES = 300
-"""First frames of a recording in which a target is looked for, while nothing hides it yet. Chosen: 0.3 s at 1000 frames
-a second; at twice a vine may already stand in front of the target."""
 
 
-CHORD_PX = 4.0
-"""Length of the chords over which a curve is summed in the plane. Derived: a chord of 4 px of a curve of 30 px radius
-is short by 4²/24·30² = 0.07 %, of 100 px by 0.007 %."""
+CHORD_PX = 4.0  # Length of the chords over which a curve is summed in the plane (derived)
 
 
 class CalibrationError(ValueError):
@@ -60,10 +46,9 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class AxisScale:
-    """The calibration along one growth axis.
-
-    `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative standard error (NaN where unknown);
-    `position_m` maps points of the picture (x, y), shape (n, 2), to metres along the axis from its start.
+    """The calibration along one growth axis. `m_per_px` is the mean over the axis, `scale_rel_sigma` its relative
+    standard error (NaN where unknown); `position_m` maps points of the picture (x, y), shape (n, 2), to metres along
+    the axis from its start.
     """
 
     m_per_px: float
@@ -73,13 +58,9 @@ class AxisScale:
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """The result of a calibration.
-
-    `m_per_px` and `scale_rel_sigma` hold across the middle of `covered_px` (left, top, right, bottom: the target's
-    corners, or the whole picture without one), along the picture's longer side; `along` gives them for a growth axis.
-    `reprojection_px` is the root mean square distance of the corners from the fit (NaN without a target); `n_corners`
-    and `n_pictures` are what it rests on; `own_rel_sigma` is an error of scale that the plane's fit does not include;
-    `notes` are sentences for a person.
+    """The result of a calibration. `m_per_px` and `scale_rel_sigma` hold across the middle of `covered_px` (left, top,
+    right, bottom: the target's corners, or the whole picture without one), along the picture's longer side; `along`
+    gives them for a growth axis.
     """
 
     kind: str
@@ -102,30 +83,11 @@ class PlaneCalibration:
         return self.along(*self._middle_line()).scale_rel_sigma
 
     def plane_m(self, picture_px: Floats) -> Floats:
-        """Map points of the picture to the plane of growth.
-
-        Parameters
-        ----------
-        picture_px : (x, y), shape (..., 2), px.
-
-        Returns
-        -------
-        shape (..., 2), m.
-        """
+        """Map points of the picture to the plane of growth. Shapes: picture_px (..., 2) → (..., 2)."""
         return self.plane.plane_m(picture_px)
 
     def along(self, from_px: Sequence[float], to_px: Sequence[float]) -> AxisScale:
-        """Return scale and position along an axis of the picture.
-
-        Parameters
-        ----------
-        from_px, to_px : ends of the axis, (x, y), px.
-
-        Returns
-        -------
-        m/px on average, its relative standard error, and a function from (x, y) in px, shape (n, 2), to m along the
-            axis.
-        """
+        """Return scale and position along an axis of the picture. Shape (n, 2)."""
         start_px, end_px = np.asarray(from_px, dtype=float), np.asarray(to_px, dtype=float)
         start_m, end_m = self.plane.plane_m(np.stack([start_px, end_px]))
         length_m = float(np.linalg.norm(end_m - start_m))
@@ -139,18 +101,7 @@ class PlaneCalibration:
         return AxisScale(m_per_px, rel_sigma, position_m)
 
     def along_path(self, axis: Axis, off_px: float = 0.0) -> AxisScale:
-        """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord.
-
-        Parameters
-        ----------
-        axis : in the picture, px.
-        off_px : standard error of the curve's place across the tube, px: beside a curve that turns by an angle θ the
-            path is longer or shorter by θ · `off_px`.
-
-        Returns
-        -------
-        as `along`; `position_m` takes the nearest place along the curve.
-        """
+        """Return the scale along an axis that may be a curve: of the arc length in the plane, not of its chord."""
         if not isinstance(axis, CurvedAxis):
             return self.along(axis.from_px, axis.to_px)
         along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / CHORD_PX) + 2)
@@ -173,23 +124,7 @@ class PlaneCalibration:
 
 
 def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int) -> PlaneCalibration:
-    """Calibrate recordings of `width_px` × `height_px` as the experiment's settings say.
-
-    Parameters
-    ----------
-    settings : the `calibration` of `experiment.yaml`.
-    folder : the experiment's folder, to which `image` is relative.
-    width_px, height_px : size of the recordings; pictures of a target must have it too.
-
-    Returns
-    -------
-    the calibration.
-
-    Raises
-    ------
-    CalibrationError
-        In one sentence, where the target cannot be read or contradicts the settings.
-    """
+    """Calibrate recordings of `width_px` × `height_px` as the experiment's settings say."""
     if isinstance(settings, MmPerPx):
         plane = PlaneMap.from_scale(settings.mm_per_px / 1000, width_px, height_px)
         note = "the scale is the one given as mm_per_px; nothing is known of its error, nor of distortion and tilt"
@@ -208,24 +143,9 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 
 
 def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checkerboard) -> PlaneCalibration:
-    """Calibrate from pictures of a target, grey levels of shape (height, width) each.
-
-    The corners of a stationary target are averaged. Of a target that is moved every picture gets its own plane but all
-    share the lens, and the first readable one shows the plane of growth.
-
-    Parameters
-    ----------
-    pictures : grey levels, shape (height, width) each, all of one size.
-    board : what the target is.
-
-    Returns
-    -------
-    the calibration.
-
-    Raises
-    ------
-    CalibrationError
-        In one sentence, where no picture can be used.
+    """Calibrate from pictures of a target, grey levels of shape (height, width) each. The corners of a stationary
+    target are averaged. Of a target that is moved every picture gets its own plane but all share the lens, and the
+    first readable one shows the plane of growth. Shapes: pictures (height, width).
     """
     views, complaints = [], []
     read = charuco_corners if isinstance(board, Charuco) else checkerboard_corners
@@ -264,13 +184,7 @@ def _whole_picture(plane: PlaneMap) -> tuple[float, float, float, float]:
 
 
 def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
-    """Up to MOST_PICTURES_READ grey pictures, spread over the first SEARCHED_FRAMES frames of a recording.
-
-    Raises
-    ------
-    CalibrationError
-        In one sentence, where nothing can be read.
-    """
+    """Up to MOST_PICTURES_READ grey pictures, spread over the first SEARCHED_FRAMES frames of a recording."""
     try:
         recording = inspect_recording(path)
         declared = recording.declared_frames or SEARCHED_FRAMES

@@ -21,14 +21,12 @@ from vinetrack.video.capture_clock import SAME_RATE
 from vinetrack.video.frames import Recording, RecordingError
 from vinetrack.video.raw_frames import RawFrames
 
+# Offsets in the settings of a cine, bytes from their beginning
 MARK_AT, RATE_AT, SHUTTER_US_AT, COLOUR_FILTER_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 768, 772, 808, 896, 1568
-"""Offsets in the settings of a cine, bytes from their beginning: the mark ST and behind it their length, frames a
-second, exposure in µs, code of the colour filter, bits of a pixel, exposure in ns. Source: vendor's document, as pycine
-0.3.2 has it; newer versions extend the settings only at their end."""
 
-SETUP_BYTES = SHUTTER_NS_AT + 4
-"""Bytes of the settings that are read. Derived: the last of those offsets and its four bytes."""
+SETUP_BYTES = SHUTTER_NS_AT + 4  # Bytes of the settings that are read (derived)
 
+# XML path in a `.cihx` of each line of a `.cih`
 CIHX_PLACES = {
     "Record Rate(fps)": "recordInfo/recordRate",
     "Shutter Speed(s)": "recordInfo/shutterSpeed",
@@ -40,46 +38,23 @@ CIHX_PLACES = {
     "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
     "File Format": "imageFileInfo/fileFormat",
 }
-"""XML path in a `.cihx` of each line of a `.cih`. Source: files of Photron, as pyMRAW 0.33 reads them."""
 
 SIDE_FILES = (".cih", ".cihx")
-LONGEST_SIDE_FILE = 4_000_000
-"""Most bytes of a side file that are read. Chosen: those of Photron are some ten thousand, with a preview a million; at
-half or twice nothing changes."""
+LONGEST_SIDE_FILE = 4_000_000  # Most bytes of a side file that are read (chosen)
 
-PACKED_BITS = {0: None, 256: 10, 1024: 12}
-"""Bits of a packed pixel by `biCompression` of a cine; None: pixels fill whole bytes. Source: vendor's document."""
+PACKED_BITS = {0: None, 256: 10, 1024: 12}  # Bits of a packed pixel by `biCompression` of a cine
 
-BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})
-"""Codes of colour filters of 2 by 2 pixels in a cine. Source: vendor's document."""
+BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})  # Codes of colour filters of 2 by 2 pixels in a cine
 
-EXPOSURE_TOLERANCE = 0.01
-"""Relative difference within which the exposures of frames count as one. Chosen; at half or twice only automatic
-exposure is reported."""
+EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
 
-IMAGE_TIMES, IMAGE_EXPOSURES = 1002, 1003
-"""Types of the tagged blocks of a cine. Source: vendor's document."""
+IMAGE_TIMES, IMAGE_EXPOSURES = 1002, 1003  # Types of the tagged blocks of a cine
 
-FRACTION_S = 2.0**-32
-"""Unit of times and exposures in a cine. Defined by the vendor's document: 32.32 fixed point."""
+FRACTION_S = 2.0**-32  # Unit of times and exposures in a cine (defined)
 
 
 def inspect_cine(path: Path) -> Recording:
-    """Read the header of a Phantom `.cine`.
-
-    Parameters
-    ----------
-    path : of the file.
-
-    Returns
-    -------
-    its size, depth, rate and exposure of capture, and where its frames lie.
-
-    Raises
-    ------
-    RecordingError
-        Where it is damaged, or of a kind that is not read.
-    """
+    """Read the header of a Phantom `.cine`."""
     name = path.name
     try:
         size = file_size(path)
@@ -208,21 +183,7 @@ def _cine_clock(
 
 
 def inspect_mraw(path: Path) -> Recording:
-    """Read the side file of a Photron `.mraw`.
-
-    Parameters
-    ----------
-    path : of the `.mraw`, or of its `.cih` or `.cihx`.
-
-    Returns
-    -------
-    its size, depth, rate and exposure of capture, and where its frames lie.
-
-    Raises
-    ------
-    RecordingError
-        Where one of the two files is missing, or of a kind that is not read.
-    """
+    """Read the side file of a Photron `.mraw`."""
     data = next((at for at in _siblings(path, (".mraw",))), None)
     side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
     if side is None:
@@ -267,21 +228,7 @@ class SideFile:
 
 
 def read_side_file(path: Path) -> SideFile:
-    """Read a Photron `.cih` or `.cihx`.
-
-    Parameters
-    ----------
-    path : of the side file.
-
-    Returns
-    -------
-    its content.
-
-    Raises
-    ------
-    RecordingError
-        Where it cannot be read.
-    """
+    """Read a Photron `.cih` or `.cihx`."""
     name = path.name
     try:
         file_size(path)  # refuses a pipe, on which reading would wait
@@ -311,19 +258,7 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count: int) -> SideFile | None:
-    """Find and read the side file of a TIFF stack or of a folder of pictures.
-
-    Parameters
-    ----------
-    pictures : the stack, or the folder.
-    file_format : of the pictures, such as `tiff`.
-    size : width and height, px.
-    count : pictures.
-
-    Returns
-    -------
-    its content; None where there is none, several, or one that describes other pictures.
-    """
+    """Find and read the side file of a TIFF stack or of a folder of pictures."""
     if pictures.is_dir():
         side_files = [at for at in sorted(pictures.iterdir()) if at.suffix.lower() in SIDE_FILES]
     else:

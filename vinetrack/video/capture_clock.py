@@ -7,34 +7,13 @@ import numpy as np
 from vinetrack.core.records import Trial
 from vinetrack.video.frames import Recording, RecordingError
 
-SAME_RATE = 0.005
-"""Relative difference within which two rates are the same. Derived: 29.97 and 30 frames a second differ by 0.1 %,
-23.976 and 24 likewise; a rate of capture that is no playback rate but within 0.5 % of one is 30.1 for 30, which no
-camera offers."""
+SAME_RATE = 0.005  # Relative difference within which two rates are the same (derived)
 
-SAME_EXPOSURE = 0.02
-"""Relative difference within which exposures of sheet and recording are the same. Chosen: cameras round to a
-microsecond of 50, sheets to two digits. By reasoning: at half some rounded ones are refused; at twice one of 96 µs for
-100 passes, which moves no position."""
+SAME_EXPOSURE = 0.02  # Relative difference within which exposures of sheet and recording are the same (chosen)
 
 
 def capture_rate(trial: Trial, recording: Recording) -> float:
-    """Return the capture rate: the recording's where it states one, else the sheet's.
-
-    Parameters
-    ----------
-    trial : its `capture_fps` is that of the sheet, NaN where blank.
-    recording : from `inspect_recording`.
-
-    Returns
-    -------
-    frames a second.
-
-    Raises
-    ------
-    RecordingError
-        Where there is none, where sheet and recording differ, and where it is the file's rate of playback.
-    """
+    """Return the capture rate: the recording's where it states one, else the sheet's."""
     true_fps, stated = recording.capture_fps, trial.capture_fps
     if true_fps is not None:
         if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
@@ -55,22 +34,7 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
 
 
 def capture_exposure(trial: Trial, recording: Recording) -> float:
-    """Return the exposure of a frame: the recording's where it states one, else the sheet's.
-
-    Parameters
-    ----------
-    trial : its `exposure_s` is that of the sheet, NaN where blank.
-    recording : from `inspect_recording`.
-
-    Returns
-    -------
-    s; NaN where neither knows it.
-
-    Raises
-    ------
-    RecordingError
-        Where both do and differ.
-    """
+    """Return the exposure of a frame: the recording's where it states one, else the sheet's."""
     true_s, stated_s = recording.exposure_s, trial.exposure_s
     if true_s is None:
         return stated_s

@@ -20,46 +20,19 @@ from vinetrack.video.curved_strip import front_share_on_curve
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
+# Ratio of the front share of a curve to that of the straight line from which the curve is used (measured)
 CURVE_GAIN = 1.35
-"""Ratio of the front share of a curve to that of the straight line from which the curve is used. Measured on the clips
-below: 1.7 to 1.8 along a sharp bend, 1.2 to 1.7 along a quarter of a circle (BAND_RATIO takes those below), at most
-1.04 along straight vines with doors and payloads. By reasoning: at 1.1 straight vines with longer doors are taken for
-bent, at 2 a bend half-way is missed."""
+# A curve is also used where the straight line needs a band this many times wider and the curve explains at least
+# EQUAL_SHARE of what the line does (measured)
 BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
-"""A curve is also used where the straight line needs a band this many times wider and the curve explains at least
-EQUAL_SHARE of what the line does. Measured, clips of seeds 3 and 4 (straight) and 1 to 4 (bent) of
-`benchmarks/tracking_accuracy.py`: ratios of 1.29 to 1.37 along bends of 25 degrees, 2 and more along an S, and the
-curve explains at least 0.999 of what the line does; at most 1.11 along straight vines, except where the contrast
-reverses (1.20, and a share of 0.97). At 1.1 some straight vines would be taken for bent, at 1.5 bends for straight;
-with half of the 0.02 that EQUAL_SHARE leaves the same curves are used, with twice it a reversal of contrast comes
-near."""
-LEAST_LENGTH = 3.0
-"""Least length of the band, in its widths, that has a path. Chosen: a shorter one is a blot; half or twice changes only
-vines that have hardly grown."""
-CENTRING_POWER = 3.0
-"""How strongly the path through the band keeps to its middle: a step costs 1 / depth³. Chosen: at half the path cuts
-the inner side of bends, at twice nothing changes."""
-KNOT_WIDTHS = 1.5
-"""Distance of the curve's knots in widths of the band. Chosen: shorter waves of its middle are noise of its sides; at
-half they pass, at twice sharp bends are cut."""
+LEAST_LENGTH = 3.0  # Least length of the band, in its widths, that has a path (chosen)
+CENTRING_POWER = 3.0  # How strongly the path through the band keeps to its middle: a step costs 1 / depth³ (chosen)
+KNOT_WIDTHS = 1.5  # Distance of the curve's knots in widths of the band (chosen)
 
 
 def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
     """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change.
-
-    Parameters
-    ----------
-    small : the pictures, shrunk.
-    luma : grey levels, shape (n_frames, height, width).
-
-    Returns
-    -------
-    the axis, px.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves, or what moves follows neither line nor curve.
+    Shapes: luma (n_frames, height, width).
     """
     try:
         straight: Axis | None = find_axis(small)
@@ -84,17 +57,7 @@ def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
 
 
 def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
-    """Share of all growth in the picture that is a front passing once along an axis, straight or curved.
-
-    Parameters
-    ----------
-    small : the small pictures.
-    axis : in the picture, with its width, px.
-
-    Returns
-    -------
-    0 to 1.
-    """
+    """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
     x, y, time, weight, n_times = small.grown
     if len(x) < 12:
         return 0.0
@@ -112,17 +75,7 @@ def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
 
 
 def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | None:
-    """Find the smoothed middle of the band that changed, from its first change to its last.
-
-    Parameters
-    ----------
-    small : the pictures, shrunk.
-    band : what changed in them, where that is already known.
-
-    Returns
-    -------
-    the curve with the band's width, px; None where no band is long enough.
-    """
+    """Find the smoothed middle of the band that changed, from its first change to its last."""
     band = band or _changed_band(small)
     path = None if band is None else _centreline(band)
     if band is None or path is None or len(path) < LEAST_LENGTH * band.width:
@@ -143,10 +96,9 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
 
 @dataclass(frozen=True)
 class Band:
-    """What changed in the small pictures, in their pixels; arrays of shape (height, width).
-
-    `region` is its largest connected part, `depth` the distance from the border of that, `when` the time of change, NaN
-    where nothing changed; `width` is the width along most of its length.
+    """What changed in the small pictures, in their pixels; arrays of shape (height, width). `region` is its largest
+    connected part, `depth` the distance from the border of that, `when` the time of change, NaN where nothing changed;
+    `width` is the width along most of its length.
     """
 
     region: NDArray[np.bool_]
@@ -218,10 +170,9 @@ def _in_order_of_time(path: Floats, band: Band) -> Floats:
 
 
 def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
-    """Knots `spacing` from each other of a penalised spline through a path of whole pixels, shape (n, 2), n ≥ 4.
-
-    The ends of the path run into the corners of the band: half a knot distance at each is left out. None where fewer
-    than five pixels remain between them, the fewest that a cubic spline goes through.
+    """Knots `spacing` from each other of a penalised spline through a path of whole pixels, shape (n, 2), n ≥ 4. The
+    ends of the path run into the corners of the band: half a knot distance at each is left out. None where fewer than
+    five pixels remain between them, the fewest that a cubic spline goes through.
     """
     from scipy.interpolate import make_smoothing_spline
 

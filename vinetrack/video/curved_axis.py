@@ -24,18 +24,13 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float]
 
-SAMPLES_PER_PX = 8
-"""Samples per pixel over which the arc length is summed. Derived: a chord of 1/8 px is shorter than its arc by less
-than (1/8)²/24R², 1e-6 of it for radii above 30 px."""
-LARGEST_HALF_PER_RADIUS = 0.9
-"""Largest half width of a strip, as a part of the least radius. Derived: at 1 its normals cross; at 0.9 a pixel at the
-inner side covers a tenth of one on the axis. Half refuses sound curves."""
+SAMPLES_PER_PX = 8  # Samples per pixel over which the arc length is summed (derived)
+LARGEST_HALF_PER_RADIUS = 0.9  # Largest half width of a strip, as a part of the least radius (derived)
 
 
 @dataclass(frozen=True)
 class CurvedAxis(Axis):
     """A curve in the picture along which a vine grows, from `from_px` through `via_px` to `to_px`: (x, y), px.
-
     `direction` and `normal` are those of its chord; `points` follows the curve.
     """
 
@@ -111,32 +106,13 @@ class CurvedAxis(Axis):
         return float(np.abs(np.diff(self._angles_rad)).sum())
 
     def direction_at(self, along_px: Floats) -> Floats:
-        """Unit vectors of growth at places along the curve.
-
-        Parameters
-        ----------
-        along_px : arc length from `from_px`, any shape, px.
-
-        Returns
-        -------
-        (x, y), shape (..., 2).
-        """
+        """Unit vectors of growth at places along the curve. Shape (..., 2)."""
         spline, parameter, arc = self._table
         slope = spline(np.interp(np.asarray(along_px, float), arc, parameter), 1)
         return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))
 
     def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
-        """Return picture coordinates of points given along the curve and across it, on its normal.
-
-        Parameters
-        ----------
-        along_px : arc length from `from_px`, any shape, px; beyond the ends straight on.
-        across_px : distance beside the curve, px; a number or of a shape that broadcasts.
-
-        Returns
-        -------
-        (x, y), shape (..., 2), px.
-        """
+        """Return picture coordinates of points given along the curve and across it, on its normal. Shape (..., 2)."""
         along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
         spline, parameter, arc = self._table
         unit = self.direction_at(along)
@@ -146,15 +122,8 @@ class CurvedAxis(Axis):
         return np.asarray(on_curve + past_end[..., None] * unit + across[..., None] * normal)
 
     def nearest_px(self, picture_px: Floats) -> Floats:
-        """Find the arc length of the places on the curve nearest to points of the picture.
-
-        Parameters
-        ----------
-        picture_px : (x, y), shape (n, 2), px.
-
-        Returns
-        -------
-        shape (n,), px; beyond an end where the nearest place is that end.
+        """Find the arc length of the places on the curve nearest to points of the picture. Shapes: picture_px (n, 2) →
+        (n,).
         """
         from scipy.spatial import KDTree
 
@@ -167,15 +136,8 @@ class CurvedAxis(Axis):
         return np.asarray(along + np.sum(offset * self.direction_at(along), axis=-1))
 
     def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
-        """Find where points of the picture lie along and across the curve, by their nearest place on it.
-
-        Parameters
-        ----------
-        picture_px : (x, y), shape (n, 2), px.
-
-        Returns
-        -------
-        arc length from `from_px` and distance on the normal, shape (n,) each, px.
+        """Find where points of the picture lie along and across the curve, by their nearest place on it. Returns arc
+        length from `from_px` and distance on the normal, shape (n,) each, px. Shapes: picture_px (n, 2).
         """
         points = np.asarray(picture_px, dtype=float)
         along = self.nearest_px(points)
@@ -183,37 +145,13 @@ class CurvedAxis(Axis):
         return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
 
     def moved(self, dx_px: float, dy_px: float) -> CurvedAxis:
-        """Shift the curve into a picture whose origin is elsewhere.
-
-        Parameters
-        ----------
-        dx_px, dy_px : what is added to all its points, px.
-
-        Returns
-        -------
-        the curve.
-        """
+        """Shift the curve into a picture whose origin is elsewhere."""
         through = [(x + dx_px, y + dy_px) for x, y in self.through_px]
         return CurvedAxis(through[0], through[-1], self.width_px, tuple(through[1:-1]))
 
 
 def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
-    """Lay the growth axis through points: a straight line through two, a smooth curve through more.
-
-    Parameters
-    ----------
-    through_px : (x, y) in order of growth, px.
-    width_px : of what moves along it, NaN where unknown.
-
-    Returns
-    -------
-    the axis.
-
-    Raises
-    ------
-    RecordingError
-        Where the points give no axis.
-    """
+    """Lay the growth axis through points: a straight line through two, a smooth curve through more."""
     points = [(float(x), float(y)) for x, y in through_px]
     if len(points) == 2:
         return Axis(points[0], points[1], width_px)
@@ -221,28 +159,12 @@ def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float
 
 
 def length_along(path: Floats) -> Floats:
-    """Cumulative length along a path from its first point.
-
-    Parameters
-    ----------
-    path : places, shape (n, 2).
-
-    Returns
-    -------
-    shape (n,), in the unit of the places.
-    """
+    """Cumulative length along a path from its first point. Shapes: path (n, 2) → (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def axis_entry(axis: Axis) -> dict[str, Any]:
-    """Convert an axis to a JSON mapping, without its width: `from_px`, `to_px`, and of a curve `via_px`.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
+    """Convert an axis to a JSON mapping, without its width: `from_px`, `to_px`, and of a curve `via_px`. Returns
     mapping of JSON types.
     """
     entry: dict[str, Any] = {"from_px": axis.from_px, "to_px": axis.to_px}
@@ -250,16 +172,7 @@ def axis_entry(axis: Axis) -> dict[str, Any]:
 
 
 def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
-    """Read an axis that `axis_entry` wrote.
-
-    Parameters
-    ----------
-    entry : `from_px`, `to_px`, of a curve `via_px`, and `width_px` where it is known.
-
-    Returns
-    -------
-    the axis, px.
-    """
+    """Read an axis that `axis_entry` wrote."""
     width = entry.get("width_px")
     through = (entry["from_px"], *entry.get("via_px", ()), entry["to_px"])
     return axis_through(through, float("nan") if width is None else float(width))
@@ -267,16 +180,7 @@ def axis_from_entry(entry: Mapping[str, Any]) -> Axis:
 
 def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
     """Say why a curve cannot be used in a picture, and the remedy; None where it can, or where it is a straight line.
-
-    Parameters
-    ----------
-    axis : in the picture, px.
-    half_px : half the width of what moves along it, px; NaN where unknown.
-    size_px : width and height of the picture.
-
-    Returns
-    -------
-    the end of a sentence that begins with "the axis", and the remedy; or None.
+    Returns the end of a sentence that begins with "the axis", and the remedy; or None.
     """
     if not isinstance(axis, CurvedAxis):
         return None

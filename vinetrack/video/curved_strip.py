@@ -25,25 +25,11 @@ from vinetrack.video.strip import BAND_GAP_PX, BAND_HEIGHT_PX, Strip, cut_strip
 if TYPE_CHECKING:
     from vinetrack.video.edge import Outline
 
-KNOT_PX = 40.0
-"""Distance of the knots of a curve that is moved onto the middle of a tube. Chosen: a tube bends over several of its
-widths, and its sides are found in stretches of 12 px at least. At half, noise of the sides makes the curve wavy and too
-long; at twice, bends of 100 px radius are cut short by their sagitta of 8 px."""
-STRETCH_PX = 30.0
-"""Length of the stretches in which the tube's middle is found along a curve. Chosen a little shorter than KNOT_PX; half
-or twice hardly matters, since a smooth curve is laid through them."""
-AVERAGING_STRETCHES = 1.0
-"""Standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged. Measured on bends of 90
-to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, since sharp bends are cut. Half was not tried."""
-CENTRED_PX = 0.3
-"""Largest distance from the tube's middle at which a curve is left unchanged. Measured on drawn curves, seeds 1 to 4 of
-`bent` of `benchmarks/tracking_accuracy.py`, with twice the rounds of a straight strip: SD of 0.13 px at sharp bends and
-0.09 along an S; 0.24 and 0.13 at 0.8 px and as many rounds as a straight strip. Half was not tried."""
-SLOW_PX_PER_RAD = 0.04
-"""Slow error of a position along a curve, for each radian by which the curve turns: beside the tube's middle the path
-is a little longer or shorter. Measured on clips 1 and 2 of `bent` of `benchmarks/tracking_accuracy.py`: with 0.06
-errors beyond the noise were 0.56 times what was stated along drawn curves and 0.78 times along found ones. At half or
-twice the slow error of curves halves or doubles."""
+KNOT_PX = 40.0  # Distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
+AVERAGING_STRETCHES = 1.0  # Standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
+CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
+SLOW_PX_PER_RAD = 0.04  # Slow error of a position along a curve, for each radian by which the curve turns (measured)
 
 
 @dataclass(frozen=True)
@@ -57,19 +43,8 @@ class StraightenedPictures:
 def straightened(
     luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None
 ) -> StraightenedPictures:
-    """Straighten pictures along a curve by bicubic interpolation.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    half_px : rows wanted on either side, px; more are taken, for the still background beside a strip, where the picture
-        and the curve's radius leave room for them.
-    shake_px : how far each picture moved right and down, which is undone; shape (n_frames, 2), px.
-
-    Returns
-    -------
-    pictures and the axis in them.
+    """Straighten pictures along a curve by bicubic interpolation. Shapes: luma (n_frames, height, width); shake_px
+    (n_frames, 2).
     """
     import cv2
 
@@ -86,18 +61,8 @@ def straightened(
 
 
 def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
-    """Cut, level and stabilise the strip about an axis, straight or curved; see `strip.cut_strip`.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    half_px : half the height of the strip, px; along a curve no more than its normals allow.
-    before : a strip along a neighbouring curve, whose camera shake is used again.
-
-    Returns
-    -------
-    the strip; its `shift_px` is along and across a straight axis, right and down beside a curve.
+    """Cut, level and stabilise the strip about an axis, straight or curved; see `strip.cut_strip`. Shapes: luma
+    (n_frames, height, width).
     """
     if not isinstance(axis, CurvedAxis):
         return cut_strip(luma, axis, half_px)
@@ -109,30 +74,12 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
 
 
 def path_error_px(axis: Axis) -> float:
-    """Return the slow error of positions along an axis that comes from its curvature.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
-    px; 0 along a straight line.
-    """
+    """Return the slow error of positions along an axis that comes from its curvature."""
     return SLOW_PX_PER_RAD * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
 
 
 def curve_note(axis: CurvedAxis) -> str:
-    """Say that the growth axis was found to be a curve.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
-    sentence, without an end.
-    """
+    """Say that the growth axis was found to be a curve."""
     return (
         f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
         " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
@@ -140,16 +87,8 @@ def curve_note(axis: CurvedAxis) -> str:
 
 
 def shake_along(strip: Strip, edge_px: Floats) -> Floats:
-    """Return how far a shaken camera moved each picture along the axis, at the edge.
-
-    Parameters
-    ----------
-    strip : stabilised.
-    edge_px : along its axis, shape (n_frames,), px; NaN where unknown.
-
-    Returns
-    -------
-    shape (n_frames,), px.
+    """Return how far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →
+    (n_frames,).
     """
     if not isinstance(strip.axis, CurvedAxis):
         return strip.shift_px[:, 0]
@@ -158,86 +97,35 @@ def shake_along(strip: Strip, edge_px: Floats) -> Floats:
 
 
 def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
-    """Share of the change along a curve that is one front passing once; see `axis.front_share`.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, with its width, px.
-
-    Returns
-    -------
-    0 to 1; small where what moves leaves the curve.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves along the curve.
+    """Share of the change along a curve that is one front passing once; see `axis.front_share`. Shapes: luma (n_frames,
+    height, width).
     """
     straight = straightened(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
     return front_share(SmallPictures(straight.luma), straight.axis)
 
 
 def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare:
-    """Return the function from an axis to its front share, for straight and curved axes.
-
-    Parameters
-    ----------
-    small : the small pictures made from `luma`, for straight axes.
-    luma : grey levels, shape (n_frames, height, width), for curved ones.
-
-    Returns
-    -------
-    function from an axis to its share, 0 to 1; see `axis.front_share`.
+    """Return the function from an axis to its front share, for straight and curved axes. Shapes: luma (n_frames,
+    height, width).
     """
     return lambda axis: front_share_on_curve(luma, axis) if isinstance(axis, CurvedAxis) else front_share(small, axis)
 
 
 def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
-    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide.
-
-    Parameters
-    ----------
-    axis : in the picture, px.
-    half_px : half the width of what moves along it, px; NaN where unknown.
-    shape : height and width of the picture.
-
-    Raises
-    ------
-    RecordingError
-        In one sentence.
-    """
+    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
     complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
     if complaint is not None:
         raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
 
 
 def outline_stretches(axis: Axis) -> int:
-    """Number of stretches in which the sides of a tube are found.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
-    12 along a straight line, at least as many along a curve.
-    """
+    """Number of stretches in which the sides of a tube are found."""
     return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
 
 
 def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
-    """Move a curve onto the middle of the tube, and measure how far that lies from it.
-
-    Parameters
-    ----------
-    axis : the curve along which the tube's sides were found.
-    sides : of the tube in the strip along it.
-
-    Returns
-    -------
-    curve, with the tube's width; the given one where the tube's middle makes none that a strip can be cut along.
-    distance : greatest distance between the two, px.
+    """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns curve, with the tube's
+    width; the given one where the tube's middle makes none that a strip can be cut along., distance.
     """
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
     offsets = _local_lines(sides.places_px, sides.middles_px, knots)

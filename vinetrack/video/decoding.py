@@ -22,35 +22,26 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     import av
 
+# FFmpeg decoders that report damaged frames in their log at best, but do not mark them
 NON_MARKING_DECODERS = frozenset(
     {"ffv1", "mjpeg", "prores", "huffyuv", "ffvhuff", "utvideo", "dnxhd", "png", "jpeg2000"}
     | {"hevc", "vp8", "vp9", "libdav1d", "av1"}
 )
-"""FFmpeg decoders that report damaged frames in their log at best, but do not mark them, since they do not conceal
-errors. Decoders that do mark frames (H.264, MPEG-4) also report harmless faults."""
 
-PREDICTED_BOTH_WAYS = 3
-"""Code of a B frame. Defined by FFmpeg (AV_PICTURE_TYPE_B)."""
+PREDICTED_BOTH_WAYS = 3  # Code of a B frame (defined)
 
-MEMORY_PART = 0.4
-"""Fraction of the machine's memory that the pictures of one recording may take. Derived: strips cut from them take as
-much again at most, and a fifth is left for everything else."""
+MEMORY_PART = 0.4  # Fraction of the machine's memory that the pictures of one recording may take (derived)
 
-INITIAL_FRAMES = 256
-"""Frames for which memory is reserved if a film does not declare their number; the buffer grows by half when full.
-Chosen; at half or twice the frames are copied once more or once less."""
+INITIAL_FRAMES = 256  # Frames for which memory is reserved if a film does not declare their number (chosen)
 
-HALF_TICK = 0.5
-"""Half a tick of a film's time base; times are whole ticks. Derived."""
+HALF_TICK = 0.5  # Half a tick of a film's time base; times are whole ticks (derived)
 
 
 @dataclass
 class Decoded:
-    """Decoded frames in display order, with their times (NaN where unknown) and types.
-
-    `pictures` has shape (n_frames, height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key
-    frames, `between` B frames, which are coded from later frames too. `messages` are the decoder's messages,
-    `decoder` its name.
+    """Decoded frames in display order, with their times (NaN where unknown) and types. `pictures` has shape (n_frames,
+    height, width). `corrupt` marks frames that the decoder calls corrupt, `key` key frames, `between` B frames, which
+    are coded from later frames too.
     """
 
     pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
@@ -70,27 +61,8 @@ def decode_container(
     expected: int | None = None,
     between_s: tuple[float, float] | None = None,
 ) -> Decoded:
-    """Decode every frame; a packet that cannot be decoded costs only its own frame.
-
-    Pictures are written straight into one array, so that they are held in memory once.
-
-    Parameters
-    ----------
-    path : path of a film.
-    shape : required height and width of the frames, px; decoding ends at the first frame of another size.
-    picture_of : returns the picture to keep of a frame.
-    threads : number of decoder threads.
-    expected : number of frames that the file declares; None if it does not.
-    between_s : times of the first and last frame to decode, s; None for all.
-
-    Returns
-    -------
-    frames and messages.
-
-    Raises
-    ------
-    MemoryError
-        If the pictures take more than MEMORY_PART of the machine's memory.
+    """Decode every frame; a packet that cannot be decoded costs only its own frame. Pictures are written straight into
+    one array, so that they are held in memory once.
     """
     import av
 
@@ -135,20 +107,9 @@ def decode_container(
 
 
 def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
-    """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,).
-
-    A decoder marks only the frame in which it met the fault. The frames after it are coded as differences from it and
-    are equally wrong, without a message, until the next key frame. So are frames that follow one the decoder gave up,
-    and B frames displayed before a corrupt frame but coded from it.
-
-    Parameters
-    ----------
-    decoded : from `decode_container`.
-    slot : capture period of every frame, shape (n_frames,).
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Mark frames that are corrupt or coded from corrupt frames, shape (n_frames,). A decoder marks only the frame in
+    which it met the fault. The frames after it are coded as differences from it and are equally wrong, without a
+    message, until the next key frame. Shapes: slot (n_frames,) → (n_frames,).
     """
     damaged = np.array(decoded.corrupt, dtype=bool)
     if decoded.messages:
@@ -174,9 +135,8 @@ def _enlarged(
 
 @dataclass(frozen=True)
 class PacketIndex:
-    """All frames of a film in display order, shapes (n_frames,).
-
-    `pts` is the presentation time in units of `base_s`, `key` marks key frames, `size_bytes` is the size of the packet.
+    """All frames of a film in display order, shapes (n_frames,). `pts` is the presentation time in units of `base_s`,
+    `key` marks key frames, `size_bytes` is the size of the packet.
     """
 
     pts: NDArray[np.int64]
@@ -191,16 +151,7 @@ class PacketIndex:
 
 
 def packet_index(path: Path) -> PacketIndex | None:
-    """List the frames of a film without decoding them.
-
-    Parameters
-    ----------
-    path : path of a film.
-
-    Returns
-    -------
-    index; None if packets have no times or repeated ones.
-    """
+    """List the frames of a film without decoding them."""
     import av
 
     pts, key, size = [], [], []
@@ -223,18 +174,7 @@ def packet_index(path: Path) -> PacketIndex | None:
 
 
 def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:
-    """Decode selected packets of a film.
-
-    Parameters
-    ----------
-    path : path of a film.
-    chosen : presentation times of the packets to decode, which must be key frames; None for all.
-    threads : number of decoder threads.
-
-    Yields
-    ------
-    frames, those that cannot be decoded left out.
-    """
+    """Decode selected packets of a film."""
     with quiet_log() as messages, open_film(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -246,18 +186,9 @@ def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> I
 
 @contextlib.contextmanager
 def open_film(path: Path) -> Iterator[av.container.InputContainer]:
-    """Open a film for decoding; its decoder is flushed before it is closed.
-
-    Freeing a decoder waits for its threads while holding Python's lock. A thread that has just met a fault waits for
-    that lock to log its message, and both wait for ever. A flush waits as well, but releases the lock.
-
-    Parameters
-    ----------
-    path : path of a film.
-
-    Yields
-    ------
-    container
+    """Open a film for decoding; its decoder is flushed before it is closed. Freeing a decoder waits for its threads
+    while holding Python's lock. A thread that has just met a fault waits for that lock to log its message, and both
+    wait for ever. A flush waits as well, but releases the lock.
     """
     import av
 
@@ -291,9 +222,8 @@ def _frames_of(packets: Iterator[av.Packet[Any]], messages: list[str]) -> Iterat
 
 
 def _times_of_faulty_packets(path: Path) -> set[float]:
-    """Return the times of the packets about which the decoder logs an error.
-
-    The film is decoded once more, with one thread, so that each message can be assigned to its packet.
+    """Return the times of the packets about which the decoder logs an error. The film is decoded once more, with one
+    thread, so that each message can be assigned to its packet.
     """
     import av
     import av.logging

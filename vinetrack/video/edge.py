@@ -47,60 +47,34 @@ from vinetrack.video.tip_shape import (
     seen_exposure,
 )
 
-START_ERROR_PX = 0.08
-"""Extra error near the start, where the background is visible only briefly or never. Chosen: twice FLOOR_PX of
-`point_quality`. At half or twice, the stated errors over the first 25 px halve or double."""
-START_ERROR_REACH_PX = 25.0
-"""Growth over which that error falls to 1/e. Chosen: about the length of the tip, which hides the background there. At
-half or twice, the affected stretch is half or twice as long."""
+START_ERROR_PX = 0.08  # Extra error near the start, where the background is visible only briefly or never (chosen)
+START_ERROR_REACH_PX = 25.0  # Growth over which that error falls to 1/e (chosen)
+# Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the model
+# (chosen)
 DOOR_ERROR_PX = 0.5
-"""Added to the error near the start if a door crosses the whole strip before growth and the frames do not fit the
-model. Chosen: half a pixel. At half or twice, stated errors behind doors halve or double."""
-CONVERGED_PX = 0.2
-"""The iteration has converged once no edge of a moving frame changes by more than this. Chosen below the error of the
-fastest, blurred frames; at half more iterations are made, at twice fewer."""
-SAME_PATH_PX = 1.0
-"""Two paths are the same if they nowhere differ by more than this. Derived: paths are in whole pixels."""
+CONVERGED_PX = 0.2  # The iteration has converged once no edge of a moving frame changes by more than this (chosen)
+SAME_PATH_PX = 1.0  # Two paths are the same if they nowhere differ by more than this (derived)
+# Factor on the disagreement of the bands when the fitted blur is at its upper bound (chosen)
 OUT_OF_FOCUS_FACTOR = 3.0
-"""Factor on the disagreement of the bands when the fitted blur is at its upper bound: the errors of all rows are then
-correlated. Chosen: out-of-focus recordings then state errors of a pixel. At half or twice they state half or twice as
-much."""
-MAX_MISFIT_RATIO = 100.0
-"""Upper limit of a frame's misfit relative to the median. Chosen: errors reach their limit ASTRAY_PX long before."""
+MAX_MISFIT_RATIO = 100.0  # Upper limit of a frame's misfit relative to the median (chosen)
+# Frames in which the error of the start is at least this part of its full value count as near the start (derived)
 NEAR_START_WEIGHT = 0.1
-"""Frames in which the error of the start is at least this part of its full value count as near the start. Derived:
-e^−2.3, that is within 2.3 START_ERROR_REACH_PX."""
+# Excess of the mean misfit ratio near the start at which the error of a door is added in full (chosen)
 FULL_DOOR_EXCESS = 0.7
-"""Excess of the mean misfit ratio near the start at which the error of a door is added in full. Chosen below 1, where
-the misfit is twice the median. By reasoning: at half faint doors count in full, at twice common doors count by half."""
+# Error of a width between two sides that are each located to within a blur of about 0.7 px (derived)
 WIDTH_ERROR_PX = 1.0
-"""Error of a width between two sides that are each located to within a blur of about 0.7 px. Derived: √2 · 0.7 px."""
+# Contrast, in grey levels, below which the sides of a tube fade into the background (measured)
 LOW_CONTRAST, LOW_CONTRAST_WIDTH_ERROR = 25.0, 0.15
-"""Contrast, in grey levels, below which the sides of a tube fade into the background; and the relative error of its
-width in that case. Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is visible at 16 levels,
-0.96 and more at 70."""
-MIN_FRAME_WEIGHT = 0.05
-"""Weight of a frame identical to the one before it. Chosen: twenty frames at rest weigh as much as one in motion. At
-half or twice, it takes twice or half as many."""
+MIN_FRAME_WEIGHT = 0.05  # Weight of a frame identical to the one before it (chosen)
+# Distance, in standard deviations, at which the difference of a pixel from film or background is clipped (chosen)
 EVIDENCE_CLIP = 2.5
-"""Distance, in standard deviations, at which the difference of a pixel from film or background is clipped. Chosen as
-usual in robust estimation, 2 to 3 standard deviations. By reasoning: at half contrast hardly counts, at twice a bright
-door outvotes the film."""
 
 
 @dataclass(frozen=True)
 class EdgeFit:
-    """Leading edge in strip pixels; arrays have shape (n_frames,).
-
-    `edge_px` is the position at mid-exposure and `sigma_px` its standard error from the likelihood. `extra_sigma_px` is
-    added in quadrature: it comes from the disagreement of bands of rows and, near the start, from START_ERROR_PX.
-    `bands_sigma_px` is the part of it that is independent from frame to frame, `slow_px` the error shared by
-    neighbouring frames. `misfit` is the mean squared residual in units of the noise variance (1 for a perfect fit),
-    `amplitude` the contrast of the edge relative to that of the pixels it passes. `contrast`, shape (n_along,), is the
-    mean signed contrast of each column, NaN where unknown; `passed` the first column that the edge passed and the one
-    behind the last; `hidden` marks frames in which a door or the mouth of a launcher may hide the tip.
-    `seen_exposure_frames` is the exposure inferred from the motion blur where that contradicts the stated exposure,
-    otherwise NaN, and `fast_px_per_frame` the speed at which it was inferred.
+    """Leading edge in strip pixels; arrays have shape (n_frames,). `edge_px` is the position at mid-exposure and
+    `sigma_px` its standard error from the likelihood. `extra_sigma_px` is added in quadrature: it comes from the
+    disagreement of bands of rows and, near the start, from START_ERROR_PX.
     """
 
     edge_px: Floats
@@ -120,24 +94,7 @@ class EdgeFit:
 
 
 def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, sides: Outline | None = None) -> EdgeFit:
-    """Track the leading edge through a strip, growing towards higher columns.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-    exposure_frames : exposure time over frame period; NaN to estimate it from the motion blur.
-    rounds : minimum number of iterations; at most three times as many are made until the edges converge.
-    sides : `outline` of this same strip, if already computed; its path is then the initial path.
-
-    Returns
-    -------
-    edge, standard errors and flags of every frame, px.
-
-    Raises
-    ------
-    ValueError
-        If nothing in the strip changes the way a passing front does.
-    """
+    """Track the leading edge through a strip, growing towards higher columns."""
     path, passed = initial_front_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
@@ -181,13 +138,8 @@ def _fit_frames(strip: Strip, state: EdgeState, chosen: Bools, rounds: int = FIT
 
 @dataclass(frozen=True)
 class Outline:
-    """Outline of the tube that the front leaves behind: its centreline and width, px.
-
-    `shift_px` and `slope` (px per px) describe the centreline across the strip. `half_px` is half the height that
-    contains the whole width with a margin for its blur; `width_px` is the width between the sides and `width_sigma_px`
-    its standard error. `path_px`, shape (n_frames,), is an initial path of the front; `passed` the first column that it
-    passes and the one behind the last. `middles_px`, shape (n_parts,), is the position of the centre across at
-    `places_px` along, for the stretches of typical width.
+    """Outline of the tube that the front leaves behind: its centreline and width, px. `shift_px` and `slope` (px per
+    px) describe the centreline across the strip.
     """
 
     shift_px: float
@@ -202,24 +154,9 @@ class Outline:
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
-    """Measure the centreline and width of the tube that the front leaves behind.
-
-    The contrast of each row between film and background gives the sides in `parts` stretches along the axis. This
-    corrects a given axis that is, say, two degrees off and would cut the tube obliquely.
-
-    Parameters
-    ----------
-    strip : pixels along a roughly known axis.
-    parts : number of stretches along the axis.
-
-    Returns
-    -------
-    centreline, width and standard error of the width, px.
-
-    Raises
-    ------
-    ValueError
-        If nothing in the strip changes the way a passing front does.
+    """Measure the centreline and width of the tube that the front leaves behind. The contrast of each row between film
+    and background gives the sides in `parts` stretches along the axis. This corrects a given axis that is, say, two
+    degrees off and would cut the tube obliquely.
     """
     path, passed = initial_front_path(strip)
     film, background = appearance_about_path(strip, path, passed)
@@ -246,20 +183,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:
-    """Estimate growth and speed from the initial path of the front, without fitting.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    number of columns that the front passes, px, and its mean speed over the middle of them, px per frame.
-
-    Raises
-    ------
-    ValueError
-        If nothing in the strip changes the way a passing front does.
+    """Estimate growth and speed from the initial path of the front, without fitting. Returns number of columns that the
+    front passes, px, and its mean speed over the middle of them, px per frame.
     """
     path, passed = front_path_by_change(strip)
     growth = float(passed[1] - passed[0])
@@ -269,7 +194,6 @@ def rough_growth(strip: Strip) -> tuple[float, float]:
 
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
     """Return the ends of the run with the greatest sum, interpolated to a fraction of a row (maximum-subarray search).
-
     Short gaps do not end the run and isolated glints do not extend it.
     """
     best, run_sum, start, limits = -np.inf, 0.0, 0, (0, len(excess) - 1)
@@ -322,9 +246,8 @@ def _frame_changes(strip: Strip) -> Floats:
 
 
 def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
-    """Weight each frame by how much it differs from the one before it, MIN_FRAME_WEIGHT to 1, shape (n_frames,).
-
-    While the tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
+    """Weight each frame by how much it differs from the one before it, MIN_FRAME_WEIGHT to 1, shape (n_frames,). While
+    the tip rests behind a closed door that looks like film, a hundred frames carry no more information than one.
     """
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
@@ -333,7 +256,6 @@ def _frame_weights(change: Floats, edge: Floats) -> NDArray[np.float32]:
 
 def _update_state(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
     """Take over the fitted edges; re-estimate blur lengths, film and background, and the correlation of the noise.
-
     `inflation` is the variance of a column's mean residual over that of white noise, by distance from the edge.
     """
     edge = hold_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), informative_frames(state.edge))

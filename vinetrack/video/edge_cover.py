@@ -13,25 +13,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-TABLE_STEP_PX = 0.05
-"""Spacing of the coverage table, px. Derived: linear interpolation errs by at most |p''|·TABLE_STEP_PX²/8, which is
-5e-4 with |p''| ≤ 0.242/blur² and the smallest blur of 0.4 px."""
-Z_STEP, Z_LAST = 0.02, 8.0
-"""Spacing and end of the table of the normal distribution. Derived: cubic interpolation errs by Z_STEP⁴/384 of the
-fourth derivative, 2e-10, and Φ(−8) = 6e-16."""
-MIN_MOTION_BLUR_PX = 0.02
-"""Shorter motion blurs are set to this length. Derived: the coverage changes by p''·MIN_MOTION_BLUR_PX²/24 < 1e-4, less
-than the error due to TABLE_STEP_PX."""
-SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)
-"""Entries of the coverage table per pixel. Derived from TABLE_STEP_PX."""
-NO_REFCOUNT: dict[str, Any] = {"_nrt": False}
-"""Numba option for functions that allocate nothing: slices of arrays are then used without reference counting, which
-takes longer than the work on a row of 20 px. Measured: a fit of an edge takes 0.75 of the time."""
+TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
+Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)
+MIN_MOTION_BLUR_PX = 0.02  # Shorter motion blurs are set to this length (derived)
+SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)  # Entries of the coverage table per pixel (derived)
+NO_REFCOUNT: dict[str, Any] = {"_nrt": False}  # Numba option for functions that allocate nothing (measured)
 _Z = np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
 _NORMAL = np.array([[0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)] for z in _Z])
-FASTMATH = {"contract", "arcp", "nsz", "reassoc"}
-"""Floating-point freedom of the compiler: it may reorder sums and ignore the sign of zero. Chosen: NaN and infinity
-keep their meaning."""
+FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -55,20 +44,9 @@ def _normal(z: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
-    """Tabulate the coverage p and its slope dp/dx for one length of motion blur.
-
-    Entry [j, k] is for x = middle − k + j TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal
-    distribution function over a box of `length`, from ∫Φ = zΦ(z) + φ(z). Beyond `coverage_reach` it is 0 or 1.
-
-    Parameters
-    ----------
-    length : length of the motion blur, px.
-    blur : standard deviation of the optical blur, px.
-    half : largest distance from the edge that is needed, px.
-
-    Returns
-    -------
-    p and dp/dx, shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2).
+    """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
+    TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
+    `length`, from ∫Φ = zΦ(z) + φ(z). Beyond `coverage_reach` it is 0 or 1. Shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2).
     """
     middle = math.ceil(half) + 1
     length = max(length, MIN_MOTION_BLUR_PX)
@@ -92,31 +70,14 @@ def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def coverage_reach(length: float, blur: float) -> float:
-    """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered.
-
-    Parameters
-    ----------
-    length : length of the motion blur, px.
-    blur : standard deviation of the optical blur, px.
-
-    Returns
-    -------
-    distance, px.
-    """
+    """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered."""
     return 0.5 * length + 4 * blur + 0.5
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def subpixel_index(place: float) -> tuple[int, int, float, int]:
-    """Split the position of an edge into indices of a coverage table.
-
-    Parameters
-    ----------
-    place : position of the edge, px.
-
-    Returns
-    -------
-    whole part, px; entry j below the fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
+    """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
+    fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
     """
     whole = math.floor(place)
     fraction = (place - whole) / TABLE_STEP_PX

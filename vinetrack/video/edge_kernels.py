@@ -21,42 +21,20 @@ from vinetrack.video.edge_cover import (
     subpixel_index,
 )
 
-COLUMNS_BEHIND = 25
-"""Columns behind the first passed one that are used: they stand in for film that is never visible itself. Chosen:
-nearly two decay lengths of NEIGHBOUR_DECAY in `edge_state`. Half or twice changes only film that is never visible."""
-COLUMNS_AHEAD = 50
-"""Columns ahead of the last passed one that are used. Chosen: the front never gets there. Half or twice changes only
-computing time."""
-FILM_CLIP_RATIO = 1.7
-"""Ratio of the clipped squared distance from film to that from background. Chosen above 1, so that a pixel that
-resembles neither counts as an object in front of the background. By reasoning: nearer 1 a payload counts as film, with
-a larger ratio a stain on the film counts as background."""
-FILM_BIAS = 0.1
-"""Evidence in favour of film in every pixel: a pixel that never changed was film from the start. Chosen small beside
-the clip of 6: it decides only pixels without contrast."""
+COLUMNS_BEHIND = 25  # Columns behind the first passed one that are used (chosen)
+COLUMNS_AHEAD = 50  # Columns ahead of the last passed one that are used (chosen)
+FILM_CLIP_RATIO = 1.7  # Ratio of the clipped squared distance from film to that from background (chosen)
+FILM_BIAS = 0.1  # Evidence in favour of film in every pixel (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
 def film_evidence(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, appearance: np.ndarray, width: float, clip: float
 ) -> np.ndarray:
-    """Score each column of each frame: negative where it looks like film, positive where like background.
-
-    The score is the sum over rows of min(a², FILM_CLIP_RATIO clip²) − min(b², clip²), with a and b the distances from
-    film and background in standard deviations (`width` and the pixel's own variance). A pixel that resembles neither (a
-    door, a payload) rather counts as hiding the background: how film looks is known from later frames, what may pass in
-    front of the background is not.
-
-    Parameters
-    ----------
-    strip, scale, offset : as in `picture_kernels.gather`.
-    appearance : film and background from `solve`, shape (4, n_across, n_along).
-    width : additional standard deviation of a pixel, grey levels.
-    clip : standard deviations at which distances are clipped.
-
-    Returns
-    -------
-    scores, shape (n_frames, n_along).
+    """Score each column of each frame: negative where it looks like film, positive where like background. The score is
+    the sum over rows of min(a², FILM_CLIP_RATIO clip²) − min(b², clip²), with a and b the distances from film and
+    background in standard deviations (`width` and the pixel's own variance). Shapes: appearance (4, n_across, n_along)
+    → (n_frames, n_along).
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
@@ -97,30 +75,10 @@ def fit_edges(
     frames: np.ndarray,
     rows: tuple[int, int],
 ) -> np.ndarray:
-    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6).
-
-    Columns of the result: edge, its standard error from the Fisher information, mean squared weighted residual,
-    amplitude − 1, level, number of pixels. Relative amplitude and level of the contrast are nuisance parameters with a
-    Gaussian prior. `inflation[i]` multiplies the variance of pixels i − len/2 px ahead of the edge: it accounts for
-    noise that is correlated between rows.
-
-    Parameters
-    ----------
-    strip, scale, offset, lengths, lag, blur : as in `picture_kernels.gather`.
-    start : initial edge of each search, shape (n_searches,), px.
-    appearance : film and background from `solve`, shape (4, n_across, n_along).
-    inflation : factor on the variance by distance from the edge, 1 px per bin, edge at the middle bin; shape (n_bins,).
-    prior_sd : prior standard deviation of relative amplitude and level.
-    margin : pixels beyond the blurred edge that are used on either side.
-    rounds : maximum number of Gauss-Newton steps.
-    shading : brightness of the tip in excess of film and background, by distance ahead of the edge, 1 px per bin, edge
-        at the middle bin; shape (n_distances,), 4 px wider than the pixels used; grey levels.
-    frames : frame of each search, shape (n_searches,).
-    rows : first row that is used, and the one behind the last.
-
-    Returns
-    -------
-    one row per search, NaN where `start` is NaN.
+    """Fit the edge by maximum likelihood (Gauss-Newton), one search after another; shape (n_searches, 6). Columns of
+    the result: edge, its standard error from the Fisher information, mean squared weighted residual, amplitude − 1,
+    level, number of pixels. Shapes: start, frames (n_searches,); appearance (4, n_across, n_along); inflation
+    (n_bins,).
     """
     columns = strip.shape[2]
     out = np.full((len(frames), 6), np.nan)
@@ -178,12 +136,9 @@ def _normal_sums(
     lag: np.ndarray, half: float, first: int, last: int, middle: int, table: np.ndarray, bin_inflation: np.ndarray,
     shading: np.ndarray, gain: np.float32, level: np.float32,
 ) -> tuple[int, tuple[float, float, float, float, float, float, float, float, float, float]]:  # fmt: skip
-    """Number of pixels near the edge, and over them the sums of the normal equations for edge, amplitude and level.
-
-    The last sum is that of squared residuals, weighted. The weights 1/(variance + r²/9), as of Student's t with nine
-    degrees of freedom, limit the influence of outliers. In single precision, sixteen pixels at a time: a relative error
-    of 1e-6 is far below that of the edge. The loop over pixels writes to no array; it would otherwise have to make sure
-    that none overlaps with those it reads, which takes longer than its work.
+    """Number of pixels near the edge, and over them the sums of the normal equations for edge, amplitude and level. The
+    last sum is that of squared residuals, weighted. The weights 1/(variance + r²/9), as of Student's t with nine
+    degrees of freedom, limit the influence of outliers.
     """
     zero, unit, ninth = np.float32(0.0), np.float32(1.0), np.float32(1 / 9)
     yy = yg = yl = gg = gl = ll = ry = rg = rl = chi = zero

@@ -19,39 +19,19 @@ from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving
 from vinetrack.video.slow_errors import shared_disagreement
 from vinetrack.video.strip import Strip
 
-ASTRAY_PX = 3.0
-"""Standard error stated where nothing like the edge is found where the motion leads. Chosen just below LOST_SIGMA_PX:
-the point stays and carries hardly any weight. At twice, such points are lost; at half they weigh four times as much."""
+ASTRAY_PX = 3.0  # Standard error stated where nothing like the edge is found where the motion leads
+# Ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not (chosen)
 CONSISTENT_MISFIT_RATIO = 1.4
-"""Ratio by which the misfit of a fit that agrees with its neighbours may exceed that of one that does not. Chosen
-between 1 and 1.5, from which a fit counts as bad. By reasoning: near 1 noise keeps fits that break the motion; beyond
-1.5 good fits at gaps are replaced."""
+# Amplitude (relative contrast) below which a fit has found something other than the edge (chosen)
 LEAST_FITTED_AMPLITUDE = 0.5
-"""Amplitude (relative contrast) below which a fit has found something other than the edge. Chosen: half. By reasoning:
-at half of it reflections pass for the edge; near 1 real edges in changing light do not."""
+# Frames of rest, counted from the motion, within which a bad fit is searched again from many starts (chosen)
 LONG_REST_FRAMES = 8
-"""Frames of rest, counted from the motion, within which a bad fit is searched again from many starts. Chosen for time:
-further into the rest a search from one start is enough."""
 
 
 def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
-    """Replace fits that break the motion or hardly fit by the best ones where the motion leads.
-
-    Goes from the middle of the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times
-    its neighbour or 1.5 px more. A fit that breaks this (it caught the far side of a door, or a payload) is replaced by
-    the best one that does not; a good fit at two to four whole steps stays, since frames may be missing. A fit with 1.5
-    times the median misfit is replaced where a better one is found.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : of the edge tracker.
-    fit : from `edge_state.fit_edges`, shape (n_frames, 6).
-    chosen : frames that were fitted, consecutive ones, mask, shape (n_frames,).
-
-    Returns
-    -------
-    fits, shape (n_frames, 6).
+    """Replace fits that break the motion or hardly fit by the best ones where the motion leads. Goes from the middle of
+    the motion backwards and forwards. The edge never retreats, and a step is at most 1.3 times its neighbour or 1.5 px
+    more. Shapes: fit (n_frames, 6); chosen (n_frames,) → (n_frames, 6).
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -93,9 +73,8 @@ def repair_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np
 
 
 def _repair_strays(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad_misfit: float) -> Floats:
-    """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it.
-
-    A good fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
+    """Replace bad fits that stray from the parabola through two neighbours on each side by the best fit near it. A good
+    fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
     """
     out = fit.copy()
     for t in moving[2:-2]:
@@ -140,48 +119,24 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
     return fits[inside][np.argmin(fits[inside, 2])] if inside.any() else None
 
 
-BANDS = 4
-"""Bands across the strip: enough to show which errs, few enough that each still finds the edge. Chosen: three degrees
-of freedom; with half one, with twice bands of thin vines hold two rows."""
-FEWEST_ROWS = 4
-"""Fewest rows of a band. Chosen: fewer show no edge in noise."""
+BANDS = 4  # Bands across the strip: enough to show which errs, few enough that each still finds the edge (chosen)
+FEWEST_ROWS = 4  # Fewest rows of a band (chosen)
 
+# Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped (chosen)
 OUTLYING_BAND = 2.0
-"""Deviation of a band, in median absolute deviations of the bands of its frame, at which it is clipped: its pixels
-hardly counted in the fit of all rows. Chosen: two median deviations are 1.35 standard deviations of four bands. At
-half, errors of all frames shrink; at twice, one glint makes a frame doubtful."""
-BAND_OFFSET_PX = 50.0
-"""Growth over which the lead or lag of a band is taken as its usual offset: longer than film's grain, shorter than a
-sway. Chosen: a few diameters of the smallest vine. By reasoning: at half, noise is taken for an offset; at twice, a
-sway counts as an error."""
-BAND_OFFSET_FRAMES = 7
-"""Fewest frames from which that offset is taken. Chosen: the median of seven knows it to half of a frame's error."""
+BAND_OFFSET_PX = 50.0  # Growth over which the lead or lag of a band is taken as its usual offset (chosen)
+BAND_OFFSET_FRAMES = 7  # Fewest frames from which that offset is taken (chosen)
 
-NEIGHBOURS = 2
-"""Frames on each side over which the median disagreement is taken: four bands alone are too few, and one glint should
-not count. Chosen: five frames of three degrees of freedom know a standard deviation to 18 % (1/√30). At half to 24 %,
-at twice an error of few frames is averaged away."""
-MEDIAN_TO_MEAN = 1.27
-"""Ratio of mean to median of χ² with three degrees of freedom. Derived: 3/2.366."""
+NEIGHBOURS = 2  # Frames on each side over which the median disagreement is taken (chosen)
+MEDIAN_TO_MEAN = 1.27  # Ratio of mean to median of χ² with three degrees of freedom (derived)
 
 
 def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """Error of the edge from the disagreement of its bands, and the part of it that neighbouring frames share.
-
-    The weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by
-    for long in the `core` frames is the shape of the tip, not an error.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : of the edge tracker.
-    edge : fitted to all rows, shape (n_frames,), px.
-    core : moving frames clear of the start, mask, shape (n_frames,).
-
-    Returns
-    -------
-    standard error, shape (n_frames,), px; zeros where there is one band only
-    slow error of all frames, px; see `slow_errors.shared_disagreement`
+    """Error of the edge from the disagreement of its bands, and the part of it that neighbouring frames share. The
+    weighted mean of K independent bands has the variance Σ w (y − ȳ)² / ((K − 1) Σ w). What a band leads or lags by for
+    long in the `core` frames is the shape of the tip, not an error. Returns standard error, shape (n_frames,), px;
+    zeros where there is one band only, slow error of all frames, px; see `slow_errors.shared_disagreement`. Shapes:
+    edge, core (n_frames,).
     """
     edges, sigmas = band_fits(strip, state, edge)
     if edges.shape[1] < 2:
@@ -201,33 +156,14 @@ def band_disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArra
     return np.asarray(np.sqrt(MEDIAN_TO_MEAN * running_median)), slow
 
 
+# Part of the distance between both ends of an uncertain blur that counts as its standard error (derived)
 BLUR_SIGMA_PART = 0.25
-"""Part of the distance between both ends of an uncertain blur that counts as its standard error. Derived: √(1/12) =
-0.29 for a uniform distribution between them. Measured: errors of 0.2 to 1.8 px where 0.9 is stated, in four recordings
-drawn by other code that stop at 40 px a frame and half a frame of exposure (tuning seeds 1 to 4). At half or twice,
-such frames weigh four times as much or a quarter."""
 
 
 def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
-    """Standard error of an edge that stops or starts within an exposure or next to it.
-
-    The model's blur is that of uniform motion at the mean of the speeds before and after. Where these differ by Δv,
-    either may be the speed during the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. A blur
-    that is longer or shorter than the model's is placed by either of its ends, τΔv/4 apart at most, of which
-    BLUR_SIGMA_PART counts.
-
-    A tip that moves at v px a frame and stops s frames before or after the middle of the exposure is seen, on average
-    over the exposure, v (τ/2 − |s|)²/2τ behind its place in the middle; s follows from the distance moved between two
-    frames before and two after.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-    exposure_frames : exposure over frame period.
-
-    Returns
-    -------
-    shape (n_frames,), px; 0 for uniform motion.
+    """Standard error of an edge that stops or starts within an exposure or next to it. The model's blur is that of
+    uniform motion at the mean of the speeds before and after. Where these differ by Δv, either may be the speed during
+    the exposure of τ frames, and the length of the blur is uncertain by τΔv/2. Shapes: edge (n_frames,) → (n_frames,).
     """
     if len(edge) < 3 or exposure_frames <= 0:
         return np.zeros(len(edge))
@@ -240,19 +176,9 @@ def dwell_error_px(edge: Floats, exposure_frames: float) -> Floats:
 
 
 def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:
-    """Fit the edge of each band of rows alone; NaN where a band shows none.
-
-    The bands share the rows that are informative about the edge evenly.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : of the edge tracker.
-    edge : where each search begins, shape (n_frames,), px.
-
-    Returns
-    -------
-    edge and its standard error, each of shape (n_frames, n_bands), px.
+    """Fit the edge of each band of rows alone; NaN where a band shows none. The bands share the rows that are
+    informative about the edge evenly. Returns edge and its standard error, each of shape (n_frames, n_bands), px.
+    Shapes: edge (n_frames,).
     """
     rows = strip.values.shape[1]
     contrast = np.sum((state.appearance[0] - state.appearance[1]) ** 2, axis=1).astype(float)

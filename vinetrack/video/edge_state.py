@@ -19,56 +19,29 @@ from vinetrack.video.edge_cover import coverage_reach
 from vinetrack.video.strip import Strip
 from vinetrack.video.threads import in_parts
 
+# Frames before and after the passage of the edge over which the weight of a pixel's values falls to 1/e (chosen)
 MEMORY_FRAMES = 6.0
-"""Frames before and after the passage of the edge over which the weight of a pixel's values falls to 1/e: enough frames
-to average noise, few enough to forget a door that has swung away or a tube that sways. Chosen. By reasoning: at half,
-the noise of film and background grows by a factor of 1.4; at twice, objects that moved remain in them."""
-RIDGE_WEIGHT = 0.05
-"""Weight, in frames, of a pixel's neighbours if the pixel itself was visible: (noise / texture)², with 2 and 9 grey
-levels. Derived from TEXTURE_SD and usual noise: (2/9)² = 0.05."""
-NEIGHBOUR_DECAY = 0.93
-"""Factor by which the weight of neighbours falls per column: to 1/e over 14 px, a few times the grain of film and
-background. Derived: −1/ln 0.93 = 13.8."""
+RIDGE_WEIGHT = 0.05  # Weight, in frames, of a pixel's neighbours if the pixel itself was visible (derived)
+NEIGHBOUR_DECAY = 0.93  # Factor by which the weight of neighbours falls per column (derived)
+# Standard deviation, grey levels, of a pixel about the mean of its neighbours, used where the pixel was never visible
 TEXTURE_SD = 12.0
-"""Standard deviation, grey levels, of a pixel about the mean of its neighbours, used where the pixel was never visible.
-"""
+# Prior standard deviation of relative amplitude and level of the contrast in one frame (chosen)
 CONTRAST_PRIOR_SD = 0.15
-"""Prior standard deviation of relative amplitude and level of the contrast in one frame. Chosen: flicker and shading of
-a tip. By reasoning: at half, changes of light displace the edge; at twice, a payload ahead of the edge passes for the
-edge."""
+# Maximum number of Gauss-Newton steps, in final fits and in fits that others follow (measured)
 FIT_ROUNDS, EARLY_FIT_ROUNDS = 12, 6
-"""Maximum number of Gauss-Newton steps, in final fits and in fits that others follow. Measured (`flicker` and
-`light_stream` of `benchmarks/decoding.py`): steps fall below 0.001 px after six on average. At half of the first, noisy
-frames stay off by hundredths of a pixel. At two thirds of the second, or with every second row, frames in which a door
-hides the tip may settle on the door (one recording of the demonstration); at twice more time is spent."""
-MARGIN_PX = 6.0
-"""Pixels used beyond the blurred edge on either side: they determine amplitude and level. Chosen: six pixels determine
-both better than their prior does. At half worse; at twice other objects come into view."""
-FEWEST_FITS = 4
-"""Fewest fits, or frames summed over, for which another thread is used. Chosen: they take 0.2 ms, and handing work to a
-thread 0.05 ms. At half or twice only time changes."""
-SHADING_REACH_PX = 24
-"""Distance from the edge within which the tip may carry light and shade with it. Chosen: about the length of the tip of
-the smallest vines. Measured (`contrast_reversal`, tuning seeds 3 to 6): errors of 0.41, 0.43, 0.32 and 0.68 px, at half
-0.96, 0.60, 0.76 and 1.02, at twice 0.41, 0.44, 0.31 and 0.65; elsewhere the same to 0.01 px at all three."""
+MARGIN_PX = 6.0  # Pixels used beyond the blurred edge on either side: they determine amplitude and level (chosen)
+FEWEST_FITS = 4  # Fewest fits, or frames summed over, for which another thread is used (chosen)
+SHADING_REACH_PX = 24  # Distance from the edge within which the tip may carry light and shade with it (chosen)
+# Part of the typical contrast below which film and background near the start are taken to be the same material (chosen)
 SAME_MATERIAL_CONTRAST = 0.4
-"""Part of the typical contrast below which film and background near the start are taken to be the same material. Chosen
-below half. By reasoning: at half, film in front of film is tracked as an edge; near 1 every start is taken for it."""
+# Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm) (chosen)
 START_CLEARANCE_PX = 60.0
-"""Growth after which the neighbourhood of the start is clear of whatever held the tip there (20 mm at 3 px/mm). Chosen:
-the length of a latch. At half, doors still count as shape of the tip; at twice, short growth would leave no frames,
-hence the limit of a fifth of the growth."""
 
 
 @dataclass(frozen=True)
 class EdgeState:
-    """Current estimates of the alternation.
-
-    `edge` and the `lengths` of its motion blur, shape (n_frames,), px; the tip's `lag` by row, shape (n_across,), px;
-    the optical `blur`, px. `appearance`, shape (4, n_across, n_along), holds the brightness of film and of background
-    and the variance about each. `inflation` multiplies those variances by distance ahead of the edge, 1 px per bin,
-    edge at the middle bin. `shading`, shape (2 SHADING_REACH_PX + 1,), in the same bins, is the brightness of the tip
-    in excess of film and background, such as a bright rim that moves with it, grey levels.
+    """Current estimates of the alternation. `edge` and the `lengths` of its motion blur, shape (n_frames,), px; the
+    tip's `lag` by row, shape (n_across,), px; the optical `blur`, px.
     """
 
     edge: Floats
@@ -81,16 +54,8 @@ class EdgeState:
 
 
 def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Return the length of the motion blur in every frame: smoothed speed times exposure.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-    exposure_frames : exposure time over frame period.
-
-    Returns
-    -------
-    length, shape (n_frames,), px.
+    """Return the length of the motion blur in every frame: smoothed speed times exposure. Shapes: edge (n_frames,) →
+    (n_frames,).
     """
     if len(edge) < 3:
         return np.zeros(len(edge))
@@ -100,15 +65,8 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
 
 
 def moving_frames(edge: Floats) -> NDArray[np.bool_]:
-    """Return the frames in which the edge moves; all frames if fewer than five do.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Return the frames in which the edge moves; all frames if fewer than five do. Shapes: edge (n_frames,) →
+    (n_frames,).
     """
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
     # np.quantile takes ten times as long as sorting, and all that is done with edges begins here.
@@ -119,17 +77,8 @@ def moving_frames(edge: Floats) -> NDArray[np.bool_]:
 
 
 def informative_frames(edge: Floats) -> NDArray[np.bool_]:
-    """Return the frames that determine film, background and tip shape.
-
-    They are the frames in motion, and MEMORY_CUTOFF memories before and after.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Return the frames that determine film, background and tip shape. They are the frames in motion, and MEMORY_CUTOFF
+    memories before and after. Shapes: edge (n_frames,) → (n_frames,).
     """
     moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * picture_kernels.MEMORY_CUTOFF)
     frames = np.arange(len(edge))
@@ -137,34 +86,15 @@ def informative_frames(edge: Floats) -> NDArray[np.bool_]:
 
 
 def hold_at_rest(edge: Floats, informative: NDArray[np.bool_]) -> Floats:
-    """Set the edge outside the informative frames to its value at the first and last of them.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-    informative : from `informative_frames`, shape (n_frames,).
-
-    Returns
-    -------
-    edge, shape (n_frames,), px.
+    """Set the edge outside the informative frames to its value at the first and last of them. Shapes: edge, informative
+    (n_frames,) → (n_frames,).
     """
     frames = np.flatnonzero(informative)
     return np.asarray(edge[np.clip(np.arange(len(edge)), frames[0], frames[-1])])
 
 
 def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
-    """Estimate the brightness of film and background at every pixel, given the edge.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    state : edge and blur.
-    clip : residual, in grey levels, from which outliers are down-weighted; 0 to weight all alike.
-
-    Returns
-    -------
-    the state with new `appearance`.
-    """
+    """Estimate the brightness of film and background at every pixel, given the edge."""
     early, late = _passage_frames(state, strip.values.shape[2])
     sums = picture_kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
@@ -182,7 +112,6 @@ def estimate_appearance(strip: Strip, state: EdgeState, clip: float) -> EdgeStat
 
 def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mark columns near the start whose background looks like their film: they were film all along. Shape (n_along,).
-
     If the initial edge is placed too far back, film serves as its own background; without contrast nothing corrects it.
     """
     contrast = np.sqrt(np.mean((appearance[0] - appearance[1]) ** 2, axis=0))
@@ -195,9 +124,8 @@ def _film_at_start(state: EdgeState, appearance: NDArray[np.float32]) -> NDArray
 
 
 def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
-    """First and last frame in which the edge is over each column, shapes (n_along,).
-
-    Near the start, film is counted only once the edge has cleared it: until then a door may stand or swing there.
+    """First and last frame in which the edge is over each column, shapes (n_along,). Near the start, film is counted
+    only once the edge has cleared it: until then a door may stand or swing there.
     """
     monotone = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
     frames = np.arange(len(monotone), dtype=float)
@@ -212,39 +140,15 @@ def _passage_frames(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
 
 
 def clear_of_start(edge: Floats) -> float:
-    """Return the column beyond which nothing that held the tip at its start is near.
-
-    It lies START_CLEARANCE_PX, or a fifth of the growth if that is less, beyond the start.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-
-    Returns
-    -------
-    column, px.
+    """Return the column beyond which nothing that held the tip at its start is near. It lies START_CLEARANCE_PX, or a
+    fifth of the growth if that is less, beyond the start. Shapes: edge (n_frames,).
     """
     return float(edge[0] + min(START_CLEARANCE_PX, 0.2 * (edge.max() - edge[0])))
 
 
 def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
-    """Select the frames that determine the shape of the tip.
-
-    They are in motion, clear of the start, and fit no worse than most.
-
-    Parameters
-    ----------
-    state : supplies the edge.
-    fit : from `fit_edges`, shape (n_frames, 6).
-
-    Returns
-    -------
-    mask, shape (n_frames,).
-
-    Raises
-    ------
-    ValueError
-        If no edge was found in any of them.
+    """Select the frames that determine the shape of the tip. They are in motion, clear of the start, and fit no worse
+    than most. Shapes: fit (n_frames, 6) → (n_frames,).
     """
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
@@ -257,19 +161,7 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
 
 
 def fit_edges(strip: Strip, state: EdgeState, rounds: int = FIT_ROUNDS, rows: tuple[int, int] | None = None) -> Floats:
-    """Fit the edge of every frame by maximum likelihood; see `edge_kernels.fit_edges`.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    state : initial edge (NaN to leave a frame out), film and background.
-    rounds : maximum number of Gauss-Newton steps.
-    rows : first row of the strip that is used, and the one behind the last; None for all.
-
-    Returns
-    -------
-    one row per frame: edge, its sigma, misfit, amplitude − 1, level, pixels used; shape (n_frames, 6).
-    """
+    """Fit the edge of every frame by maximum likelihood; see `edge_kernels.fit_edges`. Shape (n_frames, 6)."""
     frames = np.flatnonzero(np.isfinite(state.edge))
     out = np.full((len(state.edge), 6), np.nan)
     out[frames] = search_edges(strip, state, frames, state.edge[frames], rounds, rows)
@@ -280,20 +172,8 @@ def search_edges(
     strip: Strip, state: EdgeState, frames: NDArray[np.int_], starts: Floats, rounds: int = FIT_ROUNDS,
     rows: tuple[int, int] | None = None,
 ) -> Floats:  # fmt: skip
-    """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    state : film and background.
-    frames : frame of each search, shape (n_searches,).
-    starts : initial edge of each search, shape (n_searches,), px.
-    rounds : maximum number of Gauss-Newton steps.
-    rows : as in `fit_edges`.
-
-    Returns
-    -------
-    one row per search, as in `fit_edges`.
+    """Fit the edge from each of several starts, in any frames; see `edge_kernels.fit_edges`. Shapes: frames, starts
+    (n_searches,).
     """
     shading, rows = _padded_shading(state, MARGIN_PX), rows or (0, strip.values.shape[1])
 
@@ -318,62 +198,26 @@ def _padded_shading(state: EdgeState, margin_px: float) -> Floats:
 
 
 def distance_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by distance from the edge; see `residual_kernels.distance_sums`.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    state : edge, film and background.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    use : mask of the frames to sum over, shape (n_frames,).
-
-    Returns
-    -------
-    sums, shape (n_bins, 2).
+    """Sum the residuals of a fit by distance from the edge; see `residual_kernels.distance_sums`. Shapes: fit
+    (n_frames, 6); use (n_frames,) → (n_bins, 2).
     """
     return _frame_sums(residual_kernels.distance_sums, strip, state, fit, use, MARGIN_PX)
 
 
 def place_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by distance from each row's own edge; see `residual_kernels.place_sums`.
-
-    Parameters
-    ----------
-    strip, state, fit, use : as in `distance_sums`.
-
-    Returns
-    -------
-    sums, shape (n_distances, 2).
+    """Sum the residuals of a fit by distance from each row's own edge; see `residual_kernels.place_sums`. Shape
+    (n_distances, 2).
     """
     return _frame_sums(residual_kernels.place_sums, strip, state, fit, use, MARGIN_PX).T
 
 
 def row_sums(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> Floats:
-    """Sum the residuals of a fit by row; see `residual_kernels.row_sums`.
-
-    Parameters
-    ----------
-    strip, state, fit, use : as in `distance_sums`.
-
-    Returns
-    -------
-    sums, shape (n_across, 2).
-    """
+    """Sum the residuals of a fit by row; see `residual_kernels.row_sums`. Shape (n_across, 2)."""
     return _frame_sums(residual_kernels.row_sums, strip, state, fit, use, MARGIN_PX)
 
 
 def misfit(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX) -> float:
-    """Return the robust misfit of a fit; see `residual_kernels.misfit_sums`.
-
-    Parameters
-    ----------
-    strip, state, fit, use : as in `distance_sums`.
-    margin_px : pixels used beyond the blurred edge.
-
-    Returns
-    -------
-    misfit.
-    """
+    """Return the robust misfit of a fit; see `residual_kernels.misfit_sums`."""
     total, count = _frame_sums(residual_kernels.misfit_sums, strip, state, fit, use, margin_px)
     return float(total / max(count, 1))
 
@@ -395,17 +239,8 @@ def _frame_sums(
 
 
 def initial_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
-    """Estimate film and background from an initial path of the front, with a straight tip and a typical blur.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    path : column of the front by frame, shape (n_frames,), px.
-    exposure : exposure time over frame period.
-
-    Returns
-    -------
-    the initial state of the alternation.
+    """Estimate film and background from an initial path of the front, with a straight tip and a typical blur. Shapes:
+    path (n_frames,).
     """
     rows, columns = strip.values.shape[1:]
     blank = np.zeros((4, rows, columns), np.float32)

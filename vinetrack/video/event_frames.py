@@ -18,62 +18,22 @@ from numpy.typing import NDArray
 from vinetrack.video.decoding import PacketIndex, decode_packets, packet_index
 from vinetrack.video.frames import DECODER_THREADS, Frames, Recording, luma_plane, read_frames, slots_from_times
 
-MAX_BYTES_WHOLE = 400_000_000
-"""Size of the pictures up to which a recording is read whole. Chosen: 300 frames of 1280 x 1024. At half, recordings of
-150 such frames are sampled, which decodes a few of them twice; at twice the memory doubles."""
-MAX_SAMPLES = 400
-"""Maximum number of samples. Chosen: a recording of 10,000 frames with a key frame every 30 has 333. At half the
-selection is wider; at twice sampling a film of key frames alone takes longer than decoding the event."""
-MAX_SAMPLE_INTERVAL = 120
-"""Maximum number of frames from one sample to the next. Chosen: a shorter event that leaves no lasting change would be
-missed; a film with fewer key frames is decoded whole for sampling. At half more films are decoded twice for little
-gain."""
-SAMPLE_SIZE_PX = 320
-"""Longer side of the samples, px. Chosen near SMALL_PX of `small_pictures`; half or twice takes a quarter or four times
-the memory."""
-CHANGE_THRESHOLD = 6.0
-"""Change of a pixel that counts, in units of its noise. Measured (still pictures of 320 x 256, noise of 1, 3, 6 and 10
-grey levels, 120 pictures each, seeds 20980 to 20989): no false event in any of 40; at 5 in three. By reasoning: at half
-noise widens every selection; at twice faint film is detected late, which the margin allows for."""
-MIN_CHANGE = 3.0
-"""Smallest change that counts, grey levels of 255. Chosen: compression changes resting pixels by one or two. At half it
-widens the selection, at twice the first pixels of growth are missed, which the margin allows for."""
-MIN_CHANGED_PIXELS = 8
-"""Number of pixels that must have changed. Chosen: the tip of a vine 20 px wide that moves by 10 px. By reasoning: at
-half glints count, at twice the first 20 px are missed, which the margin allows for."""
-NOISE_PAIRS = 40
-"""Pairs of samples from which the noise is estimated. Chosen: accurate to a tenth in each pixel. At half to a seventh;
-at twice it takes twice the memory."""
-EMPTY_BYTES = 100
-"""Maximum packet size of a frame that repeats the one before it. Measured: 20 bytes (H.264, 960 x 540 px). Chosen with
-room for larger pictures and other codecs; at half some of those films are decoded whole, at twice films of low bit rate
-pass, in which packets of moving frames stand out as well."""
+MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
+MAX_SAMPLES = 400  # Maximum number of samples (chosen)
+MAX_SAMPLE_INTERVAL = 120  # Maximum number of frames from one sample to the next (chosen)
+SAMPLE_SIZE_PX = 320  # Longer side of the samples, px (chosen)
+CHANGE_THRESHOLD = 6.0  # Change of a pixel that counts, in units of its noise (measured)
+MIN_CHANGE = 3.0  # Smallest change that counts, grey levels of 255 (chosen)
+MIN_CHANGED_PIXELS = 8  # Number of pixels that must have changed (chosen)
+NOISE_PAIRS = 40  # Pairs of samples from which the noise is estimated (chosen)
+EMPTY_BYTES = 100  # Maximum packet size of a frame that repeats the one before it (measured)
+# Something moves where packets are, on average over the second number of frames (chosen)
 ACTIVE_RATIO, ACTIVE_FRAMES = 2.0, 9
-"""Something moves where packets are, on average over the second number of frames, so many times as large as the
-smallest. Chosen: a frame with a tip of a few pixels takes three times as much. By reasoning: at half single re-coded
-blocks count, at twice slow beginnings do not, which the margin allows for."""
-MARGIN_FRAMES, MARGIN_PART = 40, 0.15
-"""Frames, and fraction of the event, added at either end. Chosen: they show rest and background; slow beginnings change
-by less than MIN_CHANGE. By reasoning: at half little rest is left; at twice a short event takes twice the memory."""
+MARGIN_FRAMES, MARGIN_PART = 40, 0.15  # Frames, and fraction of the event, added at either end (chosen)
 
 
 def read_event(recording: Recording, frame_range: tuple[int, int] | None = None) -> Frames:
-    """Decode the frames that show the event; the whole recording if it is small or if no event stands out.
-
-    Parameters
-    ----------
-    recording : from `inspect_recording`.
-    frame_range : first and last frame that the sheet names; None to detect the event.
-
-    Returns
-    -------
-    frames : with their index in the recording, see `Frames.first`.
-
-    Raises
-    ------
-    RecordingError
-        If not one frame can be decoded.
-    """
+    """Decode the frames that show the event; the whole recording if it is small or if no event stands out."""
     count = recording.declared_frames or 0
     pixel_bytes = 1 if recording.bit_depth <= 8 else 2
     if count * recording.width * recording.height * pixel_bytes <= MAX_BYTES_WHOLE:
@@ -86,17 +46,8 @@ def read_event(recording: Recording, frame_range: tuple[int, int] | None = None)
 
 
 def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], count: int) -> tuple[int, int] | None:
-    """Return the first and last frame of the event, margin included, from samples of the recording.
-
-    Parameters
-    ----------
-    pictures : samples, grey levels of 255, each of shape (height, width).
-    numbers : index of each in the recording, increasing, shape (n_pictures,).
-    count : number of frames of the recording.
-
-    Returns
-    -------
-    first and last frame, both included; None if nothing changes.
+    """Return the first and last frame of the event, margin included, from samples of the recording. Returns first and
+    last frame, both included; None if nothing changes. Shapes: pictures (height, width); numbers (n_pictures,).
     """
     if len(pictures) < 8:
         return None
@@ -149,11 +100,9 @@ def _film_event(recording: Recording, frame_range: tuple[int, int] | None) -> Fr
 
 
 def _range_by_packets(recording: Recording, index: PacketIndex) -> tuple[int, int] | None:
-    """Return the first and last frame of the event, margin included, from packet sizes of a film with few key frames.
-
-    A frame that repeats the one before it takes a packet of a few bytes; one in which something moves takes more. The
-    key frames before and after the event, which can be decoded on their own, must show that nothing changes there. None
-    if even the smallest packets are large or if key frames differ; the film must then be sampled.
+    """Return the first and last frame of the event, margin included, from packet sizes of a film with few key frames. A
+    frame that repeats the one before it takes a packet of a few bytes; one in which something moves takes more. The key
+    frames before and after the event, which can be decoded on their own, must show that nothing changes there.
     """
     count, keys = len(index.pts), np.flatnonzero(index.key)
     if _keys_suffice(index) or len(keys) < 2:

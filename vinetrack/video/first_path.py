@@ -19,64 +19,28 @@ from vinetrack.video.motion_end import growth_end
 from vinetrack.video.strip import Strip
 from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
+# Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
 MIN_LOG_CHANGE = 5.0
-"""Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed. Chosen: about 360
-times the mean score of noise, e^(5/0.85). By reasoning: at half the path begins in columns that never changed; at twice
-faint starts are cut off."""
+# Length of a run of columns, and the fraction of it that must have changed for a front to have passed (chosen)
 RUN_LENGTH_PX, RUN_CHANGED_PART = 9, 0.6
-"""Length of a run of columns, and the fraction of it that must have changed for a front to have passed. Chosen: blur
-alone spreads a change over half as many columns. By reasoning: at half a glint counts as growth; at twice short growth
-does not."""
-MIN_FALL_PART, MIN_FALL_PX = 0.1, 0.2
-"""Minimum decrease from step to step of the run-up, going back in time: as a fraction of the first step after the
-onset, and in px. Chosen so that the run-up ends. By reasoning: at half it reaches twice as far back, which the second
-path corrects."""
+MIN_FALL_PART, MIN_FALL_PX = 0.1, 0.2  # Minimum decrease from step to step of the run-up, going back in time (chosen)
 
-AVERAGED_FRAMES = 12
-"""Frames after and before the front over which film and background are averaged. Derived: the effective number of
-frames of MEMORY_FRAMES in `edge_state`, (Σw)²/Σw² = 2 · 6."""
+AVERAGED_FRAMES = 12  # Frames after and before the front over which film and background are averaged (derived)
 
-_FrontPath = tuple[Floats, tuple[int, int]]
-"""Column of the front by frame, shape (n_frames,), px; the first column passed and the one behind the last."""
+_FrontPath = tuple[Floats, tuple[int, int]]  # Column of the front by frame, shape (n_frames,), px
 
 
 def initial_front_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Find the initial path of the front, and the columns that it leaves permanently changed.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    column of the front by frame, shape (n_frames,), px
-    first column passed, and the one behind the last
-
-    Raises
-    ------
-    ValueError
-        If nothing in the strip changes the way a passing front does.
+    """Find the initial path of the front, and the columns that it leaves permanently changed. Returns column of the
+    front by frame, shape (n_frames,), px, first column passed, and the one behind the last.
     """
     return _cut_at_growth_end(strip, _better_path(strip))
 
 
 def front_path_by_change(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Find the initial path of the front by change alone, and the columns that it leaves permanently changed.
-
-    Start and end of growth are more exact than by appearance, for which several frames are averaged.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    as `initial_front_path`.
-
-    Raises
-    ------
-    ValueError
-        If nothing in the strip changes the way a passing front does.
+    """Find the initial path of the front by change alone, and the columns that it leaves permanently changed. Start and
+    end of growth are more exact than by appearance, for which several frames are averaged. Returns as
+    `initial_front_path`.
     """
     return _cut_at_growth_end(strip, _trim_to_changed_runs(*ky.path_by_change(strip)))
 
@@ -124,25 +88,15 @@ def _residual_of_path(strip: Strip, front_path: _FrontPath, columns: tuple[int, 
 
 def appearance_about_path(strip: Strip, path: Floats, columns: tuple[int, int]) -> NDArray[np.float32]:
     """Average each pixel over the AVERAGED_FRAMES frames after (film) and before (background) the front passes it.
-
-    Parameters
-    ----------
-    strip : pixels along the axis.
-    path : column of the front by frame, non-decreasing, shape (n_frames,), px.
-    columns : first column, and the one behind the last.
-
-    Returns
-    -------
-    film and background, shape (2, n_across, n_columns), grey levels.
+    Shapes: path (n_frames,) → (2, n_across, n_columns).
     """
     return ky.mean_appearance(strip.values, strip.scale, strip.offset, path, *columns, AVERAGED_FRAMES)
 
 
 def _trim_to_changed_runs(path: Floats, change: Floats) -> _FrontPath:
-    """Clip a path to the range of columns that changed in runs; prepend a run-up.
-
-    A late beginning is better than an early one: neighbours then stand in for the background, whereas a column that
-    never changed carries no information about the edge.
+    """Clip a path to the range of columns that changed in runs; prepend a run-up. A late beginning is better than an
+    early one: neighbours then stand in for the background, whereas a column that never changed carries no information
+    about the edge.
     """
     strong = change > MIN_LOG_CHANGE
     run = np.convolve(strong, np.ones(RUN_LENGTH_PX) / RUN_LENGTH_PX, mode="same") > RUN_CHANGED_PART
@@ -156,10 +110,9 @@ def _trim_to_changed_runs(path: Floats, change: Floats) -> _FrontPath:
 
 
 def _run_up(path: Floats) -> Floats:
-    """Replace the beginning of a path by steps that decrease going back in time, as from rest.
-
-    An object such as a door may have stood where growth is first visible, and the tip may have come from further back.
-    If it did not, the columns in between turn out to be film from the start, and the second path corrects this.
+    """Replace the beginning of a path by steps that decrease going back in time, as from rest. An object such as a door
+    may have stood where growth is first visible, and the tip may have come from further back. If it did not, the
+    columns in between turn out to be film from the start, and the second path corrects this.
     """
     steps = np.diff(path)
     onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0

@@ -20,34 +20,17 @@ if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
     from vinetrack.video.edge import EdgeFit
 
-DISAGREEMENT_PX = 1.0
-"""Disagreement of bands above which some band follows something other than the edge. Chosen: 25 times FLOOR_PX. By
-reasoning: at half, tips of crumpled film count as doubtful; at twice, an edge half behind a door does not."""
-LARGEST_AMPLITUDE = 1.5
-"""Amplitude (relative contrast) above which something adds to the edge. Chosen about as far above 1, in ratio, as
-LEAST_AMPLITUDE of `hidden_tip` lies below. By reasoning: nearer 1, glints make points doubtful; at twice, payloads in
-front of the edge do not."""
+DISAGREEMENT_PX = 1.0  # Disagreement of bands above which some band follows something other than the edge (chosen)
+LARGEST_AMPLITUDE = 1.5  # Amplitude (relative contrast) above which something adds to the edge (chosen)
+# A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful (chosen)
 MISFIT_RATIO, LEAST_MISFIT = 6.0, 0.3
-"""A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful. Chosen: a
-compressed picture at rest leaves hardly any misfit. By reasoning: at half, textured film makes points doubtful; at
-twice, a hand in front of the tip does not."""
+# A point with a larger standard error, and one this many times the median, is doubtful (chosen)
 UNCERTAIN_PX, UNCERTAIN_RATIO = 1.0, 5.0
-"""A point with a larger standard error, and one this many times the median, is doubtful. Chosen as DISAGREEMENT_PX; the
-ratio spares recordings in which all points are uncertain. At half, fast frames of blurred recordings are doubtful; at
-twice none is."""
 
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,).
-
-    `sigma_px` is the random error by the likelihood, `extra_sigma_px` what is added to it in quadrature (disagreement
-    of bands, start of growth), `bands_sigma_px` the part of that which is independent between frames, `slow_px` the
-    error that neighbouring frames share; `unsure` marks poor fits. `reach_px` is how much of the strip must be visible
-    ahead of a position; `end` says how the motion of a body ended. `width_px` is the width of a tube and its standard
-    error; `seen_exposure` the exposure that the blur shows and the speed at which it does, see `edge.EdgeFit`.
-    `is_edge` is False where only the arrival of whatever comes along the axis was followed, to about a pixel.
-    """
+    """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,)."""
 
     edge_px: Floats
     sigma_px: Floats
@@ -68,23 +51,8 @@ def follow(
     luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, front_share_of: FrontShare
 ) -> tuple[Strip, Positions]:
     """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    trial : its travel ratio.
-    axis : with the width of what moves along it, px.
-    exposure_frames : exposure over frame period; NaN where unknown.
-    front_share_of : function from an axis to its `axis.front_share`.
-
-    Returns
-    -------
-    the strip, centred on what moves along the axis, and the positions along it.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves along the axis.
+    Returns the strip, centred on what moves along the axis, and the positions along it. Shapes: luma (n_frames, height,
+    width).
     """
     try:
         if trial.travel_ratio == 1:

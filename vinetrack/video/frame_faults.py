@@ -13,45 +13,23 @@ from vinetrack.core.records import Bools, Floats
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
-ODD_FRAMES_WITHIN = 3
-"""Number of first frames that may be odd. Chosen: cameras are known to write a wrong second frame and a corrupt first
-one."""
+ODD_FRAMES_WITHIN = 3  # Number of first frames that may be odd (chosen)
+# A frame is odd where it differs from later ones by this many times what neighbours differ by (chosen)
 ODD_RATIO, ODD_GREY = 8.0, 6.0
-"""A frame is odd where it differs from later ones by this many times what neighbours differ by, and by so many grey
-levels of 255. Chosen: a release within the first frames changes part of the picture, by less. By reasoning: at half,
-doors that swing in frame two reject it; at twice, a frame of the same scene a second later passes."""
-AROUND_PX = 40
-"""Columns on either side of the edge that are compared. Chosen: beyond the longest step. At half, fast edges leave
-them; at twice, the still surroundings outweigh the edge."""
-CLEAR_STEP_PX = 2.0
-"""Mean step of three frames above which a copy can be told from slow growth; half of it counts as motion. Chosen: edges
-err by tenths of a pixel. At half, noise decides; at twice, copies in slow growth stay."""
+AROUND_PX = 40  # Columns on either side of the edge that are compared (chosen)
+CLEAR_STEP_PX = 2.0  # Mean step of three frames above which a copy can be told from slow growth (chosen)
+# A copy moves less than this part of a step, and its picture changes by less than this part of the median (chosen)
 COPY_STEP_PART, COPY_CHANGE_PART = 0.1, 0.15
-"""A copy moves less than this part of a step, and its picture changes by less than this part of the median. Chosen: a
-coder changes even a copy a little. At half, compressed copies stay; at twice, slow frames pass for copies."""
 
+# Side of the blocks that are compared (derived)
 TORN_BLOCK_PX, TORN_RUN = 16, 12
-"""Side of the blocks that are compared, and how many of one row must lie outside what the frames before and after show.
-Derived: codecs write pictures in blocks of 16 px, row by row, and a decoding error goes on to the end of the row.
-Measured (benchmarks/damaged_recordings.py, seed 20300): 9 at most where a door swings, 20 to 60 in torn frames."""
-TORN_GREY, TORN_RATIO = 4.0, 4.0
-"""Distance of a block outside them: so many grey levels of 255, and so many times its upper quartile. Chosen: the mean
-of a block has a noise of a quarter of a level; film that slides in a tube is uneven in every frame. At half, noise of
-dark recordings counts; at twice, faint tears pass."""
+TORN_GREY, TORN_RATIO = 4.0, 4.0  # Distance of a block outside them (chosen)
 
 
 def torn_frames(luma: NDArray[Any]) -> Bools:
-    """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data.
-
-    A front that passes leaves a block between its values before and after; a tear lies outside both.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Frames in which part of a row of blocks is unlike the frames before and after: decoded from damaged data. A front
+    that passes leaves a block between its values before and after; a tear lies outside both. Shapes: luma (n_frames,
+    height, width) → (n_frames,).
     """
     n, height, width = luma.shape
     rows, columns = height // TORN_BLOCK_PX, width // TORN_BLOCK_PX
@@ -74,15 +52,8 @@ def torn_frames(luma: NDArray[Any]) -> Bools:
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:
-    """Frames among the first few that resemble none after them; some cameras write such.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Frames among the first few that resemble none after them; some cameras write such. Shapes: luma (n_frames,
+    height, width) → (n_frames,).
     """
     odd = np.zeros(len(luma), dtype=bool)
     if len(luma) < 8:
@@ -101,19 +72,9 @@ def odd_frames(luma: NDArray[Any]) -> Bools:
 
 
 def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
-    """Frames in which the surroundings of the edge repeat those of the frame before.
-
-    The change of the picture is compared with that where the edge moves, and the edge must stand still between frames
-    that show it moving on.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    edge_px : edge along the strip, shape (n_frames,), px.
-
-    Returns
-    -------
-    mask, shape (n_frames,).
+    """Frames in which the surroundings of the edge repeat those of the frame before. The change of the picture is
+    compared with that where the edge moves, and the edge must stand still between frames that show it moving on.
+    Shapes: edge_px (n_frames,) → (n_frames,).
     """
     n, _, columns = strip.values.shape
     seen_px = np.where(np.isfinite(edge_px), edge_px, 0.0)
@@ -134,7 +95,6 @@ def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
 @njit(cache=True, nogil=True)
 def _changes_between(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Mean absolute change of each frame, of every second row of some columns, from the one before; shape (n_frames,).
-
     The first has none before it: infinity.
     """
     n, rows, _ = values.shape

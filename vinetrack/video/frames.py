@@ -36,19 +36,17 @@ if TYPE_CHECKING:
 
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
+# Formats that are not read, and what they are: no vendor documentation was available to check a reader against
 UNSUPPORTED_FORMATS = {
     ".raw": "raw pixels without a header, as a Chronos writes them; nothing says their size, depth and rate",
     ".r3d": "a recording in RED's own format",
     ".braw": "a recording in Blackmagic's own format",
     ".seq": "a sequence of StreamPix",
 }
-"""Formats that are not read, and what they are: no vendor documentation was available to check a reader against."""
+# Formats under which FFmpeg renders any text as a picture of its letters
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
-"""Formats under which FFmpeg renders any text as a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
 
-DECODER_THREADS = 2
-"""Decoder threads per recording. Chosen: as many recordings are tracked in parallel as there are cores, so that more
-threads gain nothing."""
+DECODER_THREADS = 2  # Decoder threads per recording (chosen)
 
 
 class RecordingError(ValueError):
@@ -77,12 +75,8 @@ class Region:
 
 @dataclass(frozen=True)
 class Recording:
-    """Properties of a recording, known before its frames are decoded.
-
-    `kind` is `container`, `folder`, `stack` or `raw`. `declared_frames` is the frame count that the file states (None
-    if it states none). `capture_fps` and `exposure_s` are stated by DNG frames and files of high-speed cameras,
-    otherwise None; `raw` locates the frames in such a camera file. `playback_fps` is the playback rate of a film, None
-    for images; `notes` are messages for the user.
+    """Properties of a recording, known before its frames are decoded. `kind` is `container`, `folder`, `stack` or
+    `raw`. `declared_frames` is the frame count that the file states (None if it states none).
     """
 
     path: Path
@@ -107,13 +101,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames of one region.
-
-    `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape (n_frames,), is the number of capture
-    periods since the first frame, from timestamps or from the numbers of image files: 0, 1, 2 … if no frame is missing.
-    `damaged` marks frames that the decoder calls corrupt, and those coded from them, up to the next key frame. `notes`
-    are messages for the user. Of a long recording only the frames around its event are decoded; `slots_before` and
-    `slots_after`, shape (n,), are the capture periods of the frames before and after.
+    """Decoded frames of one region. `luma` has shape (n_frames, height, width), uint8 or uint16. `slot`, shape
+    (n_frames,), is the number of capture periods since the first frame, from timestamps or from the numbers of image
+    files: 0, 1, 2 … if no frame is missing.
     """
 
     recording: Recording
@@ -140,21 +130,7 @@ class Frames:
 
 
 def inspect_recording(path: Path | str) -> Recording:
-    """Read the header of a recording; at most one frame is decoded.
-
-    Parameters
-    ----------
-    path : a film, an image stack, or a folder of images.
-
-    Returns
-    -------
-    its size, rate and kind.
-
-    Raises
-    ------
-    RecordingError
-        If the recording cannot be used.
-    """
+    """Read the header of a recording; at most one frame is decoded."""
     path = Path(path)
     try:
         size = 1 if path.is_dir() else file_size(path)
@@ -181,24 +157,7 @@ def read_frames(
     threads: int = DECODER_THREADS,
     part: tuple[int, int, PacketIndex] | None = None,
 ) -> Frames:
-    """Decode all frames of a recording, or a `region` of them.
-
-    Parameters
-    ----------
-    path : path of the recording, or the result of `inspect_recording`.
-    region : part of the picture; None for the whole.
-    threads : number of decoder threads.
-    part : first and last frame of a film to decode, with its index of packets; None for every frame.
-
-    Returns
-    -------
-    the frames with their capture periods; `notes` tell of damage.
-
-    Raises
-    ------
-    RecordingError
-        If not one frame can be decoded.
-    """
+    """Decode all frames of a recording, or a `region` of them."""
     recording = path if isinstance(path, Recording) else inspect_recording(path)
     region = region or recording.whole
     if recording.raw is not None:
@@ -224,16 +183,7 @@ def read_frames(
 
 
 def too_large(recording: Recording) -> RecordingError:
-    """Make the error for a recording that does not fit in memory.
-
-    Parameters
-    ----------
-    recording : from `inspect_recording`.
-
-    Returns
-    -------
-    the error, to be raised.
-    """
+    """Make the error for a recording that does not fit in memory."""
     return RecordingError(
         f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
         "of this machine; cut it to the growth, and to the part of the picture that shows it"
@@ -241,17 +191,7 @@ def too_large(recording: Recording) -> RecordingError:
 
 
 def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
-    """Yield the region of one frame after another, as copies; stop where decoding fails.
-
-    Parameters
-    ----------
-    recording : from `inspect_recording`.
-    region : part of the picture; None for the whole.
-
-    Yields
-    ------
-    grey levels, shape (height, width).
-    """
+    """Yield the region of one frame after another, as copies; stop where decoding fails."""
     region = region or recording.whole
     if recording.raw is not None:
         for picture in recording.raw.pictures():
@@ -273,18 +213,7 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
 
 
 def luma_plane(frame: av.VideoFrame, region: Region, copy: bool = True) -> NDArray[Any]:
-    """Return the brightness of a decoded frame.
-
-    Parameters
-    ----------
-    frame : frame from the decoder.
-    region : part of the picture.
-    copy : False if the caller copies the picture before the decoder goes on.
-
-    Returns
-    -------
-    grey levels, shape region.shape, uint8 or uint16.
-    """
+    """Return the brightness of a decoded frame."""
     name = frame.format.name
     depth = frame.format.components[0].bits
     if not (name.startswith(("yuv", "gray", "nv12", "nv16", "nv21", "p010")) and frame.format.is_planar) and (
@@ -392,18 +321,9 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
 
 def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
     """Return the capture period of every frame from its timestamp, and a note on irregularities ("" if there are none).
-
     Timestamps are rounded to whole multiples of their median spacing, so that a missing frame leaves a gap. Timestamps
-    that repeat, run backwards or fit no common period are not used; frames are then numbered consecutively.
-
-    Parameters
-    ----------
-    times : timestamps, shape (n_frames,), any unit.
-    known_missing : number of frames that the file declares but that could not be decoded.
-
-    Returns
-    -------
-    capture periods since the first frame, shape (n_frames,), and the note.
+    that repeat, run backwards or fit no common period are not used; frames are then numbered consecutively. Returns
+    capture periods since the first frame, shape (n_frames,), and the note. Shapes: times (n_frames,).
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):

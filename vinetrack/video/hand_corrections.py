@@ -13,26 +13,14 @@ from vinetrack.core.records import Correction, Track, join_flags
 from vinetrack.video.calibration import CLICK_SIGMA_PX
 from vinetrack.video.slow_errors import SLOW_PX
 
+# Flags that no longer hold once a person has placed or confirmed a point
 SETTLED_FLAGS = frozenset({"doubtful", "lost", "rejected", "after_end"})
-"""Flags that no longer hold once a person has placed or confirmed a point."""
 PAST_TENSE = {"move": "moved", "drop": "dropped", "confirm": "confirmed"}
 
 
 def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
-    """Move, drop or confirm points of a track.
-
-    A moved point has the error of a click; a dropped one is `rejected`; a confirmed one is no longer doubtful. The
-    correction of a frame that the recording does not have, and a confirmation where there is no edge, change nothing
-    and are named in `notes`.
-
-    Parameters
-    ----------
-    track : in pixels along the axis, a row for every frame.
-    corrections : of its frames.
-
-    Returns
-    -------
-    Track : with the tracker's own edge in `tracked_px`.
+    """Move, drop or confirm points of a track. A moved point has the error of a click; a dropped one is `rejected`; a
+    confirmed one is no longer doubtful.
     """
     if not corrections:
         return track

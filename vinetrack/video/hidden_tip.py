@@ -18,82 +18,47 @@ from vinetrack.video.edge_repair import ASTRAY_PX
 from vinetrack.video.edge_state import START_CLEARANCE_PX, EdgeState, clear_of_start, moving_frames
 from vinetrack.video.strip import Strip
 
+# Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
+# edge is a guess (chosen)
 HIDDEN_MISFIT = 3.2
-"""Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
-edge is a guess. Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never reaches. By reasoning:
-at half, textured backgrounds count as hidden; at twice, payloads in front of the edge do not."""
+# Misfit above which nothing of the tip is visible, whatever its contrast (chosen)
 COVERED_MISFIT = 1.12 * HIDDEN_MISFIT
-"""Misfit above which nothing of the tip is visible, whatever its contrast. Chosen: an eighth more than HIDDEN_MISFIT.
-By reasoning: with a factor nearer 1 every guess is discarded; at twice, doors as bright as the film leave guesses."""
+# Ratio of the misfit to the median above which a frame differs from those clear of the start (chosen)
 UNUSUAL_MISFIT_RATIO = 2.0
-"""Ratio of the misfit to the median above which a frame differs from those clear of the start. Chosen. By reasoning:
-near 1 every textured start counts; at twice, dark doors in front of dark backgrounds do not."""
+# Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
+# visible, and below which part of it is hidden (chosen)
 LEAST_AMPLITUDE, REDUCED_AMPLITUDE = 0.6, 0.75
-"""Amplitude (contrast relative to that of the same pixels in other frames) below which too little of the edge is
-visible, and below which part of it is hidden. Chosen. They differ from LEAST_FITTED_AMPLITUDE of `edge_repair` (0.5),
-below which a fit is repeated, while these judge the final fit. By reasoning: at half, a door over two thirds of the tip
-passes; near 1 changing light does not."""
+# Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it
 GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
-"""Standard error of a guessed edge, smaller than that of a fit gone astray since the motion still bounds it; and of a
-frame without an edge, above LOST_SIGMA_PX of `point_quality`. Chosen; half or twice the first is the stated error of
-guesses."""
+# First column after the start at which a door is looked for, the fewest columns that are conclusive (chosen)
 DOOR_COLUMNS, DOOR_FRAMES = (6, 10), 15
-"""First column after the start at which a door is looked for, the fewest columns that are conclusive, and the frames
-before the motion in which a door may swing. Chosen: clear of the tip's blur; with half the frames slow doors are
-missed, with twice flicker counts."""
+# A door changes a column where its brightness varies by this part of the film's contrast and by so many grey levels
+# (chosen)
 DOOR_PART, DOOR_GREY = 0.25, 4.0
-"""A door changes a column where its brightness varies by this part of the film's contrast and by so many grey levels.
-Chosen. By reasoning: at half, noise counts as a door; at twice, dark doors on dark ground do not."""
 
-FEWEST_REST_FRAMES = 3
-"""Fewest frames of rest from which the resting place is known. Chosen as in `point_quality`: two equal frames may be a
-slow start."""
-MIDDLE_ROWS = 0.6
-"""Part of the strip's rows, about its middle, that belong to the tube whatever its sides do. Chosen: the strip is 1.15
-times as high as the tube and 10 px more. By reasoning: at half, few rows decide whether the border is straight; with
-all rows the background beside the tube makes it look ragged."""
+FEWEST_REST_FRAMES = 3  # Fewest frames of rest from which the resting place is known (chosen)
+MIDDLE_ROWS = 0.6  # Part of the strip's rows, about its middle, that belong to the tube whatever its sides do (chosen)
+# Columns left out on either side of a border, for its blur, and columns averaged beyond them (chosen)
 BORDER_GAP_PX, BORDER_SIDE_PX = 3, 6
-"""Columns left out on either side of a border, for its blur, and columns averaged beyond them. Chosen: blurs reach 3
-px; six columns average film's grain. At half, grain decides; at twice, a mouth near the strip's start is not seen."""
-FILM_RANGE_PX = (20, 150)
-"""Distances beyond the border between which the film's own steps are taken. Chosen: clear of the surroundings of the
-start, and a few diameters of film. Half or twice changes the largest of them by its scatter."""
-SEARCH_PX = 3
-"""Distance from the resting place within which a border is looked for. Chosen: the edge at rest errs by less."""
-STRAIGHT_PART = 0.95
-"""Part of the rows that must show the border with the same sign. Measured (tips seen at rest, laboratory and drawings
-of other code, seeds 20410-20466): 0.94 at most in 36 recordings; 1.00 at six mouths (seed 20511)."""
+FILM_RANGE_PX = (20, 150)  # Distances beyond the border between which the film's own steps are taken (chosen)
+SEARCH_PX = 3  # Distance from the resting place within which a border is looked for (chosen)
+STRAIGHT_PART = 0.95  # Part of the rows that must show the border with the same sign (measured)
+# Least ratio of the border to the largest step between neighbouring columns of film further on (measured)
 BORDER_TO_FILM = 2.0
-"""Least ratio of the border to the largest step between neighbouring columns of film further on. Measured on the same:
-1.6 at most without a mouth, and 2.6 at least at a mouth only 30 grey levels darker than the film."""
-BORDER_TO_CONTRAST = 0.5
-"""Least ratio of the border to the film's contrast. Measured on the same: 0.36 at most without a mouth, 0.66 at least
-at one. By reasoning: at half, backgrounds with strong marks count as mouths; at twice, a mouth as bright as the film is
-not seen."""
-FRAMES_AFTER_EXIT = 5
-"""Frames after the tip has come out from which its speed and acceleration are estimated. Chosen: three numbers of a
-parabola, and two frames more."""
+BORDER_TO_CONTRAST = 0.5  # Least ratio of the border to the film's contrast (measured)
+FRAMES_AFTER_EXIT = 5  # Frames after the tip has come out from which its speed and acceleration are estimated (chosen)
+# Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
+# motion that follows (chosen)
 LEAP_RATIO = 3.0
-"""Ratio of a change of the step to the largest of the next four, above which the hidden frames do not belong to the
-motion that follows. Chosen: from rest steps grow evenly, and a release between two frames makes one change 1.5 times
-the next. By reasoning: at half, such releases count as leaps; at twice, a door that was followed passes for the tip."""
-LEAST_LEAP_PX = ASTRAY_PX
-"""Smallest change of the step that is a leap. Chosen: the error of a guess. At half, the noise of slow starts counts as
-a leap; at twice, small leaps pass."""
+LEAST_LEAP_PX = ASTRAY_PX  # Smallest change of the step that is a leap (chosen)
+# Gain of speed over the next four frames (chosen)
 SPEED_GAIN = 0.3
-"""Gain of speed over the next four frames, as a part of the step after a leap, above which the motion is still
-accelerating. Chosen: force and damping B·v^0.37 leave a third of the first acceleration at 0.3 of the final speed, so
-that a step reached within a frame is followed by less. By reasoning: at half, vines whose speed settles count as leaps;
-at twice, some leaps pass."""
 
 
 @dataclass(frozen=True)
 class Mouth:
-    """A launcher's mouth at the start.
-
-    `before`, shape (n_frames,), marks the frames in which the edge stands at a border that stays after the tip has
-    gone. `moved_behind`: the tip comes out faster than a start from rest at that border allows; it started further
-    back.
+    """A launcher's mouth at the start. `before`, shape (n_frames,), marks the frames in which the edge stands at a
+    border that stays after the tip has gone.
     """
 
     before: Bools
@@ -101,18 +66,7 @@ class Mouth:
 
 
 def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
-    """Look for a straight border that stays where the edge rested.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : of the edge tracker.
-    edge : shape (n_frames,), px; finite.
-
-    Returns
-    -------
-    Mouth
-    """
+    """Look for a straight border that stays where the edge rested. Shapes: edge (n_frames,)."""
     none = Mouth(np.zeros(len(edge), dtype=bool), False)
     first = int(np.flatnonzero(moving_frames(state.edge))[0])
     if first < FEWEST_REST_FRAMES:
@@ -146,17 +100,7 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
 
 
 def disturbed_start(strip: Strip, state: EdgeState) -> float:
-    """Share of the columns at the start that change before the edge reaches them: a door swings there.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : of the edge tracker.
-
-    Returns
-    -------
-    0 to 1.
-    """
+    """Share of the columns at the start that change before the edge reaches them: a door swings there."""
     begin, columns = state.edge[0], strip.values.shape[2]
     column_range = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + START_CLEARANCE_PX), columns - 1))
     moving = np.flatnonzero(moving_frames(state.edge))
@@ -176,21 +120,9 @@ def disturbed_start(strip: Strip, state: EdgeState) -> float:
 
 
 def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Floats) -> Floats:
-    """Enlarge the errors of frames in which a door still hides the tip.
-
-    There the edge is a guess; where the picture differs entirely from the model, or hardly any contrast is left, there
-    is no edge.
-
-    Parameters
-    ----------
-    fit : from `edge_state.fit_edges`, shape (n_frames, 6).
-    misfit_ratio : misfit over the median, shape (n_frames,).
-    edge : shape (n_frames,), px.
-    added_px : error that is added to the likelihood's in quadrature, shape (n_frames,), px.
-
-    Returns
-    -------
-    `added_px`, larger where the tip is hidden, shape (n_frames,), px.
+    """Enlarge the errors of frames in which a door still hides the tip. There the edge is a guess; where the picture
+    differs entirely from the model, or hardly any contrast is left, there is no edge. Shapes: fit (n_frames, 6);
+    misfit_ratio, edge, added_px (n_frames,) → (n_frames,).
     """
     near = edge < clear_of_start(edge) + 0.5 * START_CLEARANCE_PX
     misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
@@ -209,9 +141,8 @@ def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, added_px: Flo
 
 
 def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> NDArray[np.float32]:
-    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns.
-
-    The moving tail averages out.
+    """Median of the middle rows over up to 15 of some frames, grey levels freed of flicker, in some columns. The moving
+    tail averages out.
     """
     rows = strip.values.shape[1]
     edge_rows = round((1 - MIDDLE_ROWS) / 2 * rows)
@@ -222,9 +153,8 @@ def _middle_picture(strip: Strip, frames: NDArray[np.int_], columns: slice) -> N
 
 
 def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX.
-
-    Shape (n_rows, n_columns).
+    """Step of brightness across each column, by row; the first column is BORDER_GAP_PX + BORDER_SIDE_PX. Shape (n_rows,
+    n_columns).
     """
     sides = np.lib.stride_tricks.sliding_window_view(picture, BORDER_SIDE_PX, axis=1).mean(axis=2)
     apart = 2 * BORDER_GAP_PX + BORDER_SIDE_PX
@@ -232,10 +162,9 @@ def _borders(picture: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _moved_behind(edge: Floats, rest_px: float) -> bool:
-    """Whether a tip first seen at `edge` started further back than at `rest_px`.
-
-    From rest under its present acceleration a it would have come v²/2a, with v its present speed; this is compared with
-    the distance from `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
+    """Whether a tip first seen at `edge` started further back than at `rest_px`. From rest under its present
+    acceleration a it would have come v²/2a, with v its present speed; this is compared with the distance from
+    `rest_px`. As much again, and 5 px, are allowed for an acceleration that falls.
     """
     if len(edge) < FRAMES_AFTER_EXIT:
         return False
@@ -245,23 +174,9 @@ def _moved_behind(edge: Floats, rest_px: float) -> bool:
 
 
 def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
-    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it.
-
-    What swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps
-    to it. Going back from the first frame that is not hidden, a leap is a step that differs from the one after it by
-    more than LEAP_RATIO times the largest difference among the next four steps, provided those still accelerate
-    (SPEED_GAIN): a vine whose speed settles within a frame may start like that, but one that goes on accelerating was
-    no faster before. Before the leap the motion is extrapolated backwards at the mean acceleration of those steps, no
-    slower than rest; the error is the distance of the edge from it.
-
-    Parameters
-    ----------
-    edge : shape (n_frames,), px.
-    hidden : frames in which something may hide the tip, mask (n_frames,).
-
-    Returns
-    -------
-    shape (n_frames,), px; 0 where the edge leads up to the motion.
+    """Distance of hidden frames from the motion that follows, extrapolated backwards; 0 where they lead up to it. What
+    swings in front of the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
+    Shapes: edge (n_frames,) → (n_frames,).
     """
     out = np.zeros(len(edge))
     if hidden.all():

@@ -15,31 +15,15 @@ from vinetrack.video.camera_headers import side_file_of
 from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
 from vinetrack.video.raw_frames import mosaic_brightness, unpack_pixels
 
-TAG_EXPOSURE = 33434
-"""Defined by TIFF/EP (ISO 12234-2): exposure time."""
+TAG_EXPOSURE = 33434  # Defined by TIFF/EP (ISO 12234-2): exposure time
 
-TAG_FRAME_RATE = 51044
-"""Defined by CinemaDNG: frame rate."""
+TAG_FRAME_RATE = 51044  # Defined by CinemaDNG: frame rate
 
 JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
 
 
 def inspect_images(path: Path) -> Recording:
-    """Read the facts of a folder of images or a TIFF stack from its first picture.
-
-    Parameters
-    ----------
-    path : a folder of pictures, or a TIFF stack.
-
-    Returns
-    -------
-    its size, kind and files.
-
-    Raises
-    ------
-    RecordingError
-        Where the folder holds no images or the first cannot be read.
-    """
+    """Read the facts of a folder of images or a TIFF stack from its first picture."""
     if path.is_dir():
         files, numbers, notes = _numbered_files(path)
         kind = "folder"
@@ -62,22 +46,7 @@ def inspect_images(path: Path) -> Recording:
 
 
 def read_images(recording: Recording, region: Region) -> Frames:
-    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged.
-
-    Parameters
-    ----------
-    recording : from `inspect_images`.
-    region : part of the picture.
-
-    Returns
-    -------
-    every picture with its capture period, by its number.
-
-    Raises
-    ------
-    RecordingError
-        Where not one picture can be read.
-    """
+    """Read every picture; one that is truncated or cannot be read is partial or black, and marked damaged."""
     name = recording.path.name
     notes = list(recording.notes)
     if recording.kind == "stack":
@@ -105,17 +74,7 @@ def read_images(recording: Recording, region: Region) -> Frames:
 
 
 def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any]]:
-    """Yield the region of each picture that can be read.
-
-    Parameters
-    ----------
-    recording : from `inspect_images`.
-    region : part of the picture.
-
-    Yields
-    ------
-    grey levels, shape (height, width).
-    """
+    """Yield the region of each picture that can be read."""
     if recording.kind == "stack":
         for page in _stack_pages(recording):
             yield page[region.slices]

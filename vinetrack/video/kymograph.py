@@ -7,9 +7,7 @@ separates columns that look as at the end of the recording from columns that loo
 flying ahead or a reflection cannot capture the path.
 
 `track_arrival` is for vines that bend, sweep or slide along walls. The film of such a vine does not stay in place, so
-its appearance is never stable and a tracker of a straight front would follow the sweep. But a column that the tip has
-not reached looks as in the first frames: the edge is the monotone path that best separates changed from unchanged
-columns, accurate to about a pixel.
+its appearance is never stable and a tracker of a straight front would follow the sweep.
 """
 
 from __future__ import annotations
@@ -29,46 +27,25 @@ if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
 
+# Number of groups into which the rows of a strip are divided, and maximum rows per group (chosen)
 ROW_GROUPS, MAX_GROUP_ROWS = 12, 4
-"""Number of groups into which the rows of a strip are divided, and maximum rows per group. Chosen for speed; with half
-as many groups noise averages out further and narrow vines fill only one group, with twice as many the initial path
-takes twice as long."""
-WINDOW = 10
-"""Frames before and after a frame whose means are compared. Chosen: noise averages out, while the slowest front passes
-10 px. By reasoning: at half faint film is lost, at twice a change that soon follows another is lost."""
+WINDOW = 10  # Frames before and after a frame whose means are compared (chosen)
+# Peak score from which a column counts as changed (chosen)
 MIN_SCORE, PEAK_FRACTION, UNCHANGED_COLUMN_COST = 3.0, 0.15, 0.2
-"""Peak score from which a column counts as changed; fraction of its peak score that a frame must exceed to count; cost
-of crossing a column that never changed. Chosen: three times the mean score of noise; a partial change, as by a blurred
-edge, still counts. By reasoning: at half, noise extends the path; at twice, faint stretches end it."""
+# Number of frames at either end of the recording whose median shows the scene before and after growth (chosen)
 END_FRAMES = 5
-"""Number of frames at either end of the recording whose median shows the scene before and after growth. Chosen: the
-median of five tolerates two outliers. By reasoning: at half a single glint counts; at twice the fastest vines have
-grown by a third."""
+# Difference of initial and final appearance, in units of the noise, at which a pixel has half a vote (chosen)
 HALF_VOTE_NOISE = 4.0
-"""Difference of initial and final appearance, in units of the noise, at which a pixel has half a vote. Chosen: smaller
-differences may be noise. By reasoning: at half noise votes, at twice dark film on dark ground hardly does."""
-RESIDUAL_CLIP = 3.0
-"""Residual, in units of the noise, at which residuals are clipped. Chosen: three standard deviations. By reasoning: at
-half, noise counts as much as real differences; at twice, a bright door outweighs the film beside it."""
+RESIDUAL_CLIP = 3.0  # Residual, in units of the noise, at which residuals are clipped (chosen)
 
-MIN_CHANGED_ROWS = 4
-"""Rows of a column that must have changed for the vine to have arrived. Chosen: noise above the threshold never fills
-four rows. By reasoning: at half glints count, at twice thin vines do not."""
-CHANGE_THRESHOLD = 4.0
-"""Change, in units of the noise, that counts; the noise is taken as at least 3 grey levels, since compression hides it.
-Chosen: exceeded by chance in 6e-5 of the pixels. By reasoning: at half noise counts as arrival, at twice dark film on
-dark ground does not."""
-SIGMA_PX = 0.8
-"""Standard error of an arrival: half a pixel of the path's grid, and the ragged outline of a crumpled tip. Chosen; half
-or twice halves or doubles the stated error of such tracks."""
+MIN_CHANGED_ROWS = 4  # Rows of a column that must have changed for the vine to have arrived (chosen)
+CHANGE_THRESHOLD = 4.0  # Change, in units of the noise, that counts (chosen)
+SIGMA_PX = 0.8  # Standard error of an arrival
+# A first step more than so many times the median of the four that follow is not growth (chosen)
 START_LEAP_RATIO, MIN_TYPICAL_STEP_PX = 3.0, 2.0
-"""A first step more than so many times the median of the four that follow is not growth; that median is taken as at
-least the second number, px. Chosen: starting from rest, steps increase. By reasoning: at half, vines that slow down at
-once lose their start; at twice, a jerking tail passes for growth."""
 
 
-FEWEST_COLUMNS = 100
-"""Fewest columns of a strip for which another thread is used. Chosen; only time depends on it."""
+FEWEST_COLUMNS = 100  # Fewest columns of a strip for which another thread is used (chosen)
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -76,10 +53,9 @@ def _change_score(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, group_size: int, noise: float, begin: int,
     end: int,
 ) -> np.ndarray:  # fmt: skip
-    """Score the change of columns `begin` up to `end`, excluded, at each frame, shape (n_frames, end − begin).
-
-    The score is the sum over groups of rows of the squared difference between the means of the `window` frames before
-    and from frame t on, divided by its expectation under noise, less 1.
+    """Score the change of columns `begin` up to `end`, excluded, at each frame, shape (n_frames, end − begin). The
+    score is the sum over groups of rows of the squared difference between the means of the `window` frames before and
+    from frame t on, divided by its expectation under noise, less 1.
     """
     n, rows, _ = strip.shape
     groups, columns = rows // group_size, end - begin
@@ -136,17 +112,8 @@ def _max_score_path(score: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def dividing_path(evidence: np.ndarray) -> np.ndarray:
-    """Find the monotone path that best separates film from background, by dynamic programming.
-
-    The sum of `evidence` behind the edge is minimised; the edge never retreats.
-
-    Parameters
-    ----------
-    evidence : negative where a column looks like film, shape (n_frames, n_along).
-
-    Returns
-    -------
-    column of the edge, shape (n_frames,), px.
+    """Find the monotone path that best separates film from background, by dynamic programming. The sum of `evidence`
+    behind the edge is minimised; the edge never retreats. Shapes: evidence (n_frames, n_along) → (n_frames,).
     """
     n, columns = evidence.shape
     best = np.zeros((n, columns + 1), np.float64)
@@ -172,19 +139,11 @@ def dividing_path(evidence: np.ndarray) -> np.ndarray:
 
 
 def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
-    """Find the front as the monotone path that collects most change; also return the change of each column.
-
-    Within a column the score is proportional to the power of the change, so that the strongest change wins; between
-    columns only its logarithm counts, so that a bright glint in a few columns cannot outweigh the others.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    column of the front, shape (n_frames,), px
-    log of each column's change relative to noise, less PEAK_FRACTION of its maximum; shape (n_along,)
+    """Find the front as the monotone path that collects most change; also return the change of each column. Within a
+    column the score is proportional to the power of the change, so that the strongest change wins; between columns only
+    its logarithm counts, so that a bright glint in a few columns cannot outweigh the others. Returns column of the
+    front, shape (n_frames,), px, log of each column's change relative to noise, less PEAK_FRACTION of its maximum;
+    shape (n_along,).
     """
 
     def score_of(first: int, last: int) -> NDArray[np.float32]:
@@ -208,19 +167,10 @@ def path_by_change(strip: Strip) -> tuple[Floats, Floats]:
 
 def path_by_appearance(strip: Strip) -> tuple[Floats, Floats]:
     """Find the front as the path that separates pixels that look as at the end from pixels that look as at the start.
-
     The vote of a pixel is its distance from the final less that from the initial appearance, divided by the distance
     between the two plus HALF_VOTE_NOISE times the noise: near −1 if it looks as at the end, near 1 if as at the start.
-    Since votes are limited, a few rows of some other object, however bright, hardly change the sum of a column.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    column of the front, shape (n_frames,), px
-    change of each column from start to end, in the units of `path_by_change`; shape (n_along,)
+    Returns column of the front, shape (n_frames,), px, change of each column from start to end, in the units of
+    `path_by_change`; shape (n_along,).
     """
     first, last = _median_frame(strip, slice(0, END_FRAMES)), _median_frame(strip, slice(-END_FRAMES, None))
 
@@ -276,19 +226,7 @@ def mean_appearance(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, path: np.ndarray, begin: int, end: int, window: int
 ) -> np.ndarray:
     """Return the mean brightness of each pixel in the frames after (film) and before (background) the front passes it.
-
-    Parameters
-    ----------
-    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
-    scale, offset : brightness = scale · value + offset, shape (n_frames,).
-    path : column of the front by frame, non-decreasing, shape (n_frames,), px.
-    begin, end : first column, and the one behind the last.
-    window : number of frames averaged on either side of the passage.
-
-    Returns
-    -------
-    film and background, shape (2, n_across, end − begin), grey levels; a column whose background, or film, is never
-    visible takes the value of the nearest column where it is.
+    Shapes: strip (n_frames, n_across, n_along); scale, offset, path (n_frames,) → (2, n_across, end − begin).
     """
     n, rows, _ = strip.shape
     front = np.empty(n + 1, np.int64)
@@ -338,20 +276,9 @@ def clipped_residual_sums(
     begin: int,
     end: int,
 ) -> np.ndarray:
-    """Sum the clipped squared residuals of a path: a frame against film behind it and background ahead of it.
-
-    Parameters
-    ----------
-    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
-    scale, offset : brightness = scale · value + offset, shape (n_frames,).
-    noise : standard deviation of a value, grey levels.
-    path : column of the front by frame, shape (n_frames,), px.
-    appearance : brightness of film and of background, shape (2, n_across, end − begin).
-    begin, end : columns over which to sum.
-
-    Returns
-    -------
-    sum of squares in units of the noise variance, each at most RESIDUAL_CLIP², shape (n_frames,).
+    """Sum the clipped squared residuals of a path: a frame against film behind it and background ahead of it. Shapes:
+    strip (n_frames, n_across, n_along); scale, offset, path (n_frames,); appearance (2, n_across, end − begin) →
+    (n_frames,).
     """
     n, rows, _ = strip.shape
     unit, largest_square, totals = np.float32(1 / noise), np.float32(RESIDUAL_CLIP * RESIDUAL_CLIP), np.zeros(n)
@@ -371,18 +298,9 @@ def clipped_residual_sums(
 
 
 def column_after_leap(path: Floats) -> int:
-    """Return the column at which growth begins if the path leaps at its start.
-
-    At release the tail jerks inside the film that already stands there: its columns change, but no front passes. No
-    front is three times as fast in its first frames as in those that follow.
-
-    Parameters
-    ----------
-    path : column of the front by frame, shape (n_frames,), px.
-
-    Returns
-    -------
-    column; 0 if the path does not leap at its start.
+    """Return the column at which growth begins if the path leaps at its start. At release the tail jerks inside the
+    film that already stands there: its columns change, but no front passes. No front is three times as fast in its
+    first frames as in those that follow. Shapes: path (n_frames,).
     """
     steps = np.diff(path)
     if not np.any(steps > 0):
@@ -396,20 +314,8 @@ def column_after_leap(path: Floats) -> int:
 
 
 def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
-    """Track the edge of a vine that bends or sweeps, as the column up to which the scene has changed.
-
-    Parameters
-    ----------
-    strip : pixels along the axis; growth is towards higher columns.
-
-    Returns
-    -------
-    edge and its standard error, each of shape (n_frames,), px.
-
-    Raises
-    ------
-    ValueError
-        If fewer than ten columns ever change.
+    """Track the edge of a vine that bends or sweeps, as the column up to which the scene has changed. Returns edge and
+    its standard error, each of shape (n_frames,), px.
     """
     values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     values += strip.offset[:, None, None].astype(np.float32)

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A tracked recording with its scale.
-
-    `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its relative standard error, NaN where unknown:
-    an error that all points share, kept apart from the random error of each. `calibration` is None where the scale is
-    the trial's `mm_per_px`. `capture_fps` and the `recording` are those that the track was made from.
+    """A tracked recording with its scale. `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its
+    relative standard error, NaN where unknown: an error that all points share, kept apart from the random error of
+    each.
     """
 
     tracking: Tracking
@@ -46,23 +44,7 @@ class Measurement:
 
 
 def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) -> Measurement:
-    """Decode, calibrate and track the recording of one trial.
-
-    Parameters
-    ----------
-    trial : its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
-    settings : `calibration` and, where the trial has none of its own, `axis` are used.
-    folder : the experiment's folder, to which the path of the calibration's picture is relative.
-
-    Returns
-    -------
-    track, scale, its relative standard error, and the calibration.
-
-    Raises
-    ------
-    RecordingError
-        In one sentence, where recording or calibration cannot be used.
-    """
+    """Decode, calibrate and track the recording of one trial."""
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
@@ -93,22 +75,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
 def calibration_of(
     trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
 ) -> PlaneCalibration | None:
-    """The calibration of the experiment; None where the trial has its own scale or there is no calibration.
-
-    Parameters
-    ----------
-    trial, settings, folder : see `measure_recording`.
-    recording : opened, for the size of its picture.
-
-    Returns
-    -------
-    the calibration, or None.
-
-    Raises
-    ------
-    RecordingError
-        Where the calibration cannot be used.
-    """
+    """The calibration of the experiment; None where the trial has its own scale or there is no calibration."""
     if math.isfinite(trial.m_per_px) or settings.calibration is None:
         return None
     try:
@@ -118,18 +85,7 @@ def calibration_of(
 
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
-    """Return the growth axis of the sheet, else of the settings.
-
-    Parameters
-    ----------
-    trial : its axis comes first.
-    settings : their axis stands for all trials.
-    m_per_px : scale, for the width of the axis.
-
-    Returns
-    -------
-    in the picture, px; None where neither has one.
-    """
+    """Return the growth axis of the sheet, else of the settings."""
     if trial.axis is not None:
         axis = trial.axis
         return axis_through((axis.from_px, *axis.via_px, axis.to_px), axis.width_m / m_per_px)

@@ -19,46 +19,21 @@ from vinetrack.video.strip import Strip
 if TYPE_CHECKING:
     from vinetrack.video.body import BodyEnd
 
-GROWN_TOLERANCE = 0.03
-"""Relative difference of travel and length within which the whole vine has grown. Chosen: lengths are cut to a few
-millimetres in 20 cm, and scales err by a per cent. At half, complete growths go unrecognised; at twice, a stop just
-before the end counts as one."""
-FEWEST_STILL_FRAMES = 4
-"""Fewest frames of standstill at the end that are reported. Chosen; at half, two equal frames are reported."""
+GROWN_TOLERANCE = 0.03  # Relative difference of travel and length within which the whole vine has grown (chosen)
+FEWEST_STILL_FRAMES = 4  # Fewest frames of standstill at the end that are reported (chosen)
+# Change of the pictures after the stop, as a part of that in motion, above which the picture goes on changing (chosen)
 CHANGING_PART = 0.3
-"""Change of the pictures after the stop, as a part of that in motion, above which the picture goes on changing. Chosen
-between noise, 0, and motion, 1. At half, a hand that lets go counts; at twice, only film that goes on sliding does."""
 
-BARE_PART = 0.2
-"""Share of the film's median difference from the background (in power) below which a column shows background again.
-Chosen: 0.45 of the film's contrast. By reasoning: at half, noise keeps bare columns from counting as bare; at twice,
-faint film counts as bare."""
-SHORTEST_BARE_PX = 10
-"""Fewest columns in a row that must show background again: more than any blur or ringing of the coder. Chosen. By
-reasoning: at half, ringing of the coder counts as bare; at twice, payloads that leave late are followed."""
+BARE_PART = 0.2  # Share of the film's median difference from the background (chosen)
+SHORTEST_BARE_PX = 10  # Fewest columns in a row that must show background again (chosen)
+# Parts of the columns passed, from the first, in at least one of which film is the majority (derived)
 FILM_PARTS = (0.7, 0.35, 0.175)
-"""Parts of the columns passed, from the first, in at least one of which film is the majority. Derived: that holds where
-film covers from a tenth to all of what is passed; a payload flies on over several lengths of a short tube. By
-reasoning: with half of the least, a door's columns are half of it; with twice, a tube that is a fifth of the way counts
-as bare."""
-FLIGHT_SPEED_RATIO = 1.35
-"""Ratio of the speeds after and before, below which the motion is still growth: a payload leaves at the speed of the
-tail, twice that of the edge. Chosen between 1 and 2. By reasoning: nearer 1, accelerating growth counts as flight;
-nearer 2, a payload slowed by drag does not."""
+FLIGHT_SPEED_RATIO = 1.35  # Ratio of the speeds after and before, below which the motion is still growth (chosen)
 
 
 def is_grown(edge_px: Floats, quality: PointQuality, length_px: float) -> bool:
-    """Whether the edge stops where the whole vine has grown; False where its length or its rest is unknown.
-
-    Parameters
-    ----------
-    edge_px : along the axis, shape (n_frames,), px.
-    quality : which frames it moves in.
-    length_px : of the vine; NaN where unknown.
-
-    Returns
-    -------
-    whether it has.
+    """Whether the edge stops where the whole vine has grown; False where its length or its rest is unknown. Shapes:
+    edge_px (n_frames,).
     """
     if quality.last_moving < 0 or not np.isfinite(length_px):
         return False
@@ -69,17 +44,7 @@ def is_grown(edge_px: Floats, quality: PointQuality, length_px: float) -> bool:
 
 
 def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
-    """Say why a body is not followed to the end of the recording.
-
-    Parameters
-    ----------
-    end : what ends it, and its last frame.
-    number : of each frame in the recording, shape (n_frames,).
-
-    Returns
-    -------
-    the sentence.
-    """
+    """Say why a body is not followed to the end of the recording. Shapes: number (n_frames,)."""
     frame = number[end.last_frame]
     if end.turns_back:
         return f"the body turns back after frame {frame}: a bounce, or the end of its motion; later frames are not used"
@@ -89,19 +54,8 @@ def body_end_note(end: BodyEnd, number: NDArray[np.int_]) -> str:
 def growth_end_notes(
     luma: NDArray[Any], quality: PointQuality, edge_px: Floats, name: str, number: NDArray[np.int_]
 ) -> list[str]:
-    """Say why the edge stops before the recording does.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    quality : which frames the edge moves in.
-    edge_px : along the axis, shape (n_frames,), px.
-    name : of the recording.
-    number : of each frame in the recording, shape (n_frames,).
-
-    Returns
-    -------
-    a sentence, or none.
+    """Say why the edge stops before the recording does. Shapes: luma (n_frames, height, width); edge_px, number
+    (n_frames,).
     """
     n, last = len(edge_px), quality.last_moving
     if last < 0 or last >= n - FEWEST_STILL_FRAMES or quality.left_picture is not None:
@@ -120,19 +74,7 @@ def growth_end_notes(
 
 
 def truncation_notes(edge_px: Floats, quality: PointQuality, length_px: float, name: str) -> list[str]:
-    """Say that the recording ends while the edge is moving.
-
-    Parameters
-    ----------
-    edge_px : along the axis, shape (n_frames,), px.
-    quality : which frames it moves in.
-    length_px : of the vine; NaN where unknown.
-    name : of the recording.
-
-    Returns
-    -------
-    a sentence, or none.
-    """
+    """Say that the recording ends while the edge is moving. Shapes: edge_px (n_frames,)."""
     followed = np.flatnonzero(np.isfinite(edge_px))
     if quality.last_moving < followed[-1] or quality.left_picture is not None:
         return []
@@ -142,21 +84,9 @@ def truncation_notes(edge_px: Floats, quality: PointQuality, length_px: float, n
 
 
 def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
-    """Column at which the film ends although something moves on; the end of `passed` where nothing does.
-
-    Going backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns
-    that look as they did before anything came, then film. The object must be faster than the edge was, or have leapt
-    ahead of it.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    path : column of the front by frame, shape (n_frames,), px.
-    passed : first column passed, and the one behind the last.
-
-    Returns
-    -------
-    column.
+    """Column at which the film ends although something moves on; the end of `passed` where nothing does. Going
+    backwards from the last column passed: first the flying object (no longer than the tube is wide), then columns that
+    look as they did before anything came, then film. Shapes: path (n_frames,).
     """
     columns, frames = np.arange(passed[0], passed[1]), len(path)
     if len(columns) < 5 * SHORTEST_BARE_PX or frames < 8:

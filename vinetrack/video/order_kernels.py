@@ -1,4 +1,5 @@
-"""Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change in order.
+"""Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change
+in order.
 
 Medians are exact; the range of the values must be known.
 """
@@ -13,29 +14,15 @@ from numpy.typing import NDArray
 
 from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
-LEVELS = 256
-"""Range of the values of the histogram. Derived: brightness and its differences are in grey levels of 255."""
-BINS_PER_LEVEL = 16
-"""Histogram bins per grey level; the median is then sought within one or two bins. Chosen: a bin holds some hundred of
-9000 values; only computing time depends on it."""
-MAX_SORTED = 300
-"""Number of values up to which they are sorted directly. Chosen for speed alone: a bin holds some hundred, or thousands
-where the video coder has frozen the picture."""
+LEVELS = 256  # Range of the values of the histogram (derived)
+BINS_PER_LEVEL = 16  # Histogram bins per grey level; the median is then sought within one or two bins (chosen)
+MAX_SORTED = 300  # Number of values up to which they are sorted directly (chosen)
 
 
 @njit(cache=True, nogil=True)
 def median(values: np.ndarray, keep: np.ndarray, bins_per_unit: float) -> float:
-    """Median of the values with `keep` > 0; the mean of the two middle ones for an even number.
-
-    Parameters
-    ----------
-    values : non-negative, shape (n,).
-    keep : 1 for values that count, else 0, shape (n,).
-    bins_per_unit : histogram bins per unit of the values.
-
-    Returns
-    -------
-    the median; 0 if no value counts.
+    """Median of the values with `keep` > 0; the mean of the two middle ones for an even number. Shapes: values, keep
+    (n,).
     """
     last = LEVELS * BINS_PER_LEVEL - 1
     place = np.empty(len(values), np.int32)
@@ -89,16 +76,8 @@ def _order_statistic(values: np.ndarray, rank: int) -> float:
 
 @njit(cache=True, nogil=True)
 def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Median ratio of each picture, plus one grey level, to a reference.
-
-    Parameters
-    ----------
-    pictures : shape (n, height, width).
-    reference : positive, shape (height, width).
-
-    Returns
-    -------
-    shape (n,).
+    """Median ratio of each picture, plus one grey level, to a reference. Shapes: pictures (n, height, width); reference
+    (height, width) → (n,).
     """
     n, height, width = pictures.shape
     out, ratio, keep = np.empty(n, np.float32), np.empty(height * width, np.float32), np.ones(height * width, np.int8)
@@ -113,16 +92,8 @@ def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
 def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
-    """Mean of the `count` largest absolute changes of single pixels from each picture to the next.
-
-    Parameters
-    ----------
-    pictures : brightness, 0 to 255, shape (n, n_pixels).
-    count : number of pixels averaged.
-
-    Returns
-    -------
-    shape (n - 1,).
+    """Mean of the `count` largest absolute changes of single pixels from each picture to the next. Shapes: pictures (n,
+    n_pixels) → (n - 1,).
     """
     n, pixels = pictures.shape
     count = min(count, pixels)
@@ -166,16 +137,9 @@ def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the frame at which the mean brightness of each pixel changes most, and the power of that change.
-
-    Parameters
-    ----------
-    pictures : shape (n, n_pixels).
-    window : number of pictures averaged before and after.
-
-    Returns
-    -------
-    index of the first picture after the step, and the power of the step, each of shape (n_pixels,).
+    """Find the frame at which the mean brightness of each pixel changes most, and the power of that change. Returns
+    index of the first picture after the step, and the power of the step, each of shape (n_pixels,). Shapes: pictures
+    (n, n_pixels).
     """
     n, pixels = pictures.shape
     best, step_frame = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
@@ -201,16 +165,8 @@ def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.nda
 
 
 def block_means(luma: NDArray[Any], side: int) -> NDArray[np.float32]:
-    """Shrink pictures by a whole factor: means of square blocks, rounded to whole grey levels as in OpenCV.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n, height, width), height and width multiples of `side`.
-    side : side of a block, px.
-
-    Returns
-    -------
-    grey levels, shape (n, height / side, width / side).
+    """Shrink pictures by a whole factor: means of square blocks, rounded to whole grey levels as in OpenCV. Shapes:
+    luma (n, height, width) → (n, height / side, width / side).
     """
     n, height, width = luma.shape
     out = np.empty((n, height // side, width // side), np.float32)
@@ -248,19 +204,8 @@ def _block_means(luma: np.ndarray, side: int, out: np.ndarray) -> None:
 def monotone_path_sums(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
 ) -> np.ndarray:
-    """Return the maximum change that a monotone path collects, for each band of two bins across parallel lines.
-
-    Parameters
-    ----------
-    along, across : position of each changed pixel along the lines, px, and across them, bins; shape (n_pixels,).
-    time, weight : index of the picture in which each pixel changes, and how much it changes, shape (n_pixels,).
-    bins : number of bins across.
-    length : length of the lines, px; positions are rounded to 4 px.
-    n_times : number of pictures.
-
-    Returns
-    -------
-    change collected, shape (bins − 1,).
+    """Return the maximum change that a monotone path collects, for each band of two bins across parallel lines. Shapes:
+    along, across, time, weight (n_pixels,) → (bins − 1,).
     """
     places = length // 4 + 1
     table = np.zeros((bins, n_times, places), np.float32)
@@ -286,15 +231,8 @@ def monotone_path_sums(
 
 @njit(cache=True)
 def passing_times(table: np.ndarray) -> np.ndarray:
-    """Find the monotone path that collects most change, and the time at which it passes each position.
-
-    Parameters
-    ----------
-    table : change by time and position, shape (n_times, n_places).
-
-    Returns
-    -------
-    index of the picture, shape (n_places,); NaN beyond the ends of the path.
+    """Find the monotone path that collects most change, and the time at which it passes each position. Shapes: table
+    (n_times, n_places) → (n_places,).
     """
     n, places = table.shape
     best = np.zeros((n, places + 1))
@@ -319,16 +257,8 @@ def passing_times(table: np.ndarray) -> np.ndarray:
 
 
 def mean_changes(pictures: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Mean absolute change from each picture to the next, of every `step`-th row and column.
-
-    Parameters
-    ----------
-    pictures : as the camera wrote them, shape (n, height, width).
-    step : rows, and columns, from one pixel that counts to the next.
-
-    Returns
-    -------
-    in the camera's values, shape (n - 1,).
+    """Mean absolute change from each picture to the next, of every `step`-th row and column. Shapes: pictures (n,
+    height, width) → (n - 1,).
     """
     sums = in_parts(
         lambda first, last: _sums_of_changes(pictures[first : last + 1], step), len(pictures) - 1, FEWEST_PICTURES

@@ -22,25 +22,13 @@ from vinetrack.video.edge_cover import (
 )
 from vinetrack.video.threads import in_parts
 
-MEMORY_CUTOFF = 4.0
-"""Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 %. Chosen for speed; at half 14 %
-of the weight is left out, at twice computing time grows."""
-PARTIAL_WEIGHT = 0.05
-"""Weight of a half-covered pixel: its contribution to film and background depends on where the edge was assumed to be.
-Chosen: a pixel half covered in 20 frames weighs as much as one fully visible once. By reasoning: at half or twice, the
-few pixels that are never fully visible change."""
+MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 % (chosen)
+PARTIAL_WEIGHT = 0.05  # Weight of a half-covered pixel (chosen)
+# Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background (chosen)
 COVERED_FRACTION = 0.98
-"""Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background. Chosen: 2 % of the contrast
-is less than the noise. By reasoning: at 1 hardly any pixel is pure; at 0.75 mixtures are taken for film."""
-MIXED_BLURS = 2.06
-"""Distance from the edge, in optical blurs, from which a pixel is pure film or background. Derived: Φ(2.054) =
-COVERED_FRACTION."""
-FAR_PX = 80
-"""Columns beyond the range of the edge that are gathered. Chosen: pixels within 60 px of the edge are used. At half,
-the neighbourhood of the start is cut off; at twice computing time grows."""
-ROWS_PER_BLOCK = 8
-"""Rows processed together, so that their sums stay in the cache. Chosen for speed alone: eleven sums of eight rows of
-960 columns are 340 kB."""
+MIXED_BLURS = 2.06  # Distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
+FAR_PX = 80  # Columns beyond the range of the edge that are gathered (chosen)
+ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
 
 
 def gather(
@@ -59,30 +47,9 @@ def gather(
     shading: np.ndarray,
 ) -> np.ndarray:
     """Accumulate the sums of the least squares for background and film at every pixel; shape (11, n_across, n_along).
-
     The edge is over column s from frame `early[s]` to `late[s]`. A pixel counts as background before and as film after,
-    with the weight exp(−frames / memory_frames), so that the frames nearest to the passage count most. Half-covered
-    pixels in between count with PARTIAL_WEIGHT. The sums are Σwq², Σwqp, Σwp², ΣwqV, ΣwpV for half-covered pixels (p
-    the coverage, q = 1 − p, V the brightness), then weight, Σ and Σ of squares of V for pure background, and the same
-    for pure film. With `clip` > 0, a value with the residual r from the previous solution is down-weighted by 1/(1 +
-    (r/clip)²).
-
-    Parameters
-    ----------
-    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
-    scale, offset : brightness = scale · value + offset, shape (n_frames,).
-    edge, lengths : position of the edge and length of its motion blur, shape (n_frames,), px; NaN where unknown.
-    lag : distance by which each row of the tip lags behind its foremost point, shape (n_across,), px.
-    blur : standard deviation of the optical blur, px.
-    early, late : first and last frame with the edge over a column, shape (n_along,).
-    memory_frames : frames after which weights fall to 1/e.
-    appearance : previous solution of `solve`; unused if `clip` is 0.
-    clip : residual from which values are down-weighted, grey levels; 0 for none.
-    shading : as in `edge_kernels.fit_edges`; subtracted from the brightness.
-
-    Returns
-    -------
-    the sums.
+    with the weight exp(−frames / memory_frames), so that the frames nearest to the passage count most. Shapes: strip
+    (n_frames, n_across, n_along); scale, offset, edge, lengths (n_frames,); lag (n_across,); early, late (n_along,).
     """
     _, rows, columns = strip.shape
     sums = np.zeros((11, rows, columns), np.float32)
@@ -105,7 +72,6 @@ def _column_weights(
     columns: int, edge: np.ndarray, early: np.ndarray, late: np.ndarray, memory_frames: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights of columns for background and for film, and the first column that counts and the one behind the last.
-
     Shapes (n_frames, n_along) twice and (n_frames, 2); common to all rows.
     """
     n = len(edge)
@@ -254,23 +220,10 @@ def _add_pure_pixels(
 
 
 def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
-    """Solve for the brightness of film and background at every pixel, and the variance about each.
-
-    A pixel at which one of the two is never visible, or whose background changes (a door swings there), takes it from
-    its row: film from the columns behind it, background from those ahead, with weights that fall as `decay`^distance.
-    Its variance is then `texture`², with a factor of 1.1 where the background changes.
-
-    Parameters
-    ----------
-    sums : from `gather`, shape (11, n_across, n_along).
-    ridge : weight of the row's estimate where the pixel itself was visible, frames.
-    decay : factor by which the weight of neighbours falls from column to column.
-    fallback : brightness used where nothing is known.
-    noise, texture : standard deviation of a value, and of a pixel about its neighbours, grey levels.
-
-    Returns
-    -------
-    film, background, variance of film, variance of background; shape (4, n_across, n_along).
+    """Solve for the brightness of film and background at every pixel, and the variance about each. A pixel at which one
+    of the two is never visible, or whose background changes (a door swings there), takes it from its row: film from the
+    columns behind it, background from those ahead, with weights that fall as `decay`^distance. Shapes: sums (11,
+    n_across, n_along) → (4, n_across, n_along).
     """
     out = np.empty((4, *sums.shape[1:]), np.float32)
 

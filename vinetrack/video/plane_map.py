@@ -18,29 +18,21 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 
-PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)
-"""Prior standard deviations of the two perspective terms (0.15: 25° of tilt at a focal length of three half-diagonals),
-of κ₁ (0.1: 10 % at the picture's corners) and of κ₂. Chosen."""
-MIN_NOISE_PX = 0.01
-"""Chosen: no corner is located better; otherwise a rendered picture without noise would claim to be exact."""
+PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)  # Prior standard deviations of the two perspective terms (chosen)
+MIN_NOISE_PX = 0.01  # Chosen: no corner is located better
 
-NOISE_ROUNDS = 3
-"""Iterations of fit and noise estimate. Chosen: each leaves a small part of the previous change; more only cost time.
-"""
+NOISE_ROUNDS = 3  # Iterations of fit and noise estimate (chosen)
 
-NEWTON_STEPS = 12
-"""Iterations of Newton's method. Chosen: it converges quadratically; more only cost time."""
+NEWTON_STEPS = 12  # Iterations of Newton's method (chosen)
 
-N_PLANE, N_LENS = 8, 2
-"""Parameters of a plane and of a lens. Derived: a homography has eight, κ₁ and κ₂ are two."""
+N_PLANE, N_LENS = 8, 2  # Parameters of a plane and of a lens (derived)
 
 
 @dataclass(frozen=True)
 class PlaneMap:
-    """Map from pixels to the plane of growth.
-
-    `parameters` are the first eight entries of the homography from undistorted half-diagonals to metres, row by row
-    (the ninth is 1), then κ₁ and κ₂; `covariance`, shape (10, 10), is their covariance.
+    """Map from pixels to the plane of growth. `parameters` are the first eight entries of the homography from
+    undistorted half-diagonals to metres, row by row (the ninth is 1), then κ₁ and κ₂; `covariance`, shape (10, 10), is
+    their covariance.
     """
 
     width_px: int
@@ -50,17 +42,7 @@ class PlaneMap:
 
     @classmethod
     def from_scale(cls, m_per_px: float, width_px: int, height_px: int) -> PlaneMap:
-        """Make the map of a plane seen at right angles, without distortion, known without error.
-
-        Parameters
-        ----------
-        m_per_px : scale, m per px.
-        width_px, height_px : size of the picture.
-
-        Returns
-        -------
-        the map.
-        """
+        """Make the map of a plane seen at right angles, without distortion, known without error."""
         step_m = m_per_px * _half_diagonal_px(width_px, height_px)
         parameters = np.array([step_m, 0, 0, 0, step_m, 0, 0, 0, 0, 0], dtype=float)
         return cls(width_px, height_px, parameters, np.zeros((N_PLANE + N_LENS, N_PLANE + N_LENS)))
@@ -71,55 +53,21 @@ class PlaneMap:
         return float(self.parameters[8]), float(self.parameters[9])
 
     def plane_m(self, picture_px: Floats) -> Floats:
-        """Map points of the picture to the plane.
-
-        Parameters
-        ----------
-        picture_px : (x, y), shape (..., 2), px.
-
-        Returns
-        -------
-        shape (..., 2), m.
-        """
+        """Map points of the picture to the plane. Shapes: picture_px (..., 2) → (..., 2)."""
         return self._plane_m(self.parameters, np.asarray(picture_px, dtype=float))
 
     def length_m(self, from_px: Floats | Sequence[float], to_px: Floats | Sequence[float]) -> float:
-        """Return the distance in the plane between two points of the picture.
-
-        Parameters
-        ----------
-        from_px, to_px : (x, y), px.
-
-        Returns
-        -------
-        distance, m.
-        """
+        """Return the distance in the plane between two points of the picture."""
         ends = self.plane_m(np.array([from_px, to_px], dtype=float))
         return float(np.linalg.norm(ends[1] - ends[0]))
 
     def length_rel_sigma(self, from_px: Floats | Sequence[float], to_px: Floats | Sequence[float]) -> float:
-        """Return the relative standard error of the distance in the plane between two points, from the covariance.
-
-        Parameters
-        ----------
-        from_px, to_px : (x, y), px.
-
-        Returns
-        -------
-        relative standard error.
-        """
+        """Return the relative standard error of the distance in the plane between two points, from the covariance."""
         return self.path_rel_sigma(np.array([from_px, to_px], dtype=float))
 
     def path_rel_sigma(self, places_px: Floats) -> float:
-        """Return the relative standard error of the length of a path in the plane, from the covariance.
-
-        Parameters
-        ----------
-        places_px : (x, y) along the path, shape (n, 2), px.
-
-        Returns
-        -------
-        relative standard error.
+        """Return the relative standard error of the length of a path in the plane, from the covariance. Shapes:
+        places_px (n, 2).
         """
         gradient = np.zeros(self.parameters.size)
         steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
@@ -141,9 +89,8 @@ class PlaneMap:
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """Plane maps of several views with a common lens, and the reprojection residuals.
-
-    `residual_px` holds an array of shape (n, 2) per view; `noise_px` is the standard deviation per coordinate.
+    """Plane maps of several views with a common lens, and the reprojection residuals. `residual_px` holds an array of
+    shape (n, 2) per view; `noise_px` is the standard deviation per coordinate.
     """
 
     maps: tuple[PlaneMap, ...]
@@ -167,22 +114,7 @@ def _half_diagonal_px(width_px: int, height_px: int) -> float:
 
 
 def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px: int) -> PlaneFit:
-    """Fit a plane to each view and a common lens.
-
-    Parameters
-    ----------
-    views : per view, corners in the picture (px) and on the target (m), both of shape (n, 2), n ≥ 4.
-    width_px, height_px : size of the picture.
-
-    Returns
-    -------
-    maps, residuals in px, and the noise of a corner, px.
-
-    Notes
-    -----
-    Least squares on distances in the picture, in units of the corners' noise, which is taken from the residuals
-    (NOISE_ROUNDS times over), plus the priors; the covariance is the inverse of JᵀJ.
-    """
+    """Fit a plane to each view and a common lens. Shapes: views (n, 2)."""
     from scipy.optimize import least_squares
 
     size = (width_px, height_px)

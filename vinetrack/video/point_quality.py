@@ -14,59 +14,33 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats, Indices, join_flags
 from vinetrack.tracks.step_gaps import count_missing
 
-LOST_SIGMA_PX = 4.0
-"""A point with a larger standard error counts as lost. Chosen: about a millimetre at the usual 3 px/mm. At half, points
-of blurred frames are lost; at twice they stay and carry hardly any weight."""
-FLOOR_PX = 0.04
-"""Standard error that no check shows: errors shared by all rows (blur, exposure, level) appear neither as roughness nor
-as disagreement of bands. Chosen between 0.03 and 0.06 px, which they came to. At half, the stated errors of good frames
-are too small, at twice too large."""
+LOST_SIGMA_PX = 4.0  # A point with a larger standard error counts as lost (chosen)
+FLOOR_PX = 0.04  # Standard error that no check shows
 
+# Fewest fourth differences from which the roughness is estimated (chosen)
 FEWEST_DIFFERENCES, SMALLEST_FACTOR, LARGEST_FACTOR = 8, 0.5, 6.0
-"""Fewest fourth differences from which the roughness is estimated, and the smallest and largest factor applied to the
-errors. Chosen: the median of eight is known to a third, and beyond a factor of six the motion is not smooth. By
-reasoning: half or twice changes the stated errors of short and of rough tracks alone."""
+# Largest factor for a body that is registered against itself, whose likelihood does not know the interpolation between
+# pixels (measured)
 LARGEST_BODY_FACTOR = 20.0
-"""Largest factor for a body that is registered against itself, whose likelihood does not know the interpolation between
-pixels. Measured: 5 to 14 on rendered balls (tuning seeds 1 and 2). By reasoning: at half, errors of bright balls are a
-third too small."""
-REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25
-"""An edge is at rest while it stays this near to its level: in standard errors, and in px at the start and at the end.
-Chosen: one point of 370 exceeds it by chance; ringing of the video coder moves an edge by some tenths of a pixel. By
-reasoning: at half, ringing counts as release; at twice, slow starts are cut by as much."""
+REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25  # An edge is at rest while it stays this near to its level (chosen)
+# Steps this many times the tolerance of rest, followed by one last frame without a step, show an abrupt stop, though
+# elsewhere two equal positions are no rest (chosen)
 ABRUPT_STOP_RATIO = 5.0
-"""Steps this many times the tolerance of rest, followed by one last frame without a step, show an abrupt stop, though
-elsewhere two equal positions are no rest. Chosen: growth that slows down takes several frames. By reasoning: at half,
-slow growth that pauses in the last frame is cut by two points; at twice, an edge that stopped from 1 to 2 px a frame
-keeps them."""
-LEAST_TRAVEL_PX = 2.0
-"""Least travel that counts as motion. Chosen: five times REST_PX. By reasoning: at half, drift of a camera counts as
-growth; at twice hardly any more recordings are refused."""
+LEAST_TRAVEL_PX = 2.0  # Least travel that counts as motion (chosen)
+# Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier
+# (chosen)
 OUTLIER_SIGMAS, OUTLIER_PX = 6.0, 1.0
-"""Distance from the curve through its neighbours, in standard errors and in px, from which a point is an outlier.
-Chosen: far beyond chance, and a pixel is 25 times FLOOR_PX. By reasoning: at half, film texture makes points doubtful;
-at twice, an edge fitted at the far side of a door does not."""
-INTERPOLATION_SD = 1.4
-"""Standard deviation of a point minus the parabola through its four neighbours, for equal errors. Derived: √(1 +
-34/36), the weights being −1, 4, 4, −1 sixths."""
+INTERPOLATION_SD = 1.4  # Standard deviation of a point minus the parabola through its four neighbours, for equal errors
+# A first step this many times the mean of the next two (chosen)
 FIRST_STEP_RATIO, FIRST_STEP_EXCESS_PX = 1.2, 0.5
-"""A first step this many times the mean of the next two, and longer by this much, shows that the tip was not where it
-seemed to rest. Chosen: from rest the first step is the shortest. By reasoning: near a ratio of 1 noise decides; at
-twice, a tip that started one step further back goes unnoticed."""
+# A last step that exceeds the extrapolated one by this part of a step (chosen)
 FLYING_STEP_PART, FLYING_ROUGHNESS_RATIO = 0.5, 4.0
-"""A last step that exceeds the extrapolated one by this part of a step, and by this many times the roughness before it,
-is an object flying on. Chosen: a payload leaves at twice the speed of the edge, one step more. By reasoning: at half, a
-kick at the stop counts; at twice, payloads pass."""
 
 
 @dataclass(frozen=True)
 class PointQuality:
-    """Flag of every frame, its capture period with missing frames counted in, and sentences for a person.
-
-    `flag`, `slot`, `without_edge` and `departure_px` have shape (n_frames,). `departure_px` is the distance of an
-    outlier from the curve through its neighbours, 0 elsewhere; `without_edge` marks frames in which no edge was found;
-    from frame `left_picture` on the edge is outside the picture, None where it never is. All frames count among those
-    that were tracked, but in `notes` they are those of the recording.
+    """Flag of every frame, its capture period with missing frames counted in, and sentences for a person. `flag`,
+    `slot`, `without_edge` and `departure_px` have shape (n_frames,).
     """
 
     flag: NDArray[np.str_]
@@ -80,20 +54,9 @@ class PointQuality:
 
 
 def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: float = LARGEST_FACTOR) -> Floats:
-    """Scale the stated errors to the roughness of the track.
-
-    Fourth differences cancel any cubic motion and have the variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their
-    median size in units of that standard deviation; it stays 1 where there are fewer than FEWEST_DIFFERENCES.
-
-    Parameters
-    ----------
-    edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
-    use : mask of the frames that count, shape (n_frames,).
-    largest : largest factor; the smallest is SMALLEST_FACTOR.
-
-    Returns
-    -------
-    standard errors, shape (n_frames,), px.
+    """Scale the stated errors to the roughness of the track. Fourth differences cancel any cubic motion and have the
+    variance Σ c² σ², c = (1, −4, 6, −4, 1). The factor is their median size in units of that standard deviation; it
+    stays 1 where there are fewer than FEWEST_DIFFERENCES. Shapes: edge_px, sigma_px, use (n_frames,) → (n_frames,).
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
@@ -109,19 +72,9 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: 
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
-    """First and last moving frame; (0, n − 1) if the edge never rests, (n, −1) if it never moves.
-
-    At rest means: over three frames or more, within three standard errors of the resting level (REST_PX at least;
-    END_REST_PX at the end, where a creeping stop must still show). At the end of the recording two frames are enough
-    after an abrupt stop.
-
-    Parameters
-    ----------
-    edge_px, sigma_px : positions and their errors, shape (n_frames,), px; NaN where the edge was not found.
-
-    Returns
-    -------
-    first and last frame.
+    """First and last moving frame; (0, n − 1) if the edge never rests, (n, −1) if it never moves. At rest means: over
+    three frames or more, within three standard errors of the resting level (REST_PX at least; END_REST_PX at the end,
+    where a creeping stop must still show). Returns first and last frame. Shapes: edge_px, sigma_px (n_frames,).
     """
     good = np.flatnonzero(np.isfinite(edge_px))
     n = len(edge_px)
@@ -170,19 +123,8 @@ def assess_points(
     repeated: Bools,
     end_px: float,
 ) -> PointQuality:
-    """Flag every frame, and correct the times for missing frames.
-
-    Parameters
-    ----------
-    edge_px, sigma_px : shape (n_frames,), px; NaN where the edge was not found.
-    slot : capture periods from the first frame, shape (n_frames,).
-    number : of each frame in the recording, shape (n_frames,).
-    unsure, repeated : masks (n_frames,): frames with a poor fit; frames whose picture repeats the one before.
-    end_px : end of the strip; an edge beyond it has left the picture.
-
-    Returns
-    -------
-    PointQuality
+    """Flag every frame, and correct the times for missing frames. Shapes: edge_px, sigma_px, slot, number
+    (n_frames,).
     """
     n = len(edge_px)
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)

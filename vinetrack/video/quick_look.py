@@ -24,22 +24,15 @@ from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.track import locate_axis
 from vinetrack.video.tube_strip import tube_strip
 
-FRAMES_LOOKED_AT = 100
-"""Frames of a recording that are looked at. Chosen: at half of them a vine that grows within a tenth of the recording
-shows in five frames; at twice as many a look takes twice the time."""
-MOST_BYTES = 200_000_000
-"""Memory for those frames. Chosen: what a laptop has to spare; 100 frames of 2 megapixels fit."""
-MOST_DECODED = 4000
-"""Most frames that are decoded, some three seconds' work; of a longer recording the beginning is looked at. Chosen for
-time."""
+FRAMES_LOOKED_AT = 100  # Frames of a recording that are looked at (chosen)
+MOST_BYTES = 200_000_000  # Memory for those frames (chosen)
+MOST_DECODED = 4000  # Most frames that are decoded, some three seconds' work (chosen)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a quick look shows; NaN where not seen.
-
-    `growth_px` is NaN as well where the recording is longer than what was looked at; `px_per_frame` is the mean speed
-    over the middle of the growth.
+    """What a quick look shows; NaN where not seen. `growth_px` is NaN as well where the recording is longer than what
+    was looked at; `px_per_frame` is the mean speed over the middle of the growth.
     """
 
     axis: Axis | None = None
@@ -50,20 +43,8 @@ class Look:
 
 
 def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | None) -> Look:
-    """Look for the axis, the width of the tube and its growth.
-
-    The sheet's diameter is not used: what it will be compared with must not depend on it.
-
-    Parameters
-    ----------
-    recording : opened.
-    trial : its travel ratio.
-    axis : growth axis in the picture, px; found from the motion where None.
-    count : number of frames of the recording; None where unknown.
-
-    Returns
-    -------
-    the look, without numbers where nothing grows along one line.
+    """Look for the axis, the width of the tube and its growth. The sheet's diameter is not used: what it will be
+    compared with must not depend on it.
     """
     most = int(np.clip(MOST_BYTES // (recording.width * recording.height), FRAMES_LOOKED_AT // 4, FRAMES_LOOKED_AT))
     every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
@@ -82,20 +63,8 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
 
 
 def proposed_axis(luma: NDArray[Any]) -> Axis:
-    """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-
-    Returns
-    -------
-    axis : in the picture, px.
-
-    Raises
-    ------
-    RecordingError
-        Where nothing moves along one line.
+    """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once. Shapes:
+    luma (n_frames, height, width).
     """
     small = SmallPictures(luma)
     axis = find_growth_axis(small, luma)

@@ -19,6 +19,7 @@ from vinetrack.core.records import Floats
 from vinetrack.video.decoding import memory_for_pictures
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region, slots_from_times, too_large
 
+# Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064
 _TABLE_STEPS = (
     "31111111111110111111111111111101111111111111110111111111111111011111111111111110111111111111111011111111"
     "11111111011111111111111101111111111110111111111111111112111111111211111121111211121112111211211211211212"
@@ -31,24 +32,17 @@ _TABLE_STEPS = (
     "77677767777767777777777767777787777777777787777787777877787787787787787878778787878788787878878878878878"
     "887888878888878888888888888888888888888988888988889888988988988988989898898988"
 )
-"""Steps from each of the 1024 values of a packed Phantom frame to the next, starting at 2, up to 4064; later values are
-4095. Source: the table of the vendor's format document, as in pycine 0.3.2. It undoes the compression by which the
-camera stores 12 bits in 10: without it an edge shifts by a part of its blur."""
 
+# 12-bit brightness for each value of a packed Phantom frame, shape (1024,)
 PHANTOM_TABLE: NDArray[np.uint16] = np.full(1024, 4095, np.uint16)
-"""12-bit brightness for each value of a packed Phantom frame, shape (1024,)."""
 PHANTOM_TABLE[: len(_TABLE_STEPS) + 1] = 2 + np.cumsum([0, *map(int, _TABLE_STEPS)])
 
 
 @dataclass(frozen=True)
 class RawFrames:
-    """Location of the frames in a file, and packing of their pixels.
-
-    `offsets` are the positions of the first byte of each frame. `stored_bits` is the number of bits of a pixel in the
-    file: 8, 16 (least significant byte first), or packed 10 or 12 (most significant bits first). `bottom_up`: the last
-    row comes first. `linearise`: values go through PHANTOM_TABLE. `mosaic`: the sensor has a colour filter array, which
-    is filtered to brightness. `times_s` is the capture time of each frame, shape (n_frames,), None if the file does not
-    state it.
+    """Location of the frames in a file, and packing of their pixels. `offsets` are the positions of the first byte of
+    each frame. `stored_bits` is the number of bits of a pixel in the file: 8, 16 (least significant byte first), or
+    packed 10 or 12 (most significant bits first).
     """
 
     file: Path
@@ -88,17 +82,7 @@ class RawFrames:
 
 
 def unpack_pixels(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
-    """Unpack the pixels of a frame.
-
-    Parameters
-    ----------
-    data : shape (n_bytes,).
-    bits : bits per pixel: 8, 16 (least significant byte first), or 10 or 12 (most significant bits first).
-
-    Returns
-    -------
-    values, shape (8 n_bytes / bits,), uint8 or uint16.
-    """
+    """Unpack the pixels of a frame. Shapes: data (n_bytes,) → (8 n_bytes / bits,)."""
     if bits == 8:
         return data
     if bits == 16:
@@ -114,14 +98,7 @@ def unpack_pixels(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
 
 def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
     """Return the brightness of a sensor with a colour filter array, for any 2 by 2 pattern: a [1 2 1] kernel both ways.
-
-    Parameters
-    ----------
-    mosaic : raw values, shape (height, width).
-
-    Returns
-    -------
-    grey levels, of the same shape and type.
+    Shapes: mosaic (height, width).
     """
     import cv2
 
@@ -130,23 +107,7 @@ def mosaic_brightness(mosaic: NDArray[Any]) -> NDArray[Any]:
 
 
 def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
-    """Read every frame of a camera's own file, straight into one array.
-
-    Parameters
-    ----------
-    recording : from `inspect_recording`.
-    raw : location of its frames.
-    region : part of the picture.
-
-    Returns
-    -------
-    the frames with their capture periods.
-
-    Raises
-    ------
-    RecordingError
-        If the frames do not fit in memory, or the file holds none.
-    """
+    """Read every frame of a camera's own file, straight into one array."""
     name, notes = recording.path.name, list(recording.notes)
     shape = (len(raw.offsets), *region.shape)
     if math.prod(shape) * raw.dtype.itemsize > memory_for_pictures():

@@ -23,40 +23,24 @@ from vinetrack.video.curved_axis import CurvedAxis, axis_entry
 from vinetrack.video.measure import Measurement
 from vinetrack.video.track import Tracking
 
-WIDTH_TOLERANCE = 0.08
-"""Relative difference of width and diameter that is allowed beyond the stated error. Measured
-(benchmarks/seen_sizes.py, seeds 20900 and up): 0.96 to 1.02 of the diameter is seen. With a ruler 10 cm nearer to a
-camera that is 1.5 m away, a tube looks 7 % narrower."""
+WIDTH_TOLERANCE = 0.08  # Relative difference of width and diameter that is allowed beyond the stated error (measured)
+# Relative excess of growth over length that is allowed, with growth from the tracker (True) or a quick look (measured)
 GROWTH_TOLERANCE = {True: 0.06, False: 0.12}
-"""Relative excess of growth over length that is allowed, with growth from the tracker (True) or a quick look (False).
-Measured (as above): up to 1.00 and 1.02 of it are seen; the rest is for a ruler beside the plane of growth."""
-EXPOSURE_TOLERANCE_PX = 3.0
-"""Difference of the blur lengths of stated and seen exposure that is allowed; twice that is an error. Measured (seeds
-20900 and up): true exposures differ by up to 0.8 px; a whole frame stated for a tenth of one differs by 3.4 to 34 px at
-7 to 45 px a frame."""
-ERROR_FACTOR = 1.5
-"""Factor between picture and sheet above which the difference is an error: no lens or ruler makes it. Chosen: the
-smallest usual slip, of an inch for a centimetre or a radius for a diameter, is 2 and more. At half (of its logarithm)
-wide lenses are refused; at twice (2.25) a diameter doubled by mistake passes."""
-SIGMAS = 3.0
-"""Standard errors of the width that are allowed for. Chosen: exceeded once in 370 by chance."""
+EXPOSURE_TOLERANCE_PX = 3.0  # Difference of the blur lengths of stated and seen exposure that is allowed (measured)
+ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
+SIGMAS = 3.0  # Standard errors of the width that are allowed for
+# Difference of logarithms within which width and growth are off by the same factor (chosen)
 SAME_FACTOR_LOG = 0.1
-"""Difference of logarithms within which width and growth are off by the same factor, so that the scale is at fault.
-Chosen: widths and growths are seen to some per cent. At half, true errors of scale are reported as two faults; at
-twice, two faults as one of scale."""
+# Angle, in degrees, between growth and the picture's rows above which growth runs up or down (chosen)
 STEEP_DEG = 60.0
-"""Angle, in degrees, between growth and the picture's rows above which growth runs up or down, and between growth and
-its columns above which it runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be
-reported, at 75 a camera askew by 20 would not."""
 OR_SKIP_COMPARISON = "or write compare_sizes: no where only part of the tube is seen"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFacts:
-    """Facts of one recording; NaN (None) where not known.
-
-    `tracked` says whether width and growth come from the tracker or from a quick look; `picture_mm` is the width of the
-    picture; `mean_speed_m_s` is that of the leading edge over the middle of its growth.
+    """Facts of one recording; NaN (None) where not known. `tracked` says whether width and growth come from the tracker
+    or from a quick look; `picture_mm` is the width of the picture; `mean_speed_m_s` is that of the leading edge over
+    the middle of its growth.
     """
 
     trial: str
@@ -80,17 +64,7 @@ class RecordingFacts:
 
 
 def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
-    """Facts of a recording that was tracked.
-
-    Parameters
-    ----------
-    trial : of the sheet.
-    measurement : of its recording.
-
-    Returns
-    -------
-    the facts.
-    """
+    """Facts of a recording that was tracked."""
     tracking = measurement.tracking
     mm_per_px = 1e3 * measurement.m_per_px
     return RecordingFacts(
@@ -110,18 +84,8 @@ def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
 
 
 def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
-    """List the sizes in the picture that contradict the sheet: warnings, or errors beyond a factor of ERROR_FACTOR.
-
-    A body that moves as a whole has no tube; `compare_sizes: no` in the sheet skips the comparison.
-
-    Parameters
-    ----------
-    trial : of the sheet.
-    facts : of its recording.
-
-    Returns
-    -------
-    problems : with both numbers and the factor.
+    """List the sizes in the picture that contradict the sheet: warnings, or errors beyond a factor of ERROR_FACTOR. A
+    body that moves as a whole has no tube; `compare_sizes: no` in the sheet skips the comparison.
     """
     if trial.travel_ratio == 1 or not trial.compare_sizes:
         return []
@@ -143,18 +107,8 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
 
 
 def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
-    """Report a stated exposure that the blur of the moving edge contradicts.
-
-    It is a warning beyond EXPOSURE_TOLERANCE_PX, and an error beyond twice that.
-
-    Parameters
-    ----------
-    trial : of the sheet.
-    tracking : of its recording.
-
-    Returns
-    -------
-    problems : one or none.
+    """Report a stated exposure that the blur of the moving edge contradicts. It is a warning beyond
+    EXPOSURE_TOLERANCE_PX, and an error beyond twice that.
     """
     stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
     difference_px = abs(stated - seen) * tracking.fast_px_per_frame
@@ -208,19 +162,8 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
 
 def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
     """Note where growth in the picture runs in another direction than in the sheet; no fault, since cameras are turned.
-
     That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
-    straight down and that runs level. A stated 0 shows that somebody thought of it: fast cameras are laid on their side
-    to fit the vine in.
-
-    Parameters
-    ----------
-    facts, trials : of the same recordings, in the same order.
-    blank : names of trials whose growth angle is blank.
-
-    Returns
-    -------
-    up to two sentences.
+    straight down and that runs level.
     """
     upright, level = [], []
     for fact, trial in zip(facts, trials, strict=True):
@@ -241,17 +184,8 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
 
 
 def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Name recordings whose axis was found askew to that of most others that grow at the same angle.
-
-    Something else that moves, such as a door as long as the growth, was then taken for the tube.
-
-    Parameters
-    ----------
-    facts, trials : of the same recordings, in the same order.
-
-    Returns
-    -------
-    sentences, one for every growth angle at which any is askew.
+    """Name recordings whose axis was found askew to that of most others that grow at the same angle. Something else
+    that moves, such as a door as long as the growth, was then taken for the tube.
     """
     axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
     slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
@@ -270,16 +204,7 @@ def _named(names: list[str]) -> str:
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
     """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
-
     `down` is the growth angle from straight down as the sheet states it: no picture shows it.
-
-    Parameters
-    ----------
-    facts, trials : of the same recordings, in the same order.
-
-    Returns
-    -------
-    lines for the terminal.
     """
     rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
     head = (
@@ -302,16 +227,7 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 
 
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
-    """Convert the facts of a recording to a JSON mapping.
-
-    Parameters
-    ----------
-    facts : of one recording.
-
-    Returns
-    -------
-    mapping; units are in the keys.
-    """
+    """Convert the facts of a recording to a JSON mapping. Returns mapping; units are in the keys."""
     entry = {key: value for key, value in vars(facts).items() if key != "axis"}
     axis = None if facts.axis is None else axis_entry(facts.axis)
     return entry | {"duration_s": facts.duration_s, "axis": axis}

@@ -20,57 +20,31 @@ from vinetrack.video.order_kernels import BINS_PER_LEVEL, median
 from vinetrack.video.resample import sample
 from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
-REFERENCE_FRAMES = 15
-"""Frames whose median is the reference. Derived: its noise is then a third of that of a frame, √(π/2)/√15. By
-reasoning: at half it is nearly a half, at twice a quarter."""
+REFERENCE_FRAMES = 15  # Frames whose median is the reference (derived)
 
-SHIFT_PIXELS = 9000
-"""Pixels of the bands used to measure a shift, evenly spaced. Derived for derivatives of 5 grey levels per pixel and
-noise of 5: 1/√9000 = 0.01 px."""
+SHIFT_PIXELS = 9000  # Pixels of the bands used to measure a shift, evenly spaced (derived)
+# Pixels used to measure flicker alone, and to decide whether to measure shake with SHIFT_PIXELS (derived)
 LEVEL_PIXELS = 3000
-"""Pixels used to measure flicker alone, and to decide whether to measure shake with SHIFT_PIXELS. Derived for noise of
-5 grey levels at 100: 5/(100·√3000) = 0.1 % of the brightness, 0.003 px of an edge of 30 grey levels. At half 0.004 px;
-at twice it takes as long as SHIFT_PIXELS."""
-MEDIAN_EVERY = 4
-"""Stride of the pixels used for medians. Derived: the median of 750 pixels is known to 1.25/√750 = 5 % of their
-scatter. At half computing time grows, at twice it is known to 7 %."""
+MEDIAN_EVERY = 4  # Stride of the pixels used for medians (derived)
+# Median shift over its standard error, with LEVEL_PIXELS, below which no shake is measured (derived)
 NOISE_SHIFT_RATIO = 1.5
-"""Median shift over its standard error, with LEVEL_PIXELS, below which no shake is measured. Derived: noise alone gives
-0.67; a shake of 2.5 standard errors with SHIFT_PIXELS, the smallest that is removed, gives 1.6. By reasoning: at half
-every recording is measured twice, at twice faint shakes remain."""
-SHAKE_FLOOR_PX = 0.04
-"""Smaller shake is not removed: interpolating the picture would cost more accuracy than it gains. Chosen as FLOOR_PX of
-`point_quality`."""
-SHAKE_ROUNDS = 4
-"""Number of registration iterations, each from the result of the one before. Chosen: each leaves a small part of the
-shift; more only cost time. Derived: shifts up to SHAKE_ROUNDS · SHAKE_STEP_PX = 6 px are found, at half up to 3 px, at
-twice up to 12 px."""
-SHAKE_STEP_PX = 1.5
-"""Maximum shift per iteration. Chosen: the linearisation holds no further. Half or twice halves or doubles the 6 px of
-SHAKE_ROUNDS; at twice, a picture that differs for other reasons is also moved twice as far."""
-SHAKE_CONVERGED_PX = 0.02
-"""Change of the shift below which the iteration has converged. Chosen: a fifth of the error of a removed shake, and
-half of SHAKE_FLOOR_PX. At half another iteration is made, at twice an error of up to that floor remains."""
-WHOLE_PIXEL_TOLERANCE = 1e-6
-"""Distance of a position from a whole pixel that is due to rounding. Derived: positions of some thousand px are known
-to 1e-12."""
+SHAKE_FLOOR_PX = 0.04  # Smaller shake is not removed (chosen)
+SHAKE_ROUNDS = 4  # Number of registration iterations, each from the result of the one before (chosen)
+SHAKE_STEP_PX = 1.5  # Maximum shift per iteration (chosen)
+SHAKE_CONVERGED_PX = 0.02  # Change of the shift below which the iteration has converged (chosen)
+WHOLE_PIXEL_TOLERANCE = 1e-6  # Distance of a position from a whole pixel that is due to rounding (derived)
+# Difference of the shifts measured in the two halves of the background, over their sum, below which the camera is taken
+# to have shaken
 HALF_DISAGREEMENT = 0.7
-"""Difference of the shifts measured in the two halves of the background, over their sum, below which the camera is
-taken to have shaken. Measured on clips of seeds 1 to 6 of `benchmarks/tracking_accuracy.py`: 0.03 to 0.36 with shake,
-0.89 to 1.02 where film and doors move in one half only. The background beside a curved axis is judged in the same way.
-At half a shake remains; at twice, moving film is taken for shake."""
 
-FEWEST_MEDIANS = 1000
-"""Fewest pixels of a reference for which another thread is used. Chosen: they take half a millisecond; only time
-depends on it."""
+FEWEST_MEDIANS = 1000  # Fewest pixels of a reference for which another thread is used (chosen)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Pixels of the bands to which frames are registered: positions and median brightness.
-
-    `along_px` and `across_px`, shape (n_pixels,), are whole numbers; the rows of `basis`, shape (4, n_pixels), are the
-    median picture, ones, and the derivatives of the picture along and across.
+    """Pixels of the bands to which frames are registered: positions and median brightness. `along_px` and `across_px`,
+    shape (n_pixels,), are whole numbers; the rows of `basis`, shape (4, n_pixels), are the median picture, ones, and
+    the derivatives of the picture along and across.
     """
 
     along_px: Floats
@@ -79,15 +53,8 @@ class Reference:
 
 
 def camera_unit(luma: NDArray[Any]) -> float:
-    """Return the number of grey levels of 255 per unit of the camera's values.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-
-    Returns
-    -------
-    grey levels.
+    """Return the number of grey levels of 255 per unit of the camera's values. Shapes: luma (n_frames,
+    height, width).
     """
     if luma.dtype == np.uint8:
         return 1.0
@@ -98,21 +65,9 @@ def camera_unit(luma: NDArray[Any]) -> float:
 def stabilise(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float, still: bool
 ) -> tuple[Floats, Floats, Floats, bool]:
-    """Estimate flicker and shake of every frame against the median picture of its bands.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    bands : rows beside the axis that show static background, px across.
-    unit : grey levels per unit of the camera's values.
-    still : True if the camera is known not to shake: only flicker is then estimated.
-
-    Returns
-    -------
-    scale and offset that correct flicker, shape (n_frames,) each
-    shift along and across, shape (n_frames, 2), px
-    whether the camera shook
+    """Estimate flicker and shake of every frame against the median picture of its bands. Returns scale and offset that
+    correct flicker, shape (n_frames,) each, shift along and across, shape (n_frames, 2), px, whether the camera shook.
+    Shapes: luma (n_frames, height, width).
     """
     n = len(luma)
     shift = np.zeros((n, 2))
@@ -164,21 +119,10 @@ def _flicker_correction(fit: Floats, unit: float) -> tuple[Floats, Floats]:
 
 
 def shifts_agree(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], unit: float) -> bool:
-    """Decide whether the camera shook: two halves of the background must then show the same shift.
-
-    A door, a shadow or a mirror image of the tip passes one half after the other. Shifts of more than a pixel are
-    beyond the linearisation, and its error differs between the halves; therefore each half is iterated to convergence.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : axis along and across which the positions of both halves are given, px.
-    halves : the two references.
-    unit : grey levels per unit of the camera's values.
-
-    Returns
-    -------
-    whether the camera shook.
+    """Decide whether the camera shook: two halves of the background must then show the same shift. A door, a shadow or
+    a mirror image of the tip passes one half after the other. Shifts of more than a pixel are beyond the linearisation,
+    and its error differs between the halves; therefore each half is iterated to convergence. Shapes: luma (n_frames,
+    height, width).
     """
     shifts, errors = [], []
     for half in halves:
@@ -201,9 +145,8 @@ def _reference_at_whole_pixels(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_],
     columns: tuple[int, int], count: int,
 ) -> Reference:  # fmt: skip
-    """Make a reference of about `count` whole pixels of some bands, from the median of some frames.
-
-    Whole pixels need no interpolation, whatever the direction of the axis.
+    """Make a reference of about `count` whole pixels of some bands, from the median of some frames. Whole pixels need
+    no interpolation, whatever the direction of the axis.
     """
     low, high = columns
     grids = [np.meshgrid(np.arange(low + 1, high - 1), rows[1:-1]) for rows in bands]
@@ -256,17 +199,8 @@ def _median_pictures(
 def reference_pixels(
     medians: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
 ) -> Reference:
-    """Make a reference of about SHIFT_PIXELS pixels of some bands, from their median pictures.
-
-    Parameters
-    ----------
-    medians : median picture of each band, shape (n_rows, n_along).
-    bands : their rows, px across.
-    columns : first column, and the one behind the last; all columns if None.
-
-    Returns
-    -------
-    the reference.
+    """Make a reference of about SHIFT_PIXELS pixels of some bands, from their median pictures. Shapes: medians (n_rows,
+    n_along).
     """
     low, high = columns or (0, medians[0].shape[1])
     parts, along, across = [], [], []
@@ -322,24 +256,10 @@ def _whole_pixels(luma: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def register(
     luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floats | None, unit: float
 ) -> tuple[Floats, Floats]:
-    """Register every frame to the static background by robust least squares.
-
-    The model is frame(x) = gain · picture(x − shift) + level, linearised in the shift. A ridge keeps the level near
-    zero, and the shift at zero where the bands have no texture.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : axis along and across which the positions of the reference are given, px.
-    reference : static background.
-    shift_px : displacement that is removed from every frame first, along and across, shape (n_frames, 2), px; None for
-        none.
-    unit : grey levels per unit of the camera's values.
-
-    Returns
-    -------
-    gain, level, shift along and across of every frame, shape (n_frames, 4), and the standard error of the shift, shape
-    (n_frames,).
+    """Register every frame to the static background by robust least squares. The model is frame(x) = gain · picture(x −
+    shift) + level, linearised in the shift. A ridge keeps the level near zero, and the shift at zero where the bands
+    have no texture. Returns gain, level, shift along and across of every frame, shape (n_frames, 4), and the standard
+    error of the shift, shape, (n_frames,).. Shapes: luma (n_frames, height, width); shift_px (n_frames, 2).
     """
     basis = reference.basis
     level = float(np.abs(basis[0]).mean()) + 1e-9
@@ -356,13 +276,8 @@ def register(
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd).
-
-    Outliers of the first fit are found with a gain alone (the ratio of the medians) if that leaves the smaller median
-    residual: a door in front of the brightest part of the picture distorts least squares so much that the door itself
-    would pass as inlier.
-
-    `data` has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
+    """Fit every frame to the rows of `basis` by least squares, twice: the second time without outliers (4 sd). `data`
+    has shape (n_frames, n_pixels), `basis` (4, n_pixels). Returns the coefficients, shape (n_frames, 4), and the
     standard error of the third, shape (n_frames,).
     """
     n, count = data.shape

@@ -18,33 +18,17 @@ from vinetrack.video.axis import Axis
 from vinetrack.video.edge_cover import NO_REFCOUNT
 from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
-CUBIC_COEFFICIENT = np.float32(-0.75)
-"""Coefficient a of the bicubic kernel (Keys 1981). Defined by OpenCV's INTER_CUBIC, which this reproduces up to
-rounding."""
-MIN_MEAN_RUN_PX = 16
-"""Mean length of runs of neighbours from which the compiled loops are used. Measured: with runs of 8 px they take as
-long as OpenCV; only computing time depends on it."""
+CUBIC_COEFFICIENT = np.float32(-0.75)  # Coefficient a of the bicubic kernel (Keys 1981) (defined)
+MIN_MEAN_RUN_PX = 16  # Mean length of runs of neighbours from which the compiled loops are used (measured)
+# Adding and subtracting it rounds a single-precision number to the nearest integer, ties to even (derived)
 ROUNDING_CONSTANT = np.float32(2**23)
-"""Adding and subtracting it rounds a single-precision number to the nearest integer, ties to even. Derived."""
-VECTOR = 16
-"""Pixels computed at a time. Derived: 512 bits hold sixteen single-precision numbers."""
-CONTRACT_FASTMATH = {"contract", "nsz"}
-"""Floating-point freedom of the compiler: fused multiply-add only. Chosen, so that results do not depend on the order
-of sums."""
+VECTOR = 16  # Pixels computed at a time (derived)
+CONTRACT_FASTMATH = {"contract", "nsz"}  # Floating-point freedom of the compiler: fused multiply-add only (chosen)
 
 
 def warp_all(luma: NDArray[Any], matrix: NDArray[np.float64], n_rows: int, n_along: int) -> NDArray[Any]:
     """Interpolate every picture on a straight grid, bicubically; beyond its border the border pixel is repeated.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width), uint8 or uint16.
-    matrix : shape (2, 3); x and y in the picture are matrix @ (along, row, 1).
-    n_rows, n_along : size of the grid.
-
-    Returns
-    -------
-    grey levels, shape (n_frames, n_rows, n_along).
+    Shapes: luma (n_frames, height, width); matrix (2, 3) → (n_frames, n_rows, n_along).
     """
     out = np.empty((len(luma), n_rows, n_along), luma.dtype)
     fractions, runs = _grid(np.asarray(matrix, np.float32), n_rows, n_along)
@@ -61,11 +45,8 @@ def warp_all(luma: NDArray[Any], matrix: NDArray[np.float64], n_rows: int, n_alo
 
 @njit(cache=True, nogil=True)
 def _grid(matrix: np.ndarray, n_rows: int, n_along: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the subpixel positions of a grid and the runs of pixels that are neighbours in the picture.
-
-    Positions, along and across, have shape (2, n_rows, n_along + VECTOR). A run is (row, first, one behind the last,
-    row in the picture, column in the picture less column of the grid), shape (n_runs, 5), of the pixel one before the
-    position in either direction. Positions are rounded as in OpenCV.
+    """Return the subpixel positions of a grid and the runs of pixels that are neighbours in the picture. Positions,
+    along and across, have shape (2, n_rows, n_along + VECTOR).
     """
     fractions = np.zeros((2, n_rows, n_along + VECTOR), np.float32)
     runs = np.empty((n_rows * n_along, 5), np.int64)
@@ -107,9 +88,8 @@ def _weights(x: np.float32) -> tuple[np.float32, np.float32, np.float32, np.floa
 def _interpolate(
     luma: np.ndarray, fractions: np.ndarray, runs: np.ndarray, max_value: np.float32, out: np.ndarray
 ) -> None:
-    """Fill `out`, shape (n_frames, n_rows * n_along), run by run; see `_grid`.
-
-    Whole vectors are computed; the excess of the last one is overwritten by the next run.
+    """Fill `out`, shape (n_frames, n_rows * n_along), run by run; see `_grid`. Whole vectors are computed; the excess
+    of the last one is overwritten by the next run.
     """
     n, height, width = luma.shape
     top = max(0, runs[:, 3].min())
@@ -129,9 +109,8 @@ def _interpolate_one(
     picture: np.ndarray, rows: np.ndarray, top: int, fractions: np.ndarray, runs: np.ndarray, max_value: np.float32,
     row_out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill `row_out`, shape (n_rows * n_along,), from one picture.
-
-    `rows` are the rows of the picture from `top` on, in single precision.
+    """Fill `row_out`, shape (n_rows * n_along,), from one picture. `rows` are the rows of the picture from `top` on, in
+    single precision.
     """
     height, width = picture.shape
     bottom = top + len(rows)
@@ -171,21 +150,10 @@ def _interpolate_one(
 
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
-    """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along).
-
-    An axis along rows or columns of the picture is sliced without interpolation, after moving it by less than half a
-    pixel. Given `shift_px`, every frame is interpolated at its own displacement.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    rows_px : consecutive distances from the axis, shape (n_rows,), px.
-    shift_px : displacement of every frame along and across, shape (n_frames, 2), px; None for none.
-
-    Returns
-    -------
-    grey levels, shape (n_frames, n_rows, n_along).
+    """Cut pixels at whole positions along the axis and at `rows_px` across; shape (n_frames, n_rows, n_along). An axis
+    along rows or columns of the picture is sliced without interpolation, after moving it by less than half a pixel.
+    Given `shift_px`, every frame is interpolated at its own displacement. Shapes: luma (n_frames, height, width);
+    rows_px (n_rows,); shift_px (n_frames, 2) → (n_frames, n_rows, n_along).
     """
     import cv2
 

@@ -12,9 +12,8 @@ from numba import njit
 
 from vinetrack.video.edge_cover import FASTMATH, NO_REFCOUNT, coverage_reach, coverage_table, subpixel_index
 
+# Largest factor of a product whose logarithm is taken, and number of factors (derived)
 LARGEST_FACTOR, FACTORS = 1e9, 32
-"""Largest factor of a product whose logarithm is taken, and number of factors. Derived: (1e9)^32 = 1e288 is a finite
-number; a residual of 1000 grey levels gives a factor of 1e6."""
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
@@ -31,21 +30,9 @@ def distance_sums(
     frames: np.ndarray,
     shading: np.ndarray,
 ) -> np.ndarray:
-    """Sum the residuals of a fit by distance from the edge, 1 px per bin, edge at the middle bin.
-
-    The sums are of z² / var z, with z = Σ C r / v over the rows of a column (C the contrast, r the
-    residual, v the variance), and of the number of terms. Their ratio is 1 on average for white noise, more where noise
-    is correlated between rows (grain of the film, the tail moving inside).
-
-    Parameters
-    ----------
-    strip, scale, offset, lengths, lag, blur, appearance, margin, shading : as in `edge_kernels.fit_edges`.
-    fit : from `edge_kernels.fit_edges`, shape (n_frames, 6).
-    frames : those to sum over, shape (n_used,).
-
-    Returns
-    -------
-    sums, shape (n_used, n_bins, 2).
+    """Sum the residuals of a fit by distance from the edge, 1 px per bin, edge at the middle bin. The sums are of z² /
+    var z, with z = Σ C r / v over the rows of a column (C the contrast, r the residual, v the variance), and of the
+    number of terms. Shapes: fit (n_frames, 6); frames (n_used,) → (n_used, n_bins, 2).
     """
     _, rows, columns = strip.shape
     bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
@@ -93,14 +80,7 @@ def place_sums(
     shading: np.ndarray,
 ) -> np.ndarray:
     """Sum Σ w r and Σ w by distance from the row's own edge, in the bins of `shading`, w the weight and r the residual.
-
-    Parameters
-    ----------
-    strip, scale, offset, fit, lengths, lag, blur, appearance, margin, frames, shading : as in `distance_sums`.
-
-    Returns
-    -------
-    sums, shape (n_used, 2, n_distances).
+    Shape (n_used, 2, n_distances).
     """
     _, rows, columns = strip.shape
     by_place, pixels = np.zeros((len(frames), 2, len(shading))), np.empty((2, columns))
@@ -142,10 +122,9 @@ def _residuals_of_row(
     level: float, half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray,
     pixels: np.ndarray,
 ) -> tuple[int, int, int, float]:  # fmt: skip
-    """Write residual and weight of the pixels of a row into the first columns of `pixels`.
-
-    Their first column in the picture and in the table, their number, and the fraction of the row's edge are returned.
-    Each loop writes one array: the compiler then proves that none overlaps, and computes several pixels at a time.
+    """Write residual and weight of the pixels of a row into the first columns of `pixels`. Their first column in the
+    picture and in the table, their number, and the fraction of the row's edge are returned. Each loop writes one array:
+    the compiler then proves that none overlaps, and computes several pixels at a time.
     """
     whole_px, j, f, _ = subpixel_index(row_edge)
     a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
@@ -183,15 +162,8 @@ def row_sums(
     frames: np.ndarray,
     shading: np.ndarray,
 ) -> np.ndarray:
-    """Sum Σ g r and Σ g² by row, weighted, with g the derivative of the model with respect to the row's lag.
-
-    Parameters
-    ----------
-    strip, scale, offset, fit, lengths, lag, blur, appearance, margin, frames, shading : as in `distance_sums`.
-
-    Returns
-    -------
-    sums, shape (n_used, n_across, 2).
+    """Sum Σ g r and Σ g² by row, weighted, with g the derivative of the model with respect to the row's lag. Shape
+    (n_used, n_across, 2).
     """
     _, rows, columns = strip.shape
     by_row = np.zeros((len(frames), rows, 2))
@@ -254,17 +226,8 @@ def misfit_sums(
     shading: np.ndarray,
 ) -> np.ndarray:
     """Sum log(1 + r²/9v̄) over all pixels, v̄ the mean of the variances of film and background, and count the pixels.
-
     The mean is a robust misfit for comparing blurs. The variance does not depend on the blur: otherwise a wider blur
-    would lower its own misfit.
-
-    Parameters
-    ----------
-    strip, scale, offset, fit, lengths, lag, blur, appearance, margin, frames, shading : as in `distance_sums`.
-
-    Returns
-    -------
-    sums and numbers of pixels, shape (n_used, 2).
+    would lower its own misfit. Shape (n_used, 2).
     """
     _, rows, columns = strip.shape
     out = np.zeros((len(frames), 2))

@@ -13,42 +13,21 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 
-HALF_WINDOW_PX = 12
-"""Half the side of the window. Beyond it a strong lens bends edges by more than the fit gains: 6 k₁ r / f² · 12²/2 ≈
-0.015 px. Derived with k₁ of a wide lens."""
-EDGE_SHARE = 0.42
-"""Part of a square over which its edges are followed from the corner. Chosen below half, where the next corner begins
-to blur in. At half, a quarter of the pixels count and noise doubles."""
-LARGEST_MOVE_PX = 2.5
-"""Largest distance of a refined corner from the detected one; beyond it there was no corner. Chosen: detected corners
-are good to a pixel. At half some are refused, at twice a neighbouring mark may be taken."""
-FIRST_BLUR_PX = 1.1
-"""First value of the blur. Chosen as usual for a sharp picture; the result does not depend on it."""
+HALF_WINDOW_PX = 12  # Half the side of the window (derived)
+EDGE_SHARE = 0.42  # Part of a square over which its edges are followed from the corner (chosen)
+LARGEST_MOVE_PX = 2.5  # Largest distance of a refined corner from the detected one (chosen)
+FIRST_BLUR_PX = 1.1  # First value of the blur (chosen)
 
-BLURS_PX = (0.4, 8.0)
-"""Bounds of the blur. Chosen: sharper is not sampled, and wider than two thirds of the window shows no corner."""
+BLURS_PX = (0.4, 8.0)  # Bounds of the blur (chosen)
 
-MOST_STEPS, SETTLED_PX = 20, 1e-4
-"""Most steps of the fit, and the step at which a corner has converged. Chosen: a hundredth of the error; more steps
-cost time alone."""
+MOST_STEPS, SETTLED_PX = 20, 1e-4  # Most steps of the fit, and the step at which a corner has converged (chosen)
 
 
 def refine_saddles(
     picture: NDArray[np.uint8], corners_px: Floats, steps_px: Floats, free_share: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Refine corners of a pattern of squares.
-
-    Parameters
-    ----------
-    picture : grey levels, shape (height, width).
-    corners_px : detected corners (x, y), shape (n, 2), good to LARGEST_MOVE_PX.
-    steps_px : steps in the picture to the next corner along the pattern's two directions, shape (n, 2, 2): [:, 0] and
-        [:, 1].
-    free_share : part of a square on both sides of an edge that is empty (the gap beside markers; 0.5 without any).
-
-    Returns
-    -------
-    corners, shape (n, 2), and mask of those for which the fit holds, shape (n,).
+    """Refine corners of a pattern of squares. Returns corners, shape (n, 2), and mask of those for which the fit holds,
+    shape (n,). Shapes: picture (height, width); corners_px (n, 2); steps_px (n, 2, 2).
     """
     offsets, levels, weights = _windows(picture, corners_px, steps_px, free_share)
     values = _first_values(offsets, levels, weights, steps_px)
@@ -79,10 +58,9 @@ def refine_saddles(
 def _windows(
     picture: NDArray[np.uint8], corners_px: Floats, steps_px: Floats, free_share: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Offsets (n, k, 2) of the pixels around each corner from its nearest pixel, their levels and weights (n, k).
-
-    A pixel counts where, in steps of the pattern from the detected corner, it lies within EDGE_SHARE both ways and
-    within `free_share`, less the blur, of one of the edges.
+    """Offsets (n, k, 2) of the pixels around each corner from its nearest pixel, their levels and weights (n, k). A
+    pixel counts where, in steps of the pattern from the detected corner, it lies within EDGE_SHARE both ways and within
+    `free_share`, less the blur, of one of the edges.
     """
     reach = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 1)
     grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)

@@ -14,52 +14,20 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 
-SLOW_PX = 0.03
-"""Slow error of any edge, which nothing in a track shows: blur, level and exposure are shared by all rows. Measured
-together with SLOW_GREY and `shared_disagreement` on 59 rendered recordings (tuning seeds 1 to 8 of
-`benchmarks/tracking_accuracy.py`, two renderers): errors without noise were 0 to 0.06 px where nothing else indicated
-any. At half or twice, that of strong edges is two thirds of it or half as much again."""
-SLOW_GREY = 1.0
-"""Error of the pictures of film and background, in grey levels of 255. Measured as SLOW_PX: at contrasts of eight to
-ten grey levels errors without noise were 0.10 to 0.24 px. At half or twice, the slow error of faint edges halves or
-doubles."""
-LEAST_CONTRAST_GREY = 1.0
-"""Least contrast, in grey levels. Chosen: about the noise of a camera; the error ends at a pixel there."""
-CONTRAST_COLUMNS = 21
-"""Columns over which the contrast at an edge is taken, px. Chosen: about the length of a tip. At half or twice, errors
-along film of uneven brightness change more or less abruptly."""
-LAGS = (1, 2)
-"""Lags, in frames, at which bands that still disagree alike share a cause. Chosen: pixel noise is independent from
-frame to frame. Measured on the same recordings: lags 1, 2, 1 to 3, or 2 to 5 describe the errors equally well (root
-mean squares 0.84 to 0.95 of those stated in the harder presets); longer lags miss what comes and goes within ten
-frames."""
-FEWEST_PRODUCTS = 4
-"""Fewest pairs of frames at a lag. Chosen: fewer are inconclusive. By reasoning: half or twice changes the stated
-errors of the shortest recordings alone."""
-START_RANDOM_PART = 0.4
-"""Part of the error near the start that differs from frame to frame. Measured: 0.37 of what is stated, where 0.92 of it
-is the whole error, in 34 rendered recordings with a door (the same tuning seeds). At half or twice, the stated random
-error of the first frames halves or doubles."""
-GUESS_RANDOM_PART = math.sqrt(0.5)
-"""The same for an edge that is a guess, since a door or the mouth hides it. Chosen: random and slow error are equal,
-for nothing separates them. At half, the stated random error of such frames halves; it cannot be twice."""
-ARRIVAL_PX = 1.0
-"""Slow error of a tip that sweeps and bends, tracked by when the picture changes for good. Measured: about a pixel, see
-`vinetrack.video.kymograph`."""
+SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
+SLOW_GREY = 1.0  # Error of the pictures of film and background, in grey levels of 255 (measured)
+LEAST_CONTRAST_GREY = 1.0  # Least contrast, in grey levels (chosen)
+CONTRAST_COLUMNS = 21  # Columns over which the contrast at an edge is taken, px (chosen)
+LAGS = (1, 2)  # Lags, in frames, at which bands that still disagree alike share a cause (chosen)
+FEWEST_PRODUCTS = 4  # Fewest pairs of frames at a lag (chosen)
+START_RANDOM_PART = 0.4  # Part of the error near the start that differs from frame to frame (measured)
+GUESS_RANDOM_PART = math.sqrt(0.5)  # The same for an edge that is a guess, since a door or the mouth hides it (chosen)
+ARRIVAL_PX = 1.0  # Slow error of a tip that sweeps and bends, tracked by when the picture changes for good (measured)
 
 
 def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats:
-    """Slow error of each frame's edge, one standard deviation.
-
-    Parameters
-    ----------
-    edge_px : along the strip, shape (n_frames,), px.
-    contrast : mean signed contrast of film and background by column, shape (n_along,), grey levels; NaN where unknown.
-    shared_px : `shared_disagreement` of the bands, px.
-
-    Returns
-    -------
-    shape (n_frames,), px.
+    """Slow error of each frame's edge, one standard deviation. Shapes: edge_px (n_frames,); contrast (n_along,) →
+    (n_frames,).
     """
     from scipy.ndimage import median_filter
 
@@ -76,20 +44,10 @@ def slow_error_px(edge_px: Floats, contrast: Floats, shared_px: float) -> Floats
 
 
 def shared_disagreement(lead_px: Floats) -> float:
-    """Slow error of the mean of bands, from the part of their disagreement that lasts over several frames.
-
-    Bands that mirror each other about the axis are averaged first, since a tip that tilts moves one ahead and the other
-    behind and leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Of the rest,
-    products of frames a few apart have the mean (K − 1) σ² for K independent bands with slow error σ each; the mean of
-    the bands has the error σ/√K.
-
-    Parameters
-    ----------
-    lead_px : lead of each band over the edge in moving frames, shape (n_frames, n_bands), px; bands in order across.
-
-    Returns
-    -------
-    px; 0 where there are too few bands or frames.
+    """Slow error of the mean of bands, from the part of their disagreement that lasts over several frames. Bands that
+    mirror each other about the axis are averaged first, since a tip that tilts moves one ahead and the other behind and
+    leaves the mean unchanged. What all frames share is the shape of the tip and is removed. Shapes: lead_px (n_frames,
+    n_bands).
     """
     frames, bands = lead_px.shape
     if bands < 4 or frames < max(LAGS):
@@ -107,19 +65,9 @@ def shared_disagreement(lead_px: Floats) -> float:
 
 
 def noise_and_slow(bands_px: Floats, seen_px: Floats, apart_px: Floats) -> tuple[Floats, Floats]:
-    """Split what is added to the error of an edge into a random part and a slow part.
-
-    Random errors are independent between frames; slow ones are shared by neighbouring frames.
-
-    Parameters
-    ----------
-    bands_px : error from the disagreement of bands in one frame, shape (n_frames,), px.
-    seen_px : that in quadrature with the errors near the start and of a picture out of focus, shape (n_frames,), px.
-    apart_px : that in quadrature with the error of an edge that is a guess, shape (n_frames,), px.
-
-    Returns
-    -------
-    random and slow error, each of shape (n_frames,), px; their sum in quadrature is `apart_px`.
+    """Split what is added to the error of an edge into a random part and a slow part. Random errors are independent
+    between frames; slow ones are shared by neighbouring frames. Returns random and slow error, each of shape
+    (n_frames,), px; their sum in quadrature is `apart_px`. Shapes: bands_px, seen_px, apart_px (n_frames,).
     """
     near = np.sqrt(np.maximum(seen_px**2 - bands_px**2, 0.0))
     guess = np.sqrt(np.maximum(apart_px**2 - seen_px**2, 0.0))

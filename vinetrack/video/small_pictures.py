@@ -24,48 +24,26 @@ from vinetrack.video.order_kernels import (
 )
 from vinetrack.video.threads import FEWEST_PICTURES, in_parts
 
-SMALL_PX = 240
-"""Longer side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide; at half a
-thin vine is lost, at twice computing time is fourfold."""
-MAX_FRAMES = 150
-"""Maximum number of frames in which it is sought, spread evenly over the changes. Chosen for speed; they resolve 1 % of
-the growth."""
-BUSIEST_PIXELS = 200
-"""Number of pixels of a small picture whose mean change is its activity. Chosen: the area of a thin vine's tip; half or
-twice changes only how the MAX_FRAMES frames are spread over the changes."""
+SMALL_PX = 240  # Longer side of the pictures in which the axis is sought (chosen)
+MAX_FRAMES = 150  # Maximum number of frames in which it is sought, spread evenly over the changes (chosen)
+BUSIEST_PIXELS = 200  # Number of pixels of a small picture whose mean change is its activity (chosen)
+# Score of a pixel (measured)
 MIN_GROWTH_SCORE = 0.4
-"""Score of a pixel (the part of its change that lasts, times the part by which it stands out at the end) from which
-growth may have caused the change. Measured on 40 short tubes beside long doors (`benchmarks/long_doors.py`, seeds
-71001-71040) and 40 drawn by other code, axes more than 5 degrees off: 8 and 2 at 0.4, 7 and none at 0.2, 6 and 4 at
-0.6; 15 and 24 if all changes are used."""
-MIN_GROWN_PART = 0.16
-"""Part of all change that must pass MIN_GROWTH_SCORE; otherwise all changes are used: a sweeping vine leaves what it
-has covered. Chosen between 0.08 of a real vine that sweeps and 0.32, the smallest of those 40; at half that vine counts
-as one that stays, at twice two of those 40 do not."""
+MIN_GROWN_PART = 0.16  # Part of all change that must pass MIN_GROWTH_SCORE (chosen)
+# Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel (chosen)
 SURROUNDINGS_PX = 4.0
-"""Distance, in the small pictures, over which unchanged pixels define the surroundings of a pixel. Chosen: between the
-widths of thin and wide tubes. Measured on the same recordings: 6 and 4 axes are off at half, 8 and none at twice."""
-END_DIVISOR = 12
-"""One in so many pictures at either end are averaged (median) into the first and last appearance. Chosen: at least two,
-so that a single bad picture does not count; by reasoning, nothing changes at half or twice while the scene rests that
-long."""
+END_DIVISOR = 12  # One in so many pictures at either end are averaged (chosen)
+# Time by which the change of a pixel may differ from the passage of the front (chosen)
 TOLERANCE, MIN_TOLERANCE = 0.03, 2.0
-"""Time by which the change of a pixel may differ from the passage of the front: part of the pictures, and minimum
-number of pictures. Chosen: it covers the tip's shape and blur. By reasoning: at half round tips fall out of order, at
-twice doors come within it."""
-MIN_TIMING_INFORMATION = 0.05
-"""Minimum information of a change, in nats. Chosen so that a recording in which everything changes at once, as where a
-vine takes two pictures, still gives an answer. Half or twice changes nothing in other recordings."""
+MIN_TIMING_INFORMATION = 0.05  # Minimum information of a change, in nats (chosen)
 
-Pixels = tuple[Floats, Floats, Floats, Floats, int]
-"""Pixels that change: x, y, time of change and weight, shape (n_pixels,) each; and the number of pictures."""
+Pixels = tuple[Floats, Floats, Floats, Floats, int]  # Pixels that change: x, y, time of change and weight, shape
 
 
 class SmallPictures:
-    """The frames of a recording, shrunk once for every step that looks for its axis.
-
-    `frames`, shape (n_frames, height, width), are in grey levels of 255, corrected for flicker; `factor` is the factor
-    by which they were shrunk and `shape` their original height and width, px.
+    """The frames of a recording, shrunk once for every step that looks for its axis. `frames`, shape (n_frames, height,
+    width), are in grey levels of 255, corrected for flicker; `factor` is the factor by which they were shrunk and
+    `shape` their original height and width, px.
     """
 
     def __init__(self, luma: NDArray[Any]) -> None:
@@ -84,10 +62,9 @@ class SmallPictures:
 
     @cached_property
     def grown(self) -> Pixels:
-        """Pixels that change as in growth: the change lasts, and stands out where nothing did before.
-
-        Their weight is reduced where many change at the same time, as where a door comes to rest. If hardly any change
-        lasts (MIN_GROWN_PART), this is `changed`.
+        """Pixels that change as in growth: the change lasts, and stands out where nothing did before. Their weight is
+        reduced where many change at the same time, as where a door comes to rest. If hardly any change lasts
+        (MIN_GROWN_PART), this is `changed`.
         """
         x, y, time, weight, n_times = self.changed
         if not len(x):
@@ -103,17 +80,7 @@ class SmallPictures:
 
 
 def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
-    """Find the pixels that change.
-
-    Parameters
-    ----------
-    small : brightness, shape (n_frames, height, width).
-    count : number of frames, from the first, that are used.
-
-    Returns
-    -------
-    the pixels.
-    """
+    """Find the pixels that change. Shapes: small (n_frames, height, width)."""
     return _changed(*_frames_with_change(small[:count]))
 
 
@@ -183,7 +150,6 @@ def _noise_power(frames: NDArray[np.float32]) -> float:
 
 def _step_fraction(values: Floats, frame: NDArray[np.int_], noise_power: float) -> Floats:
     """Fraction of each pixel's variance, beyond noise, that a single step at `frame` explains, shape (n_pixels,).
-
     `values` has shape (n_frames, n_pixels). A passing object leaves a pixel as it was, so that a step explains hardly
     any.
     """
@@ -199,10 +165,7 @@ def _contrast_gain(
     frames: NDArray[np.float32], rows: NDArray[np.int_], columns: NDArray[np.int_], noise_power: float
 ) -> Floats:
     """How much more changed pixels differ from their surroundings at the end than at the beginning, shape (n_pixels,).
-
-    1 if they did not differ at first, 0 if they do not differ at the end. The surroundings are unchanged pixels, on the
-    side where the contrast is most informative: film beside film that already stands differs from the ground above and
-    below.
+    1 if they did not differ at first, 0 if they do not differ at the end.
     """
     import cv2
 
@@ -246,24 +209,14 @@ def _side_sums(picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 
 def order_tolerance(n_times: int) -> float:
-    """Return by how many pictures a pixel may change before or after the front passes it.
-
-    Parameters
-    ----------
-    n_times : number of pictures.
-
-    Returns
-    -------
-    pictures.
-    """
+    """Return by how many pictures a pixel may change before or after the front passes it."""
     return max(MIN_TOLERANCE, TOLERANCE * n_times)
 
 
 def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
-    """Information of a pixel changing just when a front passes it, in nats, shape (n_pixels,).
-
-    It is minus the logarithm of the fraction of all change that occurs at that time: where much changes at once, the
-    order of changes says little.
+    """Information of a pixel changing just when a front passes it, in nats, shape (n_pixels,). It is minus the
+    logarithm of the fraction of all change that occurs at that time: where much changes at once, the order of changes
+    says little.
     """
     by_time = np.bincount(time.astype(int), weight, n_times)
     span = int(order_tolerance(n_times))

@@ -12,34 +12,14 @@ import numpy as np
 from vinetrack.core.records import Bools
 from vinetrack.video.frames import Frames, RecordingError
 
-LONGEST_HOLE = 1
-"""Most frames missing in a row that the tracker bridges. Measured (clips of the laboratory of 101, 71 and 56 frames,
-seeds 40 to 42): errors stay below 0.7 mm with one, reach 5 and 11 mm with two and three, and 28 mm with six."""
-MOST_DROPPED = 3
-"""Most frames missing in a row that a recorder may have dropped from an undamaged recording. Chosen: single frames are
-dropped; more than three were lost from the file. At half, two in a row break a recording; at twice, six are bridged."""
-LEAST_PART = 0.5
-"""Least part of the frames that must follow each other without damage. Measured (36 damaged clips of the laboratory,
-seed 20100): of those with less, 6 of 17 were tracked to wrong places by up to 16 mm, since neither rest nor background
-were seen; of 4 with more none by over 0.3 mm, nor of 10 others (seed 20101)."""
+LONGEST_HOLE = 1  # Most frames missing in a row that the tracker bridges (measured)
+MOST_DROPPED = 3  # Most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
+LEAST_PART = 0.5  # Least part of the frames that must follow each other without damage (measured)
 
 
 def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
     """Frames to be tracked: all that are allowed where none is damaged, else the longest stretch without damage.
-
-    Parameters
-    ----------
-    frames : decoded, `damaged` marked.
-    allowed : frames that the sheet allows, mask, shape (n_frames,).
-
-    Returns
-    -------
-    mask, shape (n_frames,).
-
-    Raises
-    ------
-    RecordingError
-        In one sentence, where that stretch is not long enough.
+    Shapes: allowed (n_frames,) → (n_frames,).
     """
     damaged = frames.damaged & allowed
     # Lost frames, within the recording or at its end, count as damage.

@@ -28,24 +28,11 @@ from vinetrack.video.registration import (
 )
 from vinetrack.video.strip import BAND_GAP_PX
 
-GROUND_PX = 120
-"""Distance from the tube within which background counts. Chosen: some thousand pixels lie there, in the plane in which
-the vine grows; half leaves fewer, twice lets more in that moves by itself."""
+GROUND_PX = 120  # Distance from the tube within which background counts (chosen)
 
 
 def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Floats | None:
-    """Measure how far each picture moved against the others.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : the curve, px.
-    half_px : half the width of what moves along it, px.
-
-    Returns
-    -------
-    right and down, shape (n_frames, 2), px; None where nothing shakes, or too little stands still.
-    """
+    """Measure how far each picture moved against the others. Shapes: luma (n_frames, height, width) → (n_frames, 2)."""
     height, width = luma.shape[1:]
     level = Axis((0.0, 0.0), (float(max(width - 1, 10)), 0.0))
     y, x = (values.ravel() for values in np.mgrid[2 : height - 2 : 2, 2 : width - 2 : 2])

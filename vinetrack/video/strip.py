@@ -17,26 +17,16 @@ from vinetrack.video.axis import Axis
 from vinetrack.video.registration import camera_unit, stabilise
 from vinetrack.video.resample import sample
 
-BAND_GAP_PX = 5
-"""Rows left out between tube and band, to allow for sway and blur. Chosen; at half a swaying tube enters the bands, at
-twice small pictures have no bands."""
+BAND_GAP_PX = 5  # Rows left out between tube and band, to allow for sway and blur (chosen)
+# Slope of an axis over its whole length up to which it is treated as lying along rows or columns (chosen)
 SNAP_TOLERANCE_PX = 0.4
-"""Slope of an axis over its whole length up to which it is treated as lying along rows or columns. Chosen: rows then
-lag by a fifth of a pixel at most. At half more strips are interpolated, at twice rows lag by up to 0.4 px."""
-BAND_HEIGHT_PX = (14, 44)
-"""Minimum and maximum height of a band. Chosen: at the minimum, two bands hold SHIFT_PIXELS of `registration` along 320
-px of axis. Half or twice changes how accurately flicker is known."""
+BAND_HEIGHT_PX = (14, 44)  # Minimum and maximum height of a band (chosen)
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Pixels along the axis in every frame.
-
-    `values`, shape (n_frames, n_across, n_along), are as the camera wrote them; `scale * values + offset`, shape
-    (n_frames,) each, is in grey levels of 255 and free of flicker. `shift_px`, shape (n_frames, 2), is the displacement
-    of the picture along and across the axis, already removed from the values; `noise` is the standard deviation of a
-    pixel, grey levels. `axis` runs through column 0 and along the middle row. `stabilised` tells whether camera shake
-    was removed.
+    """Pixels along the axis in every frame. `values`, shape (n_frames, n_across, n_along), are as the camera wrote
+    them; `scale * values + offset`, shape (n_frames,) each, is in grey levels of 255 and free of flicker.
     """
 
     values: NDArray[Any]
@@ -54,18 +44,8 @@ class Strip:
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = False) -> Strip:
-    """Cut the strip on both sides of an axis; correct flicker and camera shake.
-
-    Parameters
-    ----------
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    half_px : half the height of the strip, px.
-    still : True if the camera is known not to shake: only flicker is then corrected.
-
-    Returns
-    -------
-    the strip.
+    """Cut the strip on both sides of an axis; correct flicker and camera shake. Shapes: luma (n_frames,
+    height, width).
     """
     half = int(np.ceil(half_px))
     bands = _band_rows(luma.shape[1:], axis, half)
@@ -80,18 +60,8 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = Fals
 
 
 def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
-    """Cut the same frames along a slightly different axis, with the gain and shift of `strip`.
-
-    Parameters
-    ----------
-    strip : the first cut.
-    luma : grey levels, shape (n_frames, height, width).
-    axis : in the picture, px.
-    half_px : half the height of the strip, px.
-
-    Returns
-    -------
-    the strip.
+    """Cut the same frames along a slightly different axis, with the gain and shift of `strip`. Shapes: luma (n_frames,
+    height, width).
     """
     half = int(np.ceil(half_px))
     values = sample(luma, axis, np.arange(-half, half + 1), strip.shake_px)
@@ -99,18 +69,8 @@ def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip
 
 
 def snap_to_grid(axis: Axis, tolerance_px: float = SNAP_TOLERANCE_PX) -> Axis:
-    """Move an axis that lies along rows or columns, except for a small slope, onto whole rows or columns.
-
-    Cutting then needs no interpolation, and a tenth of the time.
-
-    Parameters
-    ----------
-    axis : in the picture, px.
-    tolerance_px : slope over the whole length up to which the axis is moved, px.
-
-    Returns
-    -------
-    the moved axis; the given one if it slopes by more or is a curve.
+    """Move an axis that lies along rows or columns, except for a small slope, onto whole rows or columns. Cutting then
+    needs no interpolation, and a tenth of the time.
     """
     if type(axis) is not Axis:
         return axis
@@ -141,7 +101,6 @@ def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np
 
 def _noise(values: NDArray[Any], scale: Floats) -> float:
     """Estimate the standard deviation of a pixel from differences of neighbouring frames, grey levels, at least 1.
-
     Medians over pixels are used, since motion affects few of them. The minimum is needed because compression freezes a
     picture at rest, while moving pixels are never known better than to a grey level.
     """

@@ -31,21 +31,15 @@ if TYPE_CHECKING:
     from vinetrack.video.raw_frames import RawFrames
 
 SETTINGS = "experiment.yaml"
-LARGEST_WALKED_BYTES = 64_000_000
-"""Largest file without an index that is read to its end to count its frames; a hundred larger ones would take minutes.
-Chosen: half a second at 130 MB/s. At twice, a check takes twice as long; at half, fewer recordings have their frames
-counted."""
+LARGEST_WALKED_BYTES = 64_000_000  # Largest file without an index that is read to its end to count its frames (chosen)
 
 
-MOST_LOOKS = 12
-"""Most recordings that are looked into, about a second each. Chosen: at half of them a sheet of eight conditions is not
-covered; at twice as many `check` takes half a minute."""
+MOST_LOOKS = 12  # Most recordings that are looked into, about a second each (chosen)
 
 
 class Surveyor:
-    """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial.
-
-    `looked_into` are the trials whose frames were looked at.
+    """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
+    trials whose frames were looked at.
     """
 
     def __init__(self) -> None:
@@ -53,17 +47,7 @@ class Surveyor:
         self.looked_into: list[Trial] = []
 
     def __call__(self, experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-        """List the problems of the recordings of these trials, each with the trial's name, and of the calibration.
-
-        Parameters
-        ----------
-        experiment : its settings (`calibration`, `axis`) and folder.
-        trials : those whose recording exists.
-
-        Returns
-        -------
-        problems : of the recordings first.
-        """
+        """List the problems of the recordings of these trials, each with the trial's name, and of the calibration."""
         problems: list[Problem] = []
         opened: dict[Trial, Recording] = {}
         sound: list[Trial] = []
@@ -87,16 +71,7 @@ class Surveyor:
 
 
 def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-    """List the problems of the recordings of these trials; see `Surveyor`.
-
-    Parameters
-    ----------
-    experiment, trials : see `Surveyor`.
-
-    Returns
-    -------
-    problems, of the recordings first.
-    """
+    """List the problems of the recordings of these trials; see `Surveyor`."""
     return Surveyor()(experiment, trials)
 
 

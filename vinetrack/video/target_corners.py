@@ -18,19 +18,12 @@ if TYPE_CHECKING:
 
 Grey = NDArray[np.uint8]
 
-FEWEST_CORNERS = 8
-"""Fewest corners of a calibration. A plane and a lens are ten numbers, two of them nearly fixed beforehand: four
-corners would fit anything. Chosen: sixteen coordinates for the ten numbers."""
+FEWEST_CORNERS = 8  # Fewest corners of a calibration (chosen)
+# Distance, in squares, from where the board has it beyond which a marker belongs to another board (chosen)
 MARKER_OUTLIER = 0.3
-"""Distance, in squares, from where the board has it beyond which a marker belongs to another board. Chosen: below half
-a square, where the next marker begins. At half bent boards are refused, at twice markers of another board pass."""
+# Relative difference from `marker_mm` above which markers were printed at another size (chosen)
 MARKER_TOLERANCE = 0.10
-"""Relative difference from `marker_mm` above which markers were printed at another size. Blur alone makes small ones
-(25 px) look 4 % smaller. Chosen above that 4 %, below the steps of usual prints. At half small markers are refused, at
-twice a print scaled to fit the page passes."""
-DICTIONARY_SIZES = (50, 100, 250, 1000)
-"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger one. Defined by
-OpenCV."""
+DICTIONARY_SIZES = (50, 100, 250, 1000)  # Words in OpenCV's dictionaries of each marker size (defined)
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
 
@@ -39,15 +32,8 @@ class CornersError(ValueError):
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
-    """Stretch grey levels, shape (height, width), so that 0.5 % of the pixels are black and 0.5 % white.
-
-    Parameters
-    ----------
-    picture : grey levels of any depth, shape (height, width).
-
-    Returns
-    -------
-    shape (height, width), 0 to 255.
+    """Stretch grey levels, shape (height, width), so that 0.5 % of the pixels are black and 0.5 % white. Shapes:
+    picture (height, width) → (height, width).
     """
     low, high = np.percentile(picture, [0.5, 99.5])
     stretched = (picture.astype(np.float32) - low) * (255 / max(float(high - low), 1.0))
@@ -55,23 +41,9 @@ def eight_bits(picture: NDArray[Any]) -> Grey:
 
 
 def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floats]:
-    """Find the corners of a ChArUco board in the picture (px) and on the board (m).
-
-    Boards printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
-
-    Parameters
-    ----------
-    picture : grey levels of any depth, shape (height, width).
-    board : what the target is.
-
-    Returns
-    -------
-    corners in the picture (px) and on the board (m), both of shape (n, 2).
-
-    Raises
-    ------
-    CornersError
-        Where no marker is seen, markers lie as on another board, or fewer than FEWEST_CORNERS corners are found.
+    """Find the corners of a ChArUco board in the picture (px) and on the board (m). Boards printed by OpenCV before 4.6
+    (markers in the other squares where the rows are even) are recognised too. Returns corners in the picture (px) and
+    on the board (m), both of shape (n, 2). Shapes: picture (height, width).
     """
     import cv2
 
@@ -108,21 +80,8 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
-    """Find the inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m).
-
-    Parameters
-    ----------
-    picture : grey levels of any depth, shape (height, width).
-    board : what the target is.
-
-    Returns
-    -------
-    corners in the picture (px) and on the board (m), both of shape (n, 2).
-
-    Raises
-    ------
-    CornersError
-        Where no checkerboard of that many squares is seen.
+    """Find the inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m). Returns
+    corners in the picture (px) and on the board (m), both of shape (n, 2). Shapes: picture (height, width).
     """
     grey = eight_bits(picture)
     across, down = board.squares
@@ -138,16 +97,8 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
 
 
 def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Detect the markers of a dictionary in a picture.
-
-    Parameters
-    ----------
-    grey : grey levels, shape (height, width).
-    dictionary : its name in OpenCV.
-
-    Returns
-    -------
-    corners of each marker, shape (1, 4, 2), px, and their numbers, shape (n, 1)
+    """Detect the markers of a dictionary in a picture. Returns corners of each marker, shape (1, 4, 2), px, and their
+    numbers, shape (n, 1). Shapes: grey (height, width).
     """
     return _detect_markers(grey, _dictionary(dictionary))
 
@@ -155,19 +106,8 @@ def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]]
 def marker_agreement(
     corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: str
 ) -> tuple[float, float]:
-    """Share of markers that lie where a board has them, and their size (mm) relative to squares of `square_mm`.
-
-    Boards printed by OpenCV before 4.6 count too.
-
-    Parameters
-    ----------
-    corners, ids : from `markers_seen`.
-    board : layout and sizes; its dictionary is not used.
-    dictionary : of the markers.
-
-    Returns
-    -------
-    share, marker_mm
+    """Share of markers that lie where a board has them, and their size (mm) relative to squares of `square_mm`. Boards
+    printed by OpenCV before 4.6 count too. Returns share, marker_mm.
     """
     predefined = _dictionary(dictionary)
     layouts = [_charuco_board(board, predefined, legacy) for legacy in (False, True)]
@@ -178,14 +118,7 @@ def marker_agreement(
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
     """Count the squares across and down of the checkerboard in a picture, as far as visible; None where there is none.
-
-    Parameters
-    ----------
-    grey : grey levels, shape (height, width).
-
-    Returns
-    -------
-    across, down; or None.
+    Returns across, down; or None. Shapes: grey (height, width).
     """
     import cv2
 
@@ -243,9 +176,8 @@ def _detect_markers(
 
 
 def _marker_agreement(layout: Any, corners: list[Any], ids: NDArray[np.int32], board: Charuco) -> tuple[float, float]:
-    """Share of markers where the board has them, and their size (mm) when squares are `square_mm`.
-
-    The centres of the markers fix the plane whatever their size; sizes are then measured in that plane.
+    """Share of markers where the board has them, and their size (mm) when squares are `square_mm`. The centres of the
+    markers fix the plane whatever their size; sizes are then measured in that plane.
     """
     import cv2
 

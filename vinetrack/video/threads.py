@@ -11,23 +11,14 @@ from vinetrack.core.thread_pool import available_cores, thread_pool
 
 Part = TypeVar("Part")
 
-MOST_THREADS = 4
-"""Most threads of one recording. Chosen: half of the time of tracking is spent in loops that can be divided, so that
-four threads take three eighths from it; half as many take a quarter, twice as many a further sixteenth."""
-FEWEST_PICTURES = 16
-"""Fewest pictures for which another thread is used. Chosen: a loop over them takes half a millisecond or more, and
-handing work to a thread 0.05 ms. At half or twice only time changes."""
+MOST_THREADS = 4  # Most threads of one recording (chosen)
+FEWEST_PICTURES = 16  # Fewest pictures for which another thread is used (chosen)
 
 
 def n_threads() -> int:
-    """Number of threads that the tracking of a recording may use.
-
-    It is 1 in a worker process, beside which others track other recordings, and at most OMP_NUM_THREADS where that is
-    set: the workflow sets it to 1 for every recording, since it tracks as many at a time as there are cores.
-
-    Returns
-    -------
-    number of threads.
+    """Number of threads that the tracking of a recording may use. It is 1 in a worker process, beside which others
+    track other recordings, and at most OMP_NUM_THREADS where that is set: the workflow sets it to 1 for every
+    recording, since it tracks as many at a time as there are cores.
     """
     if multiprocessing.parent_process() is not None:
         return 1
@@ -37,18 +28,7 @@ def n_threads() -> int:
 
 
 def in_parts(work: Callable[[int, int], Part], count: int, least: int) -> list[Part]:
-    """Call `work(first, one behind the last)` for consecutive parts of a range, side by side.
-
-    Parameters
-    ----------
-    work : releases Python's lock; what it computes of an item must not depend on the other items of its part.
-    count : number of items.
-    least : fewest items for which a thread is worth its start.
-
-    Returns
-    -------
-    what `work` returned for each part, in order.
-    """
+    """Call `work(first, one behind the last)` for consecutive parts of a range, side by side."""
     threads = 1 if count < 2 * least else min(n_threads(), count // least)
     if threads == 1:
         return [work(0, count)]

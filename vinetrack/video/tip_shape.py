@@ -23,53 +23,28 @@ from vinetrack.video.edge_state import (
 )
 from vinetrack.video.strip import Strip
 
-SHADING_KERNEL = (0.25, 0.5, 0.25)
-"""Smoothing kernel of the tip's shading. Chosen: a pixel wide, no sharper than optics are. By reasoning: without it,
-noise of single pixels is taken for shading; over twice the width, a narrow rim is blurred."""
+SHADING_KERNEL = (0.25, 0.5, 0.25)  # Smoothing kernel of the tip's shading (chosen)
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
-NEAR_BLURS = np.array([0.7, 0.85, 1, 1.2, 1.4])
-"""Blurs that are tried near the last estimate, as a part of it. Chosen: steps like those of BLURS_PX, halved."""
+NEAR_BLURS = np.array([0.7, 0.85, 1, 1.2, 1.4])  # Blurs that are tried near the last estimate, as a part of it (chosen)
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
-ASSUMED_EXPOSURE = 0.25
-"""Exposure over frame period until it is estimated. Chosen as usual for high-speed cameras; it is replaced after the
-second round."""
-FEWEST_FAST_FRAMES = 6
-"""Fewest frames from which a blur is told from the shape of the tip. Chosen: a clip of eight frames, five of them in
-motion and without any blur, showed one of 0.4 frames. The fastest trials of the demonstration have seven."""
+ASSUMED_EXPOSURE = 0.25  # Exposure over frame period until it is estimated (chosen)
+FEWEST_FAST_FRAMES = 6  # Fewest frames from which a blur is told from the shape of the tip (chosen)
+# Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is contradicted
+# (measured)
 CONTRADICTION_RATIO = 1.01
-"""Ratio of the misfit with the stated exposure to the least of any exposure, above which the stated one is
-contradicted. Measured (seeds 20900 and up): the true exposure leaves a misfit within 1.003 of the least but in one
-recording of eight (1.012); twice the true one or more leaves 1.02 to 1.35 where the edge moves 7 px a frame."""
-LARGEST_LAG_STEP_PX = 4.0
-"""Largest change of a row's lag in one round. Chosen as trust region; only the number of rounds depends on it."""
+LARGEST_LAG_STEP_PX = 4.0  # Largest change of a row's lag in one round (chosen)
 
-DEEPEST_LAG_PX = 60.0
-"""Largest lag of a row behind the foremost point. Chosen: above the radius of the widest tip, 36 px at 3 px/mm."""
+DEEPEST_LAG_PX = 60.0  # Largest lag of a row behind the foremost point (chosen)
 
-BLUR_FRAMES = 16
-"""Frames from which the blur is estimated. Chosen for time; at half the blur scatters by 1.4 times as much."""
+BLUR_FRAMES = 16  # Frames from which the blur is estimated (chosen)
 
-OPTICAL_BLUR_PX = (0.4, 3.0)
-"""Bounds of the optical blur, from a sharp pixel to a picture out of focus; a wider blur is fitted only where noise
-drowns the edge. Chosen; sharper is not sampled, and wider is noise."""
+OPTICAL_BLUR_PX = (0.4, 3.0)  # Bounds of the optical blur, from a sharp pixel to a picture out of focus (chosen)
 
 
 def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) -> EdgeState:
-    """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur.
-
-    Both come from the core frames with less motion blur; frames in which a door may still stand in front of the tip are
-    not among them.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    everywhere : whether all blurs are tried, not only those near the last one.
-
-    Returns
-    -------
-    the state with new `lag` and `blur`, and the edge moved to the foremost point.
+    """Estimate by how much each row of the tip lags behind its foremost point, then the optical blur. Both come from
+    the core frames with less motion blur; frames in which a door may still stand in front of the tip are not among
+    them. Shapes: fit (n_frames, 6).
     """
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
@@ -102,20 +77,9 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, everywhere: bool) ->
 
 
 def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
-    """Estimate what the tip shows beyond film and background, by distance ahead of the edge.
-
-    A round tip is lit differently from the tube behind it: its rim may be as bright as the background where the film is
-    darker, and the edge would be fitted behind the rim.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-
-    Returns
-    -------
-    the state with new `shading`.
+    """Estimate what the tip shows beyond film and background, by distance ahead of the edge. A round tip is lit
+    differently from the tube behind it: its rim may be as bright as the background where the film is darker, and the
+    edge would be fitted behind the rim. Shapes: fit (n_frames, 6).
     """
     core = core_frames(state, fit)
     for _ in range(2):
@@ -138,19 +102,8 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
-    """Exposure, in frame periods, that explains the blur of the faster frames best.
-
-    It is ASSUMED_EXPOSURE where no frame moves 2 px.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-
-    Returns
-    -------
-    exposure over frame period.
+    """Exposure, in frame periods, that explains the blur of the faster frames best. It is ASSUMED_EXPOSURE where no
+    frame moves 2 px. Shapes: fit (n_frames, 6).
     """
     speed, fast = _fast_frames(state, fit)
     if not fast.any():
@@ -159,19 +112,9 @@ def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
 
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
-    """Find the exposure that the blur shows where it contradicts the stated one.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    stated_frames : stated exposure over frame period.
-
-    Returns
-    -------
-    exposure over frame period, NaN where the stated one explains the blur as well (CONTRADICTION_RATIO); and the median
-        speed of the frames used, px a frame.
+    """Find the exposure that the blur shows where it contradicts the stated one. Returns exposure over frame period,
+    NaN where the stated one explains the blur as well (CONTRADICTION_RATIO); and the median: speed of the frames used,
+    px a frame. Shapes: fit (n_frames, 6).
     """
     speed, fast = _fast_frames(state, fit)
     if fast.sum() < FEWEST_FAST_FRAMES:
@@ -192,9 +135,8 @@ def _fast_frames(state: EdgeState, fit: Floats) -> tuple[Floats, NDArray[np.bool
 def _misfits_of_exposures(
     strip: Strip, state: EdgeState, fit: Floats, speed: Floats, frames: NDArray[np.bool_], exposures: Floats
 ) -> Floats:
-    """Misfit of some frames with each exposure, shape (n_exposures,).
-
-    The tip's shading is left out: at constant speed it looks like any error of the exposure.
+    """Misfit of some frames with each exposure, shape (n_exposures,). The tip's shading is left out: at constant speed
+    it looks like any error of the exposure.
     """
     bare = replace(state, shading=np.zeros_like(state.shading))
     return np.array([misfit(strip, replace(bare, lengths=speed * tau), fit, frames) for tau in exposures])
@@ -202,7 +144,6 @@ def _misfits_of_exposures(
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
     """Smooth the lag slightly along the rows, by weight, and subtract that of the foremost point; both are returned.
-
     The foremost point is the vertex of a parabola through the foremost third of the rows that show an edge: the
     smallest lag would follow their noise.
     """

@@ -47,34 +47,22 @@ if TYPE_CHECKING:
     from vinetrack.video.calibration import AxisScale
 
 
-FEWEST_FRAMES = 5
-"""Fewest frames that can be tracked. Derived: a fourth difference takes five."""
+FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)
 
-GIVEN_AXIS_MARGIN = 0.08
-"""Width added to a given axis, as a fraction of its length. Derived: the far end of an axis 2.3 degrees off lies off by
-0.04 of its length, to either side."""
-MOVING_PX = 0.3
-"""Step of a frame from which the frame counts for the roughness of the track. Chosen: at rest compression freezes the
-picture, and the track is smoother than its errors."""
+GIVEN_AXIS_MARGIN = 0.08  # Width added to a given axis, as a fraction of its length (derived)
+MOVING_PX = 0.3  # Step of a frame from which the frame counts for the roughness of the track (chosen)
+# Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing moves
+# (chosen)
 MOSTLY_LOST = 0.5
-"""Fraction of frames without an edge above which the message says that the edge is too vague, not that nothing moves.
-Chosen: the majority; it decides between two messages only."""
 
-STABILISED_PX = 0.1
-"""Error left after a shaken camera was stabilised on the still background. Measured: 0.1-0.15 px, mostly slow."""
+STABILISED_PX = 0.1  # Error left after a shaken camera was stabilised on the still background (measured)
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """A track and what a figure of it needs.
-
-    `kymograph`, shape (n_frames, n_along), is the strip's brightness averaged across, in grey levels; column j lies
-    `j` px from `axis.from_px`, and `edge_px` of the track counts from the same point. `pictures` are (frame number,
-    picture) of the first, middle and last moving frame: the full region, as the camera wrote it. `shake_px`, shape
-    (n_frames,), is how far along the axis a shaken camera moved each picture; what is drawn on a picture moves with it.
-    `tube_width_px` is the width of the tube behind the edge and `tube_width_sigma_px` its standard error, NaN for a
-    body and for a tube that leaves the axis. For `seen_exposure_frames` and `fast_px_per_frame` see `edge.EdgeFit`.
-    `strip_frames` are the frame numbers of the rows of `kymograph`, None for all.
+    """A track and what a figure of it needs. `kymograph`, shape (n_frames, n_along), is the strip's brightness averaged
+    across, in grey levels; column j lies `j` px from `axis.from_px`, and `edge_px` of the track counts from the same
+    point.
     """
 
     track: Track
@@ -103,25 +91,7 @@ def track_recording(
     m_per_px: float | None = None,
     position_m: Callable[[Floats], Floats] | None = None,
 ) -> Tracking:
-    """Track the leading edge of one recording, or the body where the travel ratio is 1.
-
-    Parameters
-    ----------
-    trial : its `video`, `capture_fps`, `exposure_s`, `travel_ratio` and, unless given here, `m_per_px` are used.
-    axis : growth axis in the picture; found from the motion where None. It is then centred on what moves along it.
-    m_per_px : scale; the trial's where None. Without any, positions in metres are NaN and those in pixels remain.
-    position_m : function from picture points (x, y), shape (n, 2), to metres along the axis: a calibration that
-        corrects distortion and tilt.
-
-    Returns
-    -------
-    the track, and what the report shows of it.
-
-    Raises
-    ------
-    RecordingError
-        In one sentence, where the recording holds no track.
-    """
+    """Track the leading edge of one recording, or the body where the travel ratio is 1. Shapes: position_m (n, 2)."""
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
@@ -140,24 +110,7 @@ def track_frames(
     position_m: Callable[[Floats], Floats] | None = None,
     along_path: Callable[[Axis], AxisScale] | None = None,
 ) -> Tracking:
-    """Track frames that are already in memory; see `track_recording`.
-
-    Parameters
-    ----------
-    frames : decoded, with their capture periods.
-    trial, axis, m_per_px, position_m : as in `track_recording`.
-    capture_fps : frames a second.
-    along_path : a calibration's scale along the axis; it replaces `position_m` and `m_per_px`.
-
-    Returns
-    -------
-    the track, and what the report shows of it.
-
-    Raises
-    ------
-    RecordingError
-        In one sentence, where the frames hold no track.
-    """
+    """Track frames that are already in memory; see `track_recording`."""
     name = frames.recording.path.name
     exposure_s = capture_exposure(trial, frames.recording)
     selection = _select_frames(frames, trial)
@@ -197,9 +150,8 @@ def track_frames(
 
 @dataclass(frozen=True)
 class _Selection:
-    """Frames to be tracked: their `rows` among the decoded frames and their `number` in the recording.
-
-    `notes` say which others are left out.
+    """Frames to be tracked: their `rows` among the decoded frames and their `number` in the recording. `notes` say
+    which others are left out.
     """
 
     rows: Indices
@@ -208,13 +160,7 @@ class _Selection:
 
 
 def _select_frames(frames: Frames, trial: Trial) -> _Selection:
-    """Frames that the sheet allows, of the longest undamaged stretch, without odd ones at the start.
-
-    Raises
-    ------
-    RecordingError
-        Where too few are left.
-    """
+    """Frames that the sheet allows, of the longest undamaged stretch, without odd ones at the start."""
     name = frames.recording.path.name
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
@@ -242,7 +188,6 @@ def _select_frames(frames: Frames, trial: Trial) -> _Selection:
 
 def _edge_errors(strip: Strip, followed: Positions, trial: Trial) -> tuple[Floats, Floats]:
     """Random error of each point, scaled to the roughness of the track; and its total error, with which it is judged.
-
     The roughness of the track and the disagreement of the bands measure the same noise, each blind to some of it: the
     larger one counts.
     """
@@ -303,19 +248,9 @@ def _notes(
 
 
 def locate_axis(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, FrontShare]:
-    """Find the growth axis, or give a known one a width and centre it on the motion.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    axis : in the picture, px; found from the motion where None.
-    trial : its diameter, or the axis, gives the width; its travel ratio says whether a tube or a body is looked for.
-    m_per_px : scale; None where unknown.
-
-    Returns
-    -------
-    the axis, px, and a function from an axis of its kind, straight or curved, to its `axis.front_share`: below
-        `axis.LEAST_FRONT_SHARE` where the vine bends or sweeps away.
+    """Find the growth axis, or give a known one a width and centre it on the motion. Returns the axis, px, and a
+    function from an axis of its kind, straight or curved, to its `axis.front_share`: below: `axis.LEAST_FRONT_SHARE`
+    where the vine bends or sweeps away. Shapes: luma (n_frames, height, width).
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
@@ -383,19 +318,7 @@ def _assemble(
 
 
 def in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
-    """Convert a track from pixels along its axis to metres.
-
-    Parameters
-    ----------
-    track : with its errors in px.
-    axis : along which its edge counts.
-    m_per_px : scale; positions and errors are NaN where it is.
-    position_m : function from picture points, shape (n, 2), px, to metres along the axis; replaces the scale.
-
-    Returns
-    -------
-    Track
-    """
+    """Convert a track from pixels along its axis to metres. Shapes: position_m (n, 2)."""
     if position_m is None:
         return _scaled(track, track.edge_px * m_per_px, m_per_px)
     finite = np.isfinite(track.edge_px)

@@ -14,39 +14,18 @@ from vinetrack.video.edge import Outline, outline
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.strip import Strip, recut, snap_to_grid
 
-MOST_RECUTS = 3
-"""Most times that the strip is cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew
-only while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
+MOST_RECUTS = 3  # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+# Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or columns
+# (chosen)
 FIRST_SLOPE = 0.08
-"""Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or
-columns. Chosen: the strip is 0.3 widths higher than the tube, and the tube's own slope is found in it. Only time
-depends on it."""
-OFF_CENTRE_PX = 0.8
-"""Tilt of the axis over its length, or shift, that is left uncorrected: the tip's rows then lag by under a tenth of it.
-Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
+OFF_CENTRE_PX = 0.8  # Tilt of the axis over its length, or shift, that is left uncorrected (chosen)
 
 
 def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tuple[Strip, Outline] | None:
-    """Cut the strip about the tube that grows along an axis.
-
-    An outline is found for anything that changes in order. Where that is no tube, the outline is arbitrary and no front
-    passes along its middle, which the front share along the middle shows.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    axis : roughly along the tube, with a width that holds it, px.
-    front_share_of : function from an axis to its `axis.front_share`.
-
-    Returns
-    -------
-    the strip, centred on the tube, and the tube's outline in it; None where no single front passes along the axis, or
-    none along the middle of what it leaves behind.
-
-    Raises
-    ------
-    ValueError
-        Where nothing in the strip changes as a passing front does.
+    """Cut the strip about the tube that grows along an axis. An outline is found for anything that changes in order.
+    Where that is no tube, the outline is arbitrary and no front passes along its middle, which the front share along
+    the middle shows. Returns the strip, centred on the tube, and the tube's outline in it; None where no single front
+    passes along the axis, or, none along the middle of what it leaves behind.. Shapes: luma (n_frames, height, width).
     """
     if front_share_of(axis) < LEAST_FRONT_SHARE:
         return None
@@ -65,19 +44,8 @@ def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tu
 
 
 def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
-    """Cut the strip anew about the tube's centreline; the same strip where it is centred already.
-
-    The ends of a given axis keep their places along it: only the position across is corrected.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    strip : cut from it.
-    tube : its outline in that strip.
-
-    Returns
-    -------
-    the strip.
+    """Cut the strip anew about the tube's centreline; the same strip where it is centred already. The ends of a given
+    axis keep their places along it: only the position across is corrected. Shapes: luma (n_frames, height, width).
     """
     shift, slope, half = tube.shift_px, tube.slope, tube.half_px
     room = (strip.values.shape[1] - 1) / 2 - half - 3

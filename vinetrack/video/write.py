@@ -11,38 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-CRF = 26
-"""Quality of the encoder: thin coloured lines stay clean, and a clip of six seconds takes a few hundred kilobytes.
-Chosen by eye; six more halve the size, six fewer double it."""
+CRF = 26  # Quality of the encoder (chosen)
 
+# Option of libx264 without which the same pictures are encoded to different bytes (measured)
 REPRODUCIBLE = {"mbtree": "0"}
-"""Option of libx264 without which the same pictures are encoded to different bytes. Measured (54 pictures of 960 × 390,
-encoded six times in one process with one thread): four different files with x264's macroblock tree, one without it."""
 
-BT709 = 1
-"""Code of ITU-R BT.709 in the stream: players otherwise guess the colours from the size of the picture. Defined by
-ITU-T H.273: 1 is BT.709."""
+BT709 = 1  # Code of ITU-R BT.709 in the stream (defined)
 
 
 def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int = CRF) -> int:
-    """Write RGB pictures of shape (height, width, 3), all of one size and with even sides; the whole clip or nothing.
-
-    Parameters
-    ----------
-    path : of the clip.
-    pictures : in order of time.
-    play_fps : pictures a second when it is played.
-    crf : constant rate factor, 0 to 51; more is smaller and worse.
-
-    Returns
-    -------
-    int
-        How many pictures were written.
-
-    Raises
-    ------
-    ValueError
-        If there is no picture, or its sides are odd.
+    """Write RGB pictures of shape (height, width, 3), all of one size and with even sides; the whole clip
+    or nothing.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".part-{path.name}")
