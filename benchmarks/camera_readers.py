@@ -21,8 +21,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 from camera_files import write_cine, write_mraw
 
-from vinetrack.video.frames import read_frames
-from vinetrack.video.raw_frames import PHANTOM_TABLE
+from vinetrack.video.frames import PHANTOM_TABLE, read_frames
 
 SEED = 20960
 

@@ -45,8 +45,7 @@ from scipy.stats import binomtest
 import vinetrack as vt
 from vinetrack.diagnosis.campaign_power import design_of_fit, fit_power
 from vinetrack.diagnosis.diagnose import with_next_experiment
-from vinetrack.diagnosis.further_trials import further_trials
-from vinetrack.diagnosis.informative_trials import confirming_trials, exploratory_trials
+from vinetrack.diagnosis.further_trials import confirming_trials, exploratory_trials, further_trials
 from vinetrack.diagnosis.power import sheet_cells
 from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.experiment.settings import Limits

@@ -31,7 +31,7 @@ from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth
-from vinetrack.video.measure import Measurement, measure_recording
+from vinetrack.video.survey import Measurement, measure_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "demo"
 

@@ -21,9 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 from chrome import Chrome
 from served import Served, Visitor
 
-from vinetrack.explorer.choice import choice_in_use, sized_model
-from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import errors_m, simulate_curves
+from vinetrack.explorer.campaign import choice_in_use, errors_m, simulate_curves, sized_model
+from vinetrack.explorer.server import open_campaign
 
 SIZE = "size_reservoir_depletion.gamma"
 

@@ -29,9 +29,9 @@ from hidden.filmed import film_campaign, filming_of
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.settings import ExperimentSettings
-from vinetrack.video.axis_agreement import askew_trials, slope_deg
+from vinetrack.video.axis import askew_trials, slope_deg
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.measure import measure_recording
+from vinetrack.video.survey import measure_recording
 from vinetrack.video.track import Tracking
 
 ONE_EACH = (

@@ -28,10 +28,10 @@ import pandas as pd
 from tqdm import tqdm
 
 import vinetrack as vt
-from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
+from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine

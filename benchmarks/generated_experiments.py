@@ -135,12 +135,10 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     results : folder for its results.
     figures : whether figures are drawn and the report is written.
     """
-    from vinetrack.pipeline.damping_stage import fit_law
     from vinetrack.pipeline.diagnosis_stage import diagnose_results
-    from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
     from vinetrack.pipeline.model_stage import fit_model
-    from vinetrack.pipeline.report_stage import write_report
-    from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse_tracks, gather
+    from vinetrack.pipeline.report_stage import draw_campaign, draw_trials, write_report
+    from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse_tracks, fit_law, gather
 
     settings = run_settings(SETTINGS)
     read = read_experiment(folder)

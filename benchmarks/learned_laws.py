@@ -34,13 +34,12 @@ from numpy.typing import NDArray
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_sensitivities import FittedMotion
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
-from vinetrack.diagnosis.ladder import left_out
+from vinetrack.diagnosis.candidate_fits import restart_exponents
+from vinetrack.diagnosis.force_inversion import FittedMotion
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out
 from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import missing_force
-from vinetrack.diagnosis.multi_start import restart_exponents
 from vinetrack.diagnosis.propose import propose
 
 LAWS = {"slip": "growth+speed", "chirp": "growth", "squeeze": "growth+pressure"}

@@ -26,12 +26,12 @@ from tqdm import tqdm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
-from vinetrack.planning.fit_inputs import numbers_of
 from vinetrack.planning.input_sources import predictive_inputs
 from vinetrack.planning.prediction import run
+from vinetrack.planning.predictive_inputs import numbers_of
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
 SAMPLES = 400

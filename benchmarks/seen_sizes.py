@@ -3,8 +3,8 @@
     python benchmarks/seen_sizes.py [--seeds tune|score] [--each N] [--keep DIR]
 
 One row a recording of the virtual laboratory, two sizes like the demonstration's and every harder preset: the look
-before any work (`vinetrack.video.quick_look`) and the tracker. Ratios are seen over true. Allowances in
-`vinetrack.video.recording_facts` were set on seeds 20900 and up (tune).
+before any work (`vinetrack.video.survey`) and the tracker. Ratios are seen over true. Allowances in
+`vinetrack.video.survey` were set on seeds 20900 and up (tune).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tracking_accuracy import CAPTURE_FPS, HARD, film
 from vinetrack.core.records import Trial
 from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.video.frames import RecordingError, inspect_recording
-from vinetrack.video.quick_look import look_at
+from vinetrack.video.survey import look_at
 from vinetrack.video.track import track_recording
 
 FIRST = {"tune": 20900, "score": 30900}

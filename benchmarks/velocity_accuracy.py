@@ -21,8 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 
 from vine_truth import CAPTURE_FPS, Vine, record
 
-from vinetrack.kinematics.velocity import estimate_kinematics
-from vinetrack.kinematics.windows import fit_all_windows
+from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
 
 FIRST_SEED = 1000
 VINES = (

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
-from vinetrack.inference.summary_of_fit import summary_of
-from vinetrack.pipeline.prediction_inputs import PredictionRequest, inputs_of, read_basis
+from vinetrack.inference.fit_summary import summary_of
+from vinetrack.pipeline.predict_stage import PredictionRequest, inputs_of, read_basis
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 FAST = ("--diameter-mm", 25, "--thickness-um", 100, "--length-mm", 400, "--pressure-kPa", 62)

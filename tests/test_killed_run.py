@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from test_pipeline import ROOT, write_campaign
 
-from vinetrack.pipeline.run_lock import OWNER_FILE
+from vinetrack.pipeline.workflow import OWNER_FILE
 
 
 @pytest.mark.pipeline

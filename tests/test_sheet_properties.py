@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import TableError, decode_text, parse_number, parse_table, result_file, safe_join
 from vinetrack.experiment.folder import ExperimentError, check_experiment, format_problems, read_experiment
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track
 

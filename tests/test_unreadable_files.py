@@ -17,8 +17,8 @@ from test_pipeline import ROOT, write_track
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.core.files import file_size, is_readable
-from vinetrack.effects._first_run import remember
+from vinetrack.core.tables import file_size, is_readable
+from vinetrack.effects._catalogue import remember
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.pipeline.workflow import make_plan

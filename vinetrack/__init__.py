@@ -27,7 +27,7 @@ _HOMES = {
     "compare": "vinetrack.interface.calls",
     "diagnose": "vinetrack.interface.calls",
     "example_tracks": "vinetrack.interface.calls",
-    "film_influence": "vinetrack.inference.film_influence",
+    "film_influence": "vinetrack.inference.fit_summary",
     "fit": "vinetrack.interface.calls",
     "load": "vinetrack.interface.loaded",
     "make_model": "vinetrack.dynamics.model",

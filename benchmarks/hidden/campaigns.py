@@ -15,7 +15,7 @@ from hidden.kinds import Hidden as Change
 from hidden.motion import Floats, Physics, Tube, follow
 from hidden.nuisances import Nuisances, draw_nuisances, noise, regime, scatter
 from vinetrack.core.records import Bend, Track, Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 
 ALL = {**EFFECTS, **INTERRUPTED}
 MOST_FRAMES = 1500

@@ -21,7 +21,7 @@ import numpy as np
 
 import vinetrack as vt
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.kinematics.velocity import estimate_kinematics

@@ -13,11 +13,11 @@ from hidden_truth import sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.diagnosis import add as fits
-from vinetrack.diagnosis.add import add
+from vinetrack.diagnosis import propose as fits
+from vinetrack.diagnosis.propose import add
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow, write_experiment
 from vinetrack.laboratory.vine_campaigns import damping_values
-from vinetrack.pipeline.run_folders import command_for_results
+from vinetrack.pipeline.workflow import command_for_results
 
 LADDER = (
     "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"

@@ -119,7 +119,7 @@ def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
     def break_down(*_: object) -> None:
         raise RuntimeError("the bottom fell out")
 
-    monkeypatch.setattr("vinetrack.pipeline.damping_stage.fit_law", break_down)
+    monkeypatch.setattr("vinetrack.pipeline.tracks_stage.fit_law", break_down)
     done = run("damping", tmp_path, "--log", tmp_path / "logs" / "d.log")
     assert done.exit_code == 1
     assert "Traceback" not in done.output

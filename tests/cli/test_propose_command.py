@@ -64,7 +64,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     assert code == 1
     assert f"move the file into {experiment}" in output
     # Without the rest of the catalogue, with which this effect would be compiled once more.
-    monkeypatch.setattr("vinetrack.diagnosis.initial_fit.host_for", lambda model, more: Model((*model.effects, *more)))
+    monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
     code, output = run("add", path, results, "--save")
     assert code == 0, output
     assert "proposed_time added to" in output

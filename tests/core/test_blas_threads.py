@@ -7,7 +7,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import vinetrack as vt
-from vinetrack.core.blas_threads import in_one_blas_thread
+from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.diagnose import diagnose
 
 

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from vinetrack.core.numbers import decimals, interval, number, with_error, with_interval
-from vinetrack.core.units import display_unit
+from vinetrack.core.units import decimals, display_unit, interval, number, with_error, with_interval
 
 
 @pytest.mark.parametrize(

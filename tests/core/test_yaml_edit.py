@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.core.yaml_document import parse_yaml
-from vinetrack.core.yaml_edit import with_value
+from vinetrack.core.yaml_document import parse_yaml, with_value
 
 COMMENTED = """# by hand
 capture_fps: 1000  # the camera's

@@ -11,9 +11,8 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.between_forms import confounded
 from vinetrack.diagnosis.between_gain import Difference, gains_by_onset, linear_gain, with_shared_errors
-from vinetrack.diagnosis.between_trials import between_fits, differences, significant
+from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import MAX_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
@@ -252,7 +251,7 @@ def test_errors_that_replicates_share_take_from_a_difference_what_they_may_expla
     gain = linear_gain(questioned, questioned.solution, by_vine)
     gains = []
     for error_Pa in (1e-6, 30.0, 3000.0):
-        monkeypatch.setattr("vinetrack.inference.systematics.PRESSURE_ERROR_PA", error_Pa)
+        monkeypatch.setattr("vinetrack.inference.robust_covariance.PRESSURE_ERROR_PA", error_Pa)
         beside = with_shared_errors(questioned, questioned.solution)
         assert beside.problem.prior_mean.size > questioned.solution.problem.prior_mean.size
         gains.append(linear_gain(questioned, beside, by_vine))

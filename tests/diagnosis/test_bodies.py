@@ -12,11 +12,11 @@ import pytest
 from lsoda_vine import as_track
 
 import vinetrack as vt
-from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
+from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.diagnosis.force_inversion import ForceEstimate
 from vinetrack.diagnosis.force_laws import Law
-from vinetrack.diagnosis.law_ranking import RankedLaw
+from vinetrack.diagnosis.missing_force import RankedLaw
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 DRAG = 0.5

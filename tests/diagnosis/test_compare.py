@@ -23,7 +23,7 @@ from lsoda_vine import (
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.compare import COMPARISON_COLUMNS, Comparison, compare, position_errors, trajectory_table
+from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS, Comparison, compare, position_errors, trajectory_table
 from vinetrack.diagnosis.replicates import replicates_of
 from vinetrack.inference.fit_result import TrialFit
 

@@ -14,10 +14,10 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
-from vinetrack.diagnosis.confounded_sizes import confounders_of, size_not_excluded
-from vinetrack.diagnosis.confounder import Confounder
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for
+from vinetrack.diagnosis.effect_sets import confounders_of, size_not_excluded
+from vinetrack.diagnosis.ladder import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_LATER_ROUNDS, MisfitTests, misfit_tests
+from vinetrack.diagnosis.result import Confounder
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit

@@ -11,7 +11,7 @@ from hidden_truth import grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.contradictions import contradictions, displacement_m, is_within_position_errors
+from vinetrack.diagnosis.selection import contradictions, displacement_m, is_within_position_errors
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow

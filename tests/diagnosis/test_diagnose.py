@@ -18,7 +18,7 @@ from own_effect import NAME, write_effect
 
 import vinetrack as vt
 from vinetrack.core.records import Track
-from vinetrack.diagnosis.lost_frames import LostFrames, with_lost_frames
+from vinetrack.diagnosis.odd_trials import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
 from vinetrack.laboratory.vine_campaigns import damping_values

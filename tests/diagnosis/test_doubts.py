@@ -14,13 +14,12 @@ from hidden_truth import Pairs, sheet
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis import misfit_tests as questions
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for
+from vinetrack.diagnosis.ladder import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
-from vinetrack.diagnosis.score_test import informations_at, scores_of
-from vinetrack.diagnosis.shape_products import fit_columns, products_of
+from vinetrack.diagnosis.score_test import fit_columns, informations_at, products_of, scores_of
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
-from vinetrack.inference.systematics import Systematics, systematics_of
+from vinetrack.inference.robust_covariance import Systematics, systematics_of
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 

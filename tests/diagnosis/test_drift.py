@@ -13,9 +13,9 @@ from counted import trajectories
 from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis import drift_along
+from vinetrack.diagnosis import drift as drift_along
 from vinetrack.diagnosis.drift import DRIFT_COLUMNS, GROUP_COLUMNS, Drift, drift
-from vinetrack.diagnosis.per_trial_estimates import align_trials, per_trial_estimates
+from vinetrack.diagnosis.replicates import align_trials, per_trial_estimates
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_result import Fit
 

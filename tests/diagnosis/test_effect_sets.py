@@ -18,7 +18,7 @@ from vinetrack.diagnosis import selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.narrative.diagnosis_text import diagnosis_text
-from vinetrack.narrative.verdict_summary import settled_rows
+from vinetrack.narrative.verdict_text import settled_rows
 
 CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
 TRUTH = {

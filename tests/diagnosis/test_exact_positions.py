@@ -12,8 +12,8 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
-from vinetrack.diagnosis.trial_effect_tests import noise_in_motion_p
-from vinetrack.inference.fit_problem import variance_floor
+from vinetrack.diagnosis.misfit_tests import noise_in_motion_p
+from vinetrack.inference.optimiser import variance_floor
 
 
 @pytest.fixture

@@ -16,17 +16,17 @@ import pytest
 import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import misfit_tests
-from vinetrack.diagnosis.candidates import CandidateShape
-from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
+from vinetrack.diagnosis.candidates import CandidateShape, EffectSensitivities
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     SINGLE_PROBE_LEVEL,
     MisfitTests,
+    Structure,
+    structure_from_scores,
 )
 from vinetrack.diagnosis.score_test import Scores, _marginalisation, _marginalised
-from vinetrack.diagnosis.structure_test import Structure, structure_from_scores
 from vinetrack.inference.fit_result import Number
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from vinetrack.diagnosis import family_test as module
-from vinetrack.diagnosis.family_test import family_test
+from vinetrack.diagnosis import score_test as module
+from vinetrack.diagnosis.score_test import family_test
 
 SIZES = (1,) * 12 + (30, 6)
 NAMES = [f"effect_{k}" for k, size in enumerate(SIZES) for _ in range(size)]

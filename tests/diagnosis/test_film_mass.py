@@ -13,16 +13,21 @@ from hidden.laboratory_rows import campaign
 from scipy.stats import norm
 
 import vinetrack as vt
-from vinetrack.core.numbers import with_error
 from vinetrack.core.records import Trial
+from vinetrack.core.units import with_error
 from vinetrack.diagnosis import likelihood_ratio
-from vinetrack.diagnosis.candidates import shapes_of
-from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
-from vinetrack.diagnosis.film_allowance import film_gain
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_none, answer_set, in_sigmas, sizes_of
-from vinetrack.diagnosis.multi_start import distinct_starts, start_values
+from vinetrack.diagnosis.between_gain import film_gain
+from vinetrack.diagnosis.candidate_fits import distinct_starts, start_values
+from vinetrack.diagnosis.candidates import effect_sensitivities, shapes_of
+from vinetrack.diagnosis.likelihood_ratio import (
+    LikelihoodRatio,
+    _compatible_with_none,
+    answer_set,
+    in_sigmas,
+    sizes_of,
+)
 from vinetrack.effects import catalogue
-from vinetrack.inference.systematics import FILM_ERROR
+from vinetrack.inference.robust_covariance import FILM_ERROR
 
 FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
 TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]

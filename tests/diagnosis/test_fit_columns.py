@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vinetrack as vt
-from vinetrack.diagnosis.shape_products import fit_columns
+from vinetrack.diagnosis.score_test import fit_columns
 from vinetrack.dynamics.simulate import SimulationError
 
 

@@ -9,13 +9,13 @@ import pytest
 from hidden_truth import grown
 
 import vinetrack as vt
-from vinetrack.diagnosis import fit_memory
-from vinetrack.diagnosis.fit_memory import drop_curves, with_curves, without_curves
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+from vinetrack.diagnosis import candidate_fits
+from vinetrack.diagnosis.candidate_fits import drop_curves, with_curves, without_curves
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, MAX_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.goodness_of_fit import relative_residual
+from vinetrack.inference.optimiser import relative_residual
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +47,8 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
 def test_of_many_trials_only_hypotheses_that_may_still_be_kept_hold_their_curves(
     whole: Fit, points: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fit_memory, "MANY_POINTS", points)
-    monkeypatch.setattr(fit_memory, "MAX_WHOLE_FITS", 2)
+    monkeypatch.setattr(candidate_fits, "MANY_POINTS", points)
+    monkeypatch.setattr(candidate_fits, "MAX_WHOLE_FITS", 2)
     effect = find_effect("tail_friction")
     behind = {"best": 0.0, "second": 500.0, "third": 600.0, "may be kept": 0.4 * ANSWER_SET_DELTA_CHI2 * MAX_INFLATION}
     hypotheses = {

@@ -10,15 +10,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.cubic_splines import uniform_splines
-from vinetrack.diagnosis.force_evidence import (
-    NEGLIGIBLE_LOG_RATIO,
-    CoefficientLikelihood,
-    coefficient_likelihood,
-    marginal_likelihood,
-    variable_weights,
-)
-from vinetrack.diagnosis.force_refinement import NormalEquations, SearchPoint
+from vinetrack.diagnosis.force_inversion import uniform_splines
+from vinetrack.diagnosis.force_laws import NormalEquations, SearchPoint
 from vinetrack.diagnosis.force_surface import (
     CONSTANT_AT_START,
     FREE_AT_START,
@@ -29,6 +22,13 @@ from vinetrack.diagnosis.force_surface import (
     Domain,
     SmoothForce,
     covariance_modes,
+)
+from vinetrack.diagnosis.learned_force import (
+    NEGLIGIBLE_LOG_RATIO,
+    CoefficientLikelihood,
+    coefficient_likelihood,
+    marginal_likelihood,
+    variable_weights,
 )
 
 GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))

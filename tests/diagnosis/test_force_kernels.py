@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_kernels import integrate_responses
-from vinetrack.diagnosis.force_sensitivities import SDIRK_GAMMA, _responses
+from vinetrack.diagnosis.force_inversion import SDIRK_GAMMA, _responses, integrate_responses
 
 TRIALS, STEPS, COLUMNS = 3, 400, 4
 

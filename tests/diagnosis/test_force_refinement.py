@@ -10,12 +10,10 @@ import pytest
 from grown import hidden_force, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.cubic_splines import uniform_splines
-from vinetrack.diagnosis.force_refinement import SearchPoint, _with_updated_motions, normal_equations
-from vinetrack.diagnosis.force_sensitivities import force_sensitivities
+from vinetrack.diagnosis.force_inversion import force_sensitivities, on_tracks, uniform_splines
+from vinetrack.diagnosis.force_laws import SearchPoint, _with_updated_motions, normal_equations
 from vinetrack.diagnosis.force_surface import SmoothForce, candidate_domains
-from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit
-from vinetrack.diagnosis.smoothed_motions import on_tracks
+from vinetrack.diagnosis.missing_force import LinearMisfit, linear_misfit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, PRESSURE, RELEASE
 

@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import gain_in_words
-from vinetrack.narrative.verdict_summary import SIGNIFICANT_SIGMA, estimate_text, estimates_text, interval_text
+from vinetrack.narrative.verdict_text import SIGNIFICANT_SIGMA, estimate_text, estimates_text, interval_text
 
 
 def fit(log_likelihood: float, converged: bool = True) -> Any:

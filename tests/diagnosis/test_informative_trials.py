@@ -14,17 +14,21 @@ from helpers.explorer_campaign import SMALL, make_experiment
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
-from vinetrack.diagnosis.design_information import DesignInformation
-from vinetrack.diagnosis.informative_trials import InformativeTrials, confirming_trials, exploratory_trials
+from vinetrack.diagnosis.further_trials import (
+    DesignInformation,
+    InformativeTrials,
+    confirming_trials,
+    exploratory_trials,
+)
 from vinetrack.diagnosis.linear_power import effect_power, power_of
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.stopping import GO_ON, CampaignLook
 from vinetrack.experiment.settings import Limits
-from vinetrack.narrative.further_text import informative_text
+from vinetrack.narrative.power_text import informative_text
 from vinetrack.pipeline.power_stage import recommended_trials
 from vinetrack.planning.campaign_information import FilmingPlan
-from vinetrack.planning.feasible_trials import feasible_conditions
+from vinetrack.planning.discriminating_design import feasible_conditions
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), payload_g=(0.0, 0.0), inlet_mm=(5.5, 8.0), chamber_l=(3.7,), trials=4)
 NAMES = ("inlet_loss", "linear_damping", "leak")

@@ -14,11 +14,11 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis import diagnose
 from vinetrack.diagnosis import ladder as ladder_module
-from vinetrack.diagnosis.compare import compare
 from vinetrack.diagnosis.ladder import (
     LADDER_COLUMNS,
     MOVED_COLUMNS,
     Errors,
+    compare,
     excess,
     highest_pressure,
     in_sample,
@@ -27,10 +27,10 @@ from vinetrack.diagnosis.ladder import (
     moved,
 )
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
+from vinetrack.inference.fit import predict_prepared, predict_trials
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
-from vinetrack.inference.left_out import predict_prepared, predict_trials
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 

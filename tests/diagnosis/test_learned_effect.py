@@ -11,11 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.diagnosis.force_evidence import ForcePosterior
 from vinetrack.diagnosis.force_surface import ZERO_AT_START, Domain, SmoothForce
-from vinetrack.diagnosis.learned_effect import table_name, table_text, uniform_table
-from vinetrack.diagnosis.learned_force import LearnedForce
-from vinetrack.diagnosis.learned_variables import dependence, not_excluded
+from vinetrack.diagnosis.learned_force import ForcePosterior, LearnedForce, dependence, not_excluded
+from vinetrack.diagnosis.propose import table_name, table_text, uniform_table
 from vinetrack.effects import own_effects
 
 DOMAINS = [

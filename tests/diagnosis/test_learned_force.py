@@ -13,7 +13,7 @@ from grown import grown, hidden_force, pairs_of, sheet
 from scipy.interpolate import BSpline
 
 import vinetrack as vt
-from vinetrack.diagnosis.cubic_splines import splines, uniform_splines
+from vinetrack.diagnosis.force_inversion import splines, uniform_splines
 from vinetrack.diagnosis.force_surface import (
     CONSTANT_AT_START,
     FREE_AT_START,
@@ -22,8 +22,7 @@ from vinetrack.diagnosis.force_surface import (
     SmoothForce,
     covariance_modes,
 )
-from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS
-from vinetrack.diagnosis.learned_variables import dependent_variables
+from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, dependent_variables
 from vinetrack.diagnosis.missing_force import missing_force
 from vinetrack.diagnosis.propose import Proposal, propose
 from vinetrack.effects import State

@@ -16,9 +16,9 @@ from threadpoolctl import threadpool_info
 
 import vinetrack as vt
 import vinetrack.diagnosis.missing_force as missing_force_module
-from vinetrack.diagnosis.force_sensitivities import force_sensitivities, motions_of
+from vinetrack.diagnosis.force_inversion import force_sensitivities, motions_of
 from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, LAW_COLUMNS, MissingForce, missing_force
-from vinetrack.diagnosis.per_trial_estimates import align_trials
+from vinetrack.diagnosis.replicates import align_trials
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference.fit_result import Fit

@@ -17,11 +17,11 @@ import pytest
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import Vine, campaign
-from vinetrack.planning.scaling_priors import damping_prior
+from vinetrack.planning.predictive_inputs import damping_prior
 
 Pairs = list[tuple[Trial, Track]]
 

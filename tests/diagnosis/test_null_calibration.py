@@ -12,9 +12,9 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign
-from vinetrack.diagnosis.family_test import family_p_value, family_test
 from vinetrack.diagnosis.null_calibration import TESTS, CalibratedTest, CampaignPValues, calibrate, null_p_values
-from vinetrack.narrative.calibration_text import calibration_lines
+from vinetrack.diagnosis.score_test import family_p_value, family_test
+from vinetrack.narrative.power_text import calibration_lines
 from vinetrack.planning.campaign_information import FilmingPlan
 
 

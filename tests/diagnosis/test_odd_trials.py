@@ -17,9 +17,8 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.prepared_trials import prepare
-from vinetrack.narrative.verdict_summary import verdict_meaning, verdict_sentence
+from vinetrack.inference.fit_data import FitError, prepare
+from vinetrack.narrative.verdict_text import verdict_meaning, verdict_sentence
 
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 

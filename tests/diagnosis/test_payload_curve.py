@@ -18,7 +18,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, PAYLOADS, payload_curves, speeds_with_error
 from vinetrack.dynamics.model import base_model
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Number
 
 P, P_Y, B, AREA, G, LENGTH = 28e3, 3e3, 2.0, math.pi * 0.012**2, 9.81, 0.2

@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.plausibility_prior import log_evidence, posterior_weights, prior_penalty
+from vinetrack.diagnosis.likelihood_ratio import log_evidence, posterior_weights, prior_penalty
 from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
 

@@ -12,26 +12,33 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import expected_scores
-from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_tests
-from vinetrack.diagnosis.expected_scores import (
+from vinetrack.diagnosis import linear_power
+from vinetrack.diagnosis.campaign_power import (
+    CampaignDesign,
+    SimulatedDiagnosis,
+    design_of_fit,
+    planned_tests,
+    rates_of,
+    simulated_diagnosis,
+)
+from vinetrack.diagnosis.linear_power import (
     NoiselessStart,
+    effect_power,
+    error_inflation,
     fitted_without,
     half_power_below,
     noiseless_start,
+    power_of,
     residual_displacements,
     score_ratio,
 )
-from vinetrack.diagnosis.linear_power import effect_power, error_inflation, power_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
-from vinetrack.diagnosis.score_test import informations_at, scores_of
-from vinetrack.diagnosis.shape_products import fit_columns
-from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis, rates_of, simulated_diagnosis
+from vinetrack.diagnosis.score_test import fit_columns, informations_at, scores_of
 from vinetrack.inference import sensitivity
 from vinetrack.narrative.power_text import effect_sentence
-from vinetrack.narrative.verdict_summary import summary_facts
+from vinetrack.narrative.verdict_text import summary_facts
 from vinetrack.planning.campaign_information import FilmingPlan
 
 CAMERA = FilmingPlan(500.0, 1e-4)
@@ -169,7 +176,7 @@ def test_a_fit_without_an_effect_that_does_not_converge_is_not_used(
     start, k = noiseless_start(six.fit), place_of(six, "leak")
     size = 2 * power["leak"].size_at(0.5)
     assert score_ratio(six, k, size, start) != 1.0
-    monkeypatch.setattr(expected_scores, "MAX_ITERATIONS", 1)
+    monkeypatch.setattr(linear_power, "MAX_ITERATIONS", 1)
     assert score_ratio(six, k, size, start) == 1.0
 
 
@@ -226,7 +233,7 @@ def test_further_sizes_are_computed_only_where_the_score_is_nonlinear(
             asked.append(abs(size))
             return ratio_at_7 if len(asked) == 1 else ratio_at_4 if len(asked) == 2 else larger
 
-        monkeypatch.setattr(expected_scores, "score_ratio", ratio)
+        monkeypatch.setattr(linear_power, "score_ratio", ratio)
         power = effect_power(six, "leak")
         assert power is not None
         assert [7 * size / asked[0] for size in asked] == pytest.approx([7.0, 4.0, 14.0, 28.0, 56.0][: len(asked)])

@@ -12,8 +12,8 @@ from hidden_truth import grown
 import vinetrack as vt
 import vinetrack.inference.fit
 from vinetrack.diagnosis import candidate_fits
+from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
-from vinetrack.diagnosis.multi_start import SubsetFitter, full_fit
 from vinetrack.effects import find_effect
 from vinetrack.inference.parameters import YIELD_PRESSURE
 from vinetrack.inference.solving import solve_onward

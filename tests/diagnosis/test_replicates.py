@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.compare import position_errors
+from vinetrack.diagnosis.ladder import position_errors
 from vinetrack.diagnosis.replicates import align_replicates, replicates_of
 from vinetrack.inference.fit_data import ImpreciseRest
 from vinetrack.inference.fit_result import TrialFit

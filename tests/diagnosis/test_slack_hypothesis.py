@@ -10,11 +10,10 @@ from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
-from vinetrack.diagnosis.initial_fit import candidates_of
+from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
-from vinetrack.diagnosis.selection import SelectionStep, select_effects
-from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK, pushes, slack_fit
+from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, pushes, select_effects, slack_fit
 from vinetrack.inference.fit import fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
@@ -49,7 +48,7 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
     found = fit(vt.base_model(), grown(60.0, "free"), profile=False)
     # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
     bent = replace(found, solution=replace(found.solution, state=replace(found.solution.state, spread=(0.04, 0.15))))
-    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.pushes", lambda _: False)
+    monkeypatch.setattr("vinetrack.diagnosis.selection.pushes", lambda _: False)
     slack = slack_fit(bent)
     assert slack is not None
     assert slack.sigma > 5
@@ -59,9 +58,9 @@ def test_where_the_rule_makes_scattering_trials_far_worse_none_is_fitted_in_full
     """A payload that the true tail pushes, which a tail that cannot push never does."""
     taut = fit(vt.base_model(), grown(60.0, "taut"), profile=False)
     asked: list[object] = []
-    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.has_excess_scatter", lambda _: True)
+    monkeypatch.setattr("vinetrack.diagnosis.selection.has_excess_scatter", lambda _: True)
     for name in ("refit", "full_fit"):
-        monkeypatch.setattr(f"vinetrack.diagnosis.slack_hypothesis.{name}", lambda *given, **_: asked.append(given))
+        monkeypatch.setattr(f"vinetrack.diagnosis.selection.{name}", lambda *given, **_: asked.append(given))
     assert pushes(taut)
     assert slack_fit(taut) is None
     assert not asked

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from vinetrack.diagnosis import candidate_fits
-from vinetrack.diagnosis.candidate_fits import CandidateFits
-from vinetrack.diagnosis.multi_start import SubsetFit
+from vinetrack.diagnosis.candidate_fits import CandidateFits, SubsetFit
 from vinetrack.effects import catalogue
 
 LEAK = SubsetFit((catalogue()["leak"],), math.nan, {"leak.rate": 1.0})

@@ -14,14 +14,14 @@ from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.trial_effect_tests import (
+from vinetrack.diagnosis.misfit_tests import (
     CAREFUL_DAMPING_SCATTER,
     STRETCH_FRAMES,
     between_conditions_p,
     has_excess_scatter,
     noise_in_motion_p,
 )
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine

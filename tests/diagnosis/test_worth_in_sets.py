@@ -12,8 +12,8 @@ from scipy.stats import chi2, norm
 
 from vinetrack.diagnosis import effect_sets
 from vinetrack.diagnosis.effect_sets import EffectSets
-from vinetrack.diagnosis.family_test import FamilyTest
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
+from vinetrack.diagnosis.score_test import FamilyTest
 from vinetrack.effects import find_effect
 
 NAMES = ("air_drag", "leak", "tail_friction")

@@ -11,10 +11,9 @@ import pytest
 from by_hand import BARE, LOADED, N
 from own_effect import NAME, write_effect
 
-from vinetrack.dynamics import batch
-from vinetrack.dynamics.host import host_for, probe, shared_host
+from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.kernel import kernel
-from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.model import Model, base_model, host_for, make_model, probe, shared_host
 from vinetrack.dynamics.simulate import prepare, simulate_many
 from vinetrack.effects import Effect, catalogue, load_effect, own_effects
 

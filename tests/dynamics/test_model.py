@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack import effects
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import Model, base_model, effects_on, make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import BASE_EFFECTS, EffectError

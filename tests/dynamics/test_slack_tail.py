@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import base_model
 from vinetrack.dynamics.simulate import SimulationError, simulate
 from vinetrack.effects import catalogue

@@ -17,8 +17,8 @@ from numba import njit
 
 import vinetrack
 from vinetrack.core.records import Bend, Trial
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.equations import TrialArrays
-from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs

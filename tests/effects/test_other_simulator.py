@@ -18,8 +18,7 @@ from hidden.questions import outsider_values, true_effects
 from hidden.verify import FRAME_S, SIZES, ours, trials
 
 import vinetrack as vt
-from vinetrack.dynamics.host import host_for
-from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.inference.fit_data import pairs_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from by_hand import ATM, BARE, LOADED, RT_AIR, N, Vine, assert_same_motion, simulated, whole_catalogue
 
-from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import EffectError, catalogue

@@ -12,7 +12,7 @@ import pytest
 from by_hand import BARE, LEVEL, LOADED, Vine, simulated, whole_catalogue
 from scipy.optimize import least_squares
 
-from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.audit import evaluate
 
 TIMES = np.linspace(0, 0.12, 60)
 SAME = 2e-6

@@ -8,8 +8,7 @@ import pytest
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import Correction
-from vinetrack.experiment.corrections import corrections_text, read_corrections
-from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.folder import corrections_text, read_corrections, read_experiment
 
 SHEET = "trial,video,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,capture_fps\n"
 ROWS = "a,a.mp4,,12,100,140,24,3,1000\nb,,b.csv,12,100,140,24,3,\n"

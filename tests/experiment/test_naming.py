@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from vinetrack.core.records import Bend, Trial
-from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.schema import COLUMNS
+from vinetrack.experiment.schema import COLUMNS, with_names
 
 TRIAL = Trial(
     name="a", diameter_m=0.024, thickness_m=200e-6, length_m=0.28, pressure_Pa=28e3, yield_pressure_Pa=3e3, inlet_m=8e-3

@@ -10,9 +10,8 @@ import pytest
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.records import PictureAxis
-from vinetrack.experiment.cells import CellError, read_cell
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.experiment.schema import COLUMNS
+from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
 from vinetrack.tracks.importers import TrackError, load_track, read_track
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")

@@ -9,17 +9,12 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.schema import COLUMNS, SHARED
-from vinetrack.experiment.settings import (
-    ExperimentSettings,
-    RunSettings,
-    read_experiment_settings,
-    run_settings,
-)
+from vinetrack.experiment.settings import ExperimentSettings, RunSettings, read_experiment_settings, run_settings
 
 CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from hand_sheet import HEADER, TRACK, write
 
-from vinetrack.experiment.folder import check_experiment, read_experiment
-from vinetrack.experiment.trial_order import order_pressure_correlation, trial_order
+from vinetrack.experiment.folder import check_experiment, order_pressure_correlation, read_experiment, trial_order
 
 PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
 

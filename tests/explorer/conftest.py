@@ -8,7 +8,7 @@ import pytest
 from explorer_campaign import SMALL, make_experiment, make_results
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.command import open_campaign
+from vinetrack.explorer.server import open_campaign
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import choice_in_use
-from vinetrack.explorer.curves import overall_m
+from vinetrack.explorer.campaign import Campaign, choice_in_use, overall_m
 from vinetrack.explorer.fitting import (
     FAULT,
     BackgroundFit,

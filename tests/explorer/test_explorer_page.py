@@ -14,8 +14,8 @@ from page_browser import Browser
 
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.fitting import BackgroundFit
+from vinetrack.explorer.server import open_campaign
 
 GAMMA = "size_reservoir_depletion.gamma"
 
@@ -218,7 +218,7 @@ def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
 
 
 def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
-    from vinetrack.explorer.choice import choice_from_options, choice_in_use
+    from vinetrack.explorer.campaign import choice_from_options, choice_in_use
 
     background = BackgroundFit(
         campaign, choice_from_options(campaign, choice_in_use(campaign), ["leak"], [], ["leak.rate=0.2"])
@@ -233,7 +233,7 @@ def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
 
 
 def test_a_page_opened_as_the_command_does_shows_the_fit_and_no_size_that_was_moved(campaign: Campaign) -> None:
-    from vinetrack.explorer.choice import choice_in_use
+    from vinetrack.explorer.campaign import choice_in_use
 
     grown = BackgroundFit(campaign, choice_in_use(campaign)).begin()
     grown.wait(240)

@@ -16,11 +16,11 @@ from page_browser import Browser
 
 from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.explorer import proposal
+from vinetrack.explorer import controls
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.pipeline.proposed_effects import WrittenProposal
+from vinetrack.explorer.server import open_campaign
+from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 
 
@@ -49,7 +49,7 @@ def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]
 
 
 def searching(monkeypatch: pytest.MonkeyPatch, search: Callable[..., WrittenProposal]) -> None:
-    monkeypatch.setattr(proposal, "propose_effect", search)
+    monkeypatch.setattr(controls, "propose_effect", search)
 
 
 def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
@@ -129,7 +129,7 @@ def test_a_stopped_or_failed_search_is_reported_and_can_be_restarted(
     searching(monkeypatch, refused)
     browser.click("propose")
     browser.until(lambda: "exists already" in browser.text("proposal"))
-    assert browser.model("propose").label == proposal.PROPOSE
+    assert browser.model("propose").label == controls.PROPOSE
     assert not browser.model("open_proposed").visible
 
     searching(monkeypatch, lambda *_: WrittenProposal(("No law does better than chance.",), ()))
@@ -149,4 +149,4 @@ def test_an_invalid_effect_file_is_reported(unexplained: Campaign, monkeypatch: 
     path.write_text("def tail_force(", encoding="utf-8")
     searching(monkeypatch, lambda *_: WrittenProposal((), (path,)))
     with pytest.raises(EffectError, match="cannot be read"):
-        proposal.propose_and_read(unexplained, lambda _: None)
+        controls.propose_and_read(unexplained, lambda _: None)

@@ -11,7 +11,7 @@ import pytest
 from explorer_campaign import write_bars
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.recording import DecodedRecording, RecordingView, recording_view
+from vinetrack.explorer.film_panel import DecodedRecording, RecordingView, recording_view
 from vinetrack.results.folder_layout import Results
 from vinetrack.video.axis import Axis
 

@@ -19,19 +19,22 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import Campaign, ExplorerTrial, condition_labels
-from vinetrack.explorer.choice import (
+from vinetrack.explorer.campaign import (
+    Campaign,
     ChoiceError,
+    ExplorerTrial,
     added_and_dropped,
     choice_from_options,
     choice_in_use,
+    condition_labels,
+    errors_m,
+    overall_m,
+    simulate_curves,
     sized_model,
     slider_range,
 )
-from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import errors_m, overall_m, simulate_curves
-from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, export_bytes, model_text
-from vinetrack.explorer.series import (
+from vinetrack.explorer.fitting import CURVE_COLUMNS, commands, curve_table, export_bytes, model_text
+from vinetrack.explorer.plots import (
     error_bars,
     measured_lines,
     model_lines,
@@ -41,6 +44,7 @@ from vinetrack.explorer.series import (
     symmetric_range,
     vine_colours,
 )
+from vinetrack.explorer.server import open_campaign
 from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.results.folder_layout import ResultsError
 
@@ -154,7 +158,7 @@ def test_a_slider_move_simulates_every_trial_once(campaign: Campaign, monkeypatc
         simulated.append(len(trials))
         return simulate_many(model, trials, *more, **named)
 
-    monkeypatch.setattr("vinetrack.explorer.curves.simulate_many", counted)
+    monkeypatch.setattr("vinetrack.explorer.campaign.simulate_many", counted)
     start = choice_in_use(campaign)
     before = simulate_curves(campaign, sized_model(campaign, start))
     simulate_curves(campaign, sized_model(campaign, start.with_size("eversion_damping.n", 0.42)), before)

@@ -11,9 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vinetrack.figures.damping_figures import draw_damping_law, draw_exponents, log_force_sigma
-from vinetrack.figures.overview import MAX_CONDITION_PANELS, draw_overview
-from vinetrack.figures.size_figures import draw_scaling
+from vinetrack.figures.damping_figures import draw_damping_law, draw_exponents, draw_scaling, log_force_sigma
+from vinetrack.figures.motion_figures import MAX_CONDITION_PANELS, draw_overview
 from vinetrack.figures.style import look, render, vine_styles
 
 N = 0.4

@@ -9,7 +9,7 @@ import pytest
 from plain_scene import Plan, plain_scene
 
 from vinetrack.core.records import Correction, Trial, hand_corrected, join_flags, with_flag
-from vinetrack.figures.strip_figure import draw_strip
+from vinetrack.figures.overlay import draw_strip
 from vinetrack.video.frames import Frames, Recording
 from vinetrack.video.track import Tracking, track_frames
 

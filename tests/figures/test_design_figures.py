@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from vinetrack.figures.design_figures import FilmChoice, GasLawLoss, draw_campaign, draw_choice, draw_reservoir
+from vinetrack.figures.prediction_figures import FilmChoice, GasLawLoss, draw_campaign, draw_choice, draw_reservoir
 from vinetrack.figures.style import render
 
 

@@ -10,9 +10,20 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from vinetrack.figures.candidate_figures import MAX_CANDIDATES, MAX_EFFECTS, draw_candidates, draw_cosines, draw_drift
-from vinetrack.figures.ladder_figures import AFTER, BEFORE, draw_before_after, draw_ladder, rms_m
-from vinetrack.figures.misfit_figures import draw_missing_force, draw_where
+from vinetrack.figures.diagnosis_figures import (
+    AFTER,
+    BEFORE,
+    MAX_CANDIDATES,
+    MAX_EFFECTS,
+    draw_before_after,
+    draw_candidates,
+    draw_cosines,
+    draw_drift,
+    draw_ladder,
+    draw_missing_force,
+    draw_where,
+    rms_m,
+)
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION, render
 
 

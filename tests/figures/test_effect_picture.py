@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
+from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
 from vinetrack.effects import catalogue
 from vinetrack.figures.prediction_figures import draw_effect
 from vinetrack.figures.style import BLUE, render

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.figures.learned_force_figure import draw_learned_force
+from vinetrack.figures.diagnosis_figures import draw_learned_force
 
 NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
 

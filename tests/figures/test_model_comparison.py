@@ -6,7 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.figures.model_comparison import MAX_PANELS, draw_model_comparison, draw_model_residuals
+from vinetrack.figures.motion_figures import (
+    MODEL_COMPARISON_MAX_PANELS as MAX_PANELS,
+)
+from vinetrack.figures.motion_figures import (
+    draw_model_comparison,
+    draw_model_residuals,
+)
 from vinetrack.figures.style import render
 
 DRAWINGS = [draw_model_comparison, draw_model_residuals]

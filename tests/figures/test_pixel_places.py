@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from matplotlib.text import Text
 
-from vinetrack.figures.pixel_places import draw_pixel_places, periodic_error, subpixel_positions
+from vinetrack.figures.overlay import draw_pixel_places, periodic_error, subpixel_positions
 
 
 def places(amplitude_px: float, count: int = 4000, seed: int = 971) -> np.ndarray:

@@ -12,7 +12,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vinetrack.figures.size_figures import draw_efficiency, draw_payload_speed, draw_speed_scaling
+from vinetrack.figures.damping_figures import draw_efficiency, draw_payload_speed, draw_speed_scaling
 from vinetrack.figures.style import look
 
 LINE = {"slope": 0.1, "slope_95": [0.02, 0.18], "intercept": 0.5, "intercept_95": [0, 1], "R2": 0.935, "p": 0.033}

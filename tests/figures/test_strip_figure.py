@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Track
-from vinetrack.figures.strip_figure import MAX_STRIP_PX, draw_strip, flagged, shrunk
+from vinetrack.figures.overlay import MAX_STRIP_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
-from vinetrack.report.svg import compact_svg
+from vinetrack.report.section import compact_svg
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 

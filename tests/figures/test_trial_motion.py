@@ -8,8 +8,8 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from vinetrack.figures.motion_figures import draw_trial_motion
 from vinetrack.figures.style import RULE_COLOURS, look
-from vinetrack.figures.trial_motion import draw_trial_motion
 
 TIME_S = np.arange(200) / 1000
 LONG = "still accelerating: the speed rises by 24 % (20 to 28 %) across the window; choose a later start " * 3

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.batch import Trace
-from vinetrack.dynamics.host import host_for
-from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.kernel import Trace
+from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import Trajectory, simulate
 
 G = 9.81

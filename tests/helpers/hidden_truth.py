@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 

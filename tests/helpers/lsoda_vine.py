@@ -10,7 +10,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 
 FPS = 1000.0
 B_TRUE = {24.0: 6.4, 18.0: 4.5}

@@ -14,10 +14,10 @@ from hidden_truth import sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
-from vinetrack.diagnosis.initial_fit import candidates_of
+from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import Trajectory
-from vinetrack.inference.position_change import position_change
+from vinetrack.inference.sensitivity import position_change
 from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 

@@ -10,10 +10,8 @@ from lsoda_vine import small_campaign
 
 import vinetrack as vt
 from vinetrack.core.tables import write_json
-from vinetrack.inference.film_influence import MATTERS, film_influence, film_messages
-from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.inference.summary_of_fit import summary_of
-from vinetrack.inference.systematics import FILM_ERROR
+from vinetrack.inference.fit_summary import MATTERS, FitSummary, film_influence, film_messages, summary_of
+from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.results.folder_layout import read_json
 
 

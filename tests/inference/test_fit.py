@@ -26,9 +26,8 @@ from lsoda_vine import (
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.inference import solving
-from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import FixedTerms, Solution, Step, solve
+from vinetrack.inference.optimiser import FixedTerms, Solution, Step, make_problem, solve
 from vinetrack.inference.sensitivity import Predictor
 
 Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]

@@ -11,8 +11,7 @@ from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 
 import vinetrack as vt
-from vinetrack.inference.gauge_clock import Growth, gauge_clocks
-from vinetrack.inference.gauge_noise import DenoisedTrace, denoised_traces
+from vinetrack.inference.gauge_noise import DenoisedTrace, Growth, denoised_traces, gauge_clocks
 from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of_traces, white_noise_sd
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)

@@ -9,12 +9,9 @@ import pytest
 from mixed_problem import RHO, columns_of, frame_of, state_of
 from scipy.optimize import lsq_linear
 
-from vinetrack.inference.gauss_newton import bounded_solve, levenberg_marquardt_step
-from vinetrack.inference.mixed_effects import (
-    MixedProblem,
-)
+from vinetrack.inference.marginal_likelihood import bounded_solve, levenberg_marquardt_step
+from vinetrack.inference.mixed_effects import MixedProblem, decrease_within_bounds
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, _next_step
-from vinetrack.inference.variance_kernels import decrease_within_bounds
 from vinetrack.inference.whitening import all_products, whiten
 
 

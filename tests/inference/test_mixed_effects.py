@@ -12,18 +12,19 @@ import pytest
 from mixed_problem import RHO, SIGMA, columns_of, covariance, frame_of, state_of
 from scipy.stats import multivariate_normal
 
-from vinetrack.inference.intervals import degrees_of_freedom, precision
+from vinetrack.inference.fit_result import CHECK_COLUMNS, _deviate
 from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, estimate_noise, marginal
 from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
     at_zero_deviations,
+    decrease_within_bounds,
+    normal_equations_without_deviations,
     sum_matrix_blocks,
     trial_deviation_sd,
 )
-from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.variance_kernels import decrease_within_bounds, normal_equations_without_deviations
+from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 

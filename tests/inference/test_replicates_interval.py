@@ -11,7 +11,7 @@ from lsoda_vine import filmed, vine_trial
 from scipy.stats import t as student
 
 import vinetrack as vt
-from vinetrack.inference.intervals import precision
+from vinetrack.inference.position_errors import precision
 
 
 @pytest.mark.parametrize("trials", [5, 7])

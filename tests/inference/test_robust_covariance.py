@@ -11,12 +11,17 @@ import pytest
 from lsoda_vine import B_TRUE, N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
-from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
+from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.inference.fit_result import Number
-from vinetrack.inference.intervals import precision
-from vinetrack.inference.robust_covariance import _few_trial_variances, robust_covariance, widened_covariance
-from vinetrack.inference.systematics import PRESSURE_ERROR_PA, Systematics
+from vinetrack.inference.position_errors import precision
+from vinetrack.inference.robust_covariance import (
+    PRESSURE_ERROR_PA,
+    Systematics,
+    _few_trial_variances,
+    robust_covariance,
+    widened_covariance,
+)
 
 Pairs = list[tuple[Trial, Track]]
 

@@ -11,8 +11,8 @@ from hidden.laboratory_rows import campaign
 from lsoda_vine import N_TRUE, small_campaign
 
 import vinetrack as vt
-from vinetrack.inference.prepared_trials import prepare
-from vinetrack.pipeline.check_stage import check_folder
+from vinetrack.inference.fit_data import prepare
+from vinetrack.pipeline.run_stage import check_folder
 
 STEP_M = 2e-3
 

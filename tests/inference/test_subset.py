@@ -11,10 +11,9 @@ from lsoda_vine import small_campaign
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
+from vinetrack.inference.fit import fit_subset, predict_prepared, predict_trials
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.left_out import predict_prepared, predict_trials
-from vinetrack.inference.subset import fit_subset
 
 Pairs = list[tuple[Trial, Track]]
 

@@ -14,14 +14,14 @@ import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
-from vinetrack.inference.left_out import predict_prepared
+from vinetrack.inference.fit import predict_prepared
+from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.optimiser import FixedTerms
-from vinetrack.inference.prepared_trials import prepare
+from vinetrack.inference.robust_covariance import recorded_pressures, systematics_of
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import solve_onward
-from vinetrack.inference.systematics import recorded_pressures, systematics_of
-from vinetrack.inference.trace_errors import (
+from vinetrack.inference.solving import (
     as_recorded,
+    solve_onward,
     trace_error_penalty,
     trace_error_step,
     with_fitted_trace_errors,

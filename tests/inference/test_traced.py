@@ -10,8 +10,8 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.robust_covariance import systematics_of
 from vinetrack.inference.sensitivity import PRESSURE, Predictor
-from vinetrack.inference.systematics import systematics_of
 
 GAUGE_NOISE_PA = 100.0
 

@@ -17,8 +17,13 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState
 from vinetrack.inference.optimiser import FixedTerms, _stagnates, solve
 from vinetrack.inference.position_errors import SmoothErrors
-from vinetrack.inference.release_kernels import products_at_releases
-from vinetrack.inference.trial_effects import LARGEST_DEVIATION, optimise_trial_effects, residuals_in, trial_costs
+from vinetrack.inference.trial_effects import (
+    LARGEST_DEVIATION,
+    optimise_trial_effects,
+    products_at_releases,
+    residuals_in,
+    trial_costs,
+)
 from vinetrack.inference.whitening import products, whiten
 
 

@@ -9,7 +9,7 @@ import pytest
 from vine_truth import Vine, record
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.inference.prepared_trials import prepare
+from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO = 0.4

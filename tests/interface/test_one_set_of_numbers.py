@@ -13,10 +13,10 @@ import pytest
 from explorer_campaign import run
 
 import vinetrack as vt
-from vinetrack.core.numbers import number
+from vinetrack.core.units import number
 from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.interface.loaded import LoadedResults
-from vinetrack.narrative.verdict_summary import estimate_text, interval_text, summary_facts
+from vinetrack.narrative.verdict_text import estimate_text, interval_text, summary_facts
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_the_worst_condition_is_one(loaded: LoadedResults, diagnosis: Diagnosis,
 
 
 def test_the_explorer_starts_from_the_same_numbers_and_floors(small_run: Path, loaded: LoadedResults) -> None:
-    from vinetrack.explorer.command import open_campaign
+    from vinetrack.explorer.server import open_campaign
 
     campaign = open_campaign(small_run)
     assert dict(campaign.numbers) == {entry.name: entry.value for entry in loaded.fit.numbers}

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.naming import with_names
-from vinetrack.kinematics.conditions import CONDITION_COLUMNS, condition_table, mean_with_error
+from vinetrack.experiment.schema import with_names
+from vinetrack.kinematics.summary import CONDITION_COLUMNS, condition_table, mean_with_error
 
 nan = math.nan
 BARE = Trial(

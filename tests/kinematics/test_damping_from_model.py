@@ -10,7 +10,7 @@ import pytest
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.summary import (
     LAW_COLUMNS,

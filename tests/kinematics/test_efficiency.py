@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.kinematics.conditions import efficiency_shares, energy_efficiency, lead_velocity_at
+from vinetrack.kinematics.summary import efficiency_shares, energy_efficiency, lead_velocity_at
 
 VINE = Trial(
     name="v", diameter_m=0.012, thickness_m=100e-6, length_m=0.3, pressure_Pa=34e3, payload_kg=0.0356, travel_ratio=2.0

@@ -12,8 +12,7 @@ from vinetrack import effects
 from vinetrack.core.records import Kinematics, Track, Trial, Window
 from vinetrack.dynamics.model import base_model
 from vinetrack.effects import EffectError
-from vinetrack.kinematics.force import SteadyForce, known_pressure, steady_force, why_not_force, why_not_in_fit
-from vinetrack.kinematics.release import Release
+from vinetrack.kinematics.force import Release, SteadyForce, known_pressure, steady_force, why_not_force, why_not_in_fit
 
 G = 9.81
 AREA = math.pi * 0.012**2

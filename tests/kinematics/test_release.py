@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
-from vinetrack.kinematics.release import find_release, flag_rest
+from vinetrack.kinematics.force import find_release, flag_rest
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 

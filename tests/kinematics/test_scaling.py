@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vinetrack.core.published import DAMPING_B, DIAMETER_MM, THICKNESS_UM
-from vinetrack.kinematics.scaling import fit_scaling
+from vinetrack.kinematics.damping import fit_scaling
 
 
 def law(B: float, diameter_mm: float, thickness_um: float) -> dict:

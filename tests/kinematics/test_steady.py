@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from vine_truth import Vine, ar1, make_track, record
 
-from vinetrack.kinematics.plateau import WindowMoments
-from vinetrack.kinematics.steady import gated_window, user_window
+from vinetrack.kinematics.steady import WindowMoments, gated_window, user_window
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 SEEDS = range(1000, 1010)

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.kinematics.conditions import CONDITION_COLUMNS
-from vinetrack.kinematics.scaling import alike, fit_trends, planes, regress
+from vinetrack.kinematics.damping import alike, fit_trends, planes, regress
+from vinetrack.kinematics.summary import CONDITION_COLUMNS
 
 PER_STEP_95 = 12.706204736  # Student's t with one degree of freedom
 PER_TWO_95 = 4.302652730  # and with two

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
-from vinetrack.kinematics.velocity import estimate_kinematics
-from vinetrack.kinematics.windows import fit_all_windows
+from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
 
 SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
 TRIALS = [

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import savgol_filter
 from vine_truth import ar1
 
-from vinetrack.kinematics.windows import correlated, fit_all_windows
+from vinetrack.kinematics.velocity import correlated, fit_all_windows
 
 EVEN = np.arange(60) / 1000
 GAPPED = np.delete(np.arange(64) / 1000, [20, 21, 22, 40])

@@ -12,10 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.laboratory.render import FrameRenderer, frame_order
+from vinetrack.laboratory.render import FrameRenderer, frame_order, motion_function, tip_profiles
 from vinetrack.laboratory.scene import PRESETS, Ball, Camera, Door, Faults, Light, Scene, Sensor, Tube, preset
-from vinetrack.laboratory.scene_motion import motion_function
-from vinetrack.laboratory.scene_objects import tip_profiles
 
 FPS = 1000.0
 CLEAN = preset("clean")

@@ -15,7 +15,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.tracks import (
     GroundTruth,

@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from vinetrack.paper.arithmetic import (
+    COMPUTED,
+    as_table,
     computed_rows,
     gauge_left,
     p_value,
@@ -15,7 +17,6 @@ from vinetrack.paper.arithmetic import (
     volume_change,
     weight_over_gas,
 )
-from vinetrack.paper.rows import COMPUTED, as_table
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.naming import with_names
-from vinetrack.paper.comparison import (
+from vinetrack.experiment.schema import with_names
+from vinetrack.paper.arithmetic import NONE, follow
+from vinetrack.paper.protocol import (
     Rest,
     eq2_speed_m_s,
     final_speeds,
@@ -21,7 +22,6 @@ from vinetrack.paper.comparison import (
     speed_conditions,
     speed_curves,
 )
-from vinetrack.paper.departures import NONE, follow
 
 
 def trial(name: str, pressure_kPa: float, payload_g: float, thickness_um: float = 200.0) -> Trial:

@@ -11,10 +11,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
-from vinetrack.paper.departures import (
+from vinetrack.paper.arithmetic import (
     DEPARTURE_COLUMNS,
     DEPARTURES,
     NONE,
+    as_table,
     departure_table,
     follow,
     motion_table,
@@ -23,8 +24,7 @@ from vinetrack.paper.departures import (
     position_trials,
     pressure_table,
 )
-from vinetrack.paper.rows import as_table
-from vinetrack.paper.theory_rows import (
+from vinetrack.paper.result_rows import (
     departures_in_words,
     drag_shares,
     fast_vine_speeds,

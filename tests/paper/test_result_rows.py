@@ -10,14 +10,11 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.kinematics.conditions import CONDITION_COLUMNS
-from vinetrack.paper.arithmetic import computed_rows
-from vinetrack.paper.comparison import POSITION_COLUMNS, SPEED_COLUMNS
-from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
-from vinetrack.paper.protocol import protocol_rows
-from vinetrack.paper.result_rows import ExperimentResults, result_rows
-from vinetrack.paper.rows import (
+from vinetrack.kinematics.summary import CONDITION_COLUMNS
+from vinetrack.paper.arithmetic import (
     COMPUTED,
+    DEPARTURE_COLUMNS,
+    DEPARTURES,
     MEASURED,
     NOT_CHECKABLE,
     PAPER_COLUMNS,
@@ -25,9 +22,11 @@ from vinetrack.paper.rows import (
     PaperRow,
     as_table,
     bounds,
+    computed_rows,
     number,
 )
-from vinetrack.paper.theory_rows import theory_rows
+from vinetrack.paper.protocol import POSITION_COLUMNS, SPEED_COLUMNS, protocol_rows
+from vinetrack.paper.result_rows import ExperimentResults, result_rows, theory_rows
 
 nan = math.nan
 

@@ -15,7 +15,7 @@ from vinetrack.diagnosis.result import Round
 from vinetrack.figures import registry
 from vinetrack.figures.registry import draw
 from vinetrack.figures.style import render
-from vinetrack.pipeline.diagnosis_tables import (
+from vinetrack.pipeline.diagnosis_stage import (
     cosines_by_rank,
     figure_tables,
     predicted_trials,
@@ -24,7 +24,7 @@ from vinetrack.pipeline.diagnosis_tables import (
     round_heading,
     worst_condition,
 )
-from vinetrack.pipeline.figures_stage import figure_inputs, with_final_model
+from vinetrack.pipeline.report_stage import figure_inputs, with_final_model
 from vinetrack.results.folder_layout import Results
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2
@@ -183,7 +183,7 @@ def test_ties_stand_in_the_order_of_the_ranking() -> None:
 def test_trials_in_which_nothing_grew_have_no_places_along_the_growth() -> None:
     import pandas as pd
 
-    from vinetrack.pipeline import diagnosis_tables
+    from vinetrack.pipeline import diagnosis_stage as diagnosis_tables
 
     still = {"trial": ["a"] * 6, "time_s": range(6), "lead_position_m": [0.0] * 6}
     members = pd.DataFrame(still | {"model_before_m": [0.0] * 6, "model_after_m": [0.0] * 6})

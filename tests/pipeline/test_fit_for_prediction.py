@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vinetrack.core.tables import write_json
-from vinetrack.pipeline.fit_for_prediction import choose_fit
+from vinetrack.pipeline.predict_stage import choose_fit
 from vinetrack.results.folder_layout import Results, ResultsError
 
 

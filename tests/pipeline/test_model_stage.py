@@ -219,7 +219,7 @@ def test_an_unforeseen_fault_stops_nothing_and_stands_in_the_log(
     def fault(*_: object, **__: object) -> None:
         raise RuntimeError("surprise")
 
-    monkeypatch.setattr("vinetrack.diagnosis.initial_fit.initial_fit", fault)
+    monkeypatch.setattr("vinetrack.diagnosis.ladder.initial_fit", fault)
     experiment, source, _ = campaign
     results = analysed(experiment, tmp_path / "results")
     done = run("model", experiment, results, "--log", tmp_path / "log.txt")

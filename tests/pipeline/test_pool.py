@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.pipeline.pool import map_trials, map_unordered
+from vinetrack.pipeline.tracks_stage import map_trials, map_unordered
 
 PARENT = """
 import os, sys, time
-from vinetrack.pipeline.pool import map_unordered, map_trials
+from vinetrack.pipeline.tracks_stage import map_unordered, map_trials
 
 def task(number):
     os.write(1, b"%d\\n" % os.getpid())  # at once: two that print mix their lines

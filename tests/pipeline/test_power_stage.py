@@ -14,14 +14,11 @@ from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.core.problems import ExperimentError
-from vinetrack.diagnosis.campaign_power import CampaignDesign
+from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
 from vinetrack.diagnosis.null_calibration import TESTS, CampaignPValues
-from vinetrack.diagnosis.simulated_power import SimulatedDiagnosis
 from vinetrack.figures.registry import draw
-from vinetrack.pipeline import simulated_answers
-from vinetrack.pipeline.power_campaigns import PowerRequest
-from vinetrack.pipeline.power_stage import power_of_target
-from vinetrack.pipeline.simulated_answers import fingerprint, stored_answers
+from vinetrack.pipeline import power_stage
+from vinetrack.pipeline.power_stage import PowerRequest, fingerprint, power_of_target, stored_answers
 
 SHEET = (
     "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -93,12 +90,12 @@ def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeyp
         asked_for.append(seed)
         return CampaignPValues(seed, dict.fromkeys(TESTS, 0.1 * (seed + 1)))
 
-    monkeypatch.setattr(simulated_answers, "null_p_values", chances)
-    monkeypatch.setattr(simulated_answers, "fingerprint", lambda _: "design")
-    how = simulated_answers.Simulation(2, 0, 1, tmp_path / "chances.csv")
+    monkeypatch.setattr(power_stage, "null_p_values", chances)
+    monkeypatch.setattr(power_stage, "fingerprint", lambda _: "design")
+    how = power_stage.Simulation(2, 0, 1, tmp_path / "chances.csv")
     design: Any = None
-    first = simulated_answers.simulate_null_tests(design, how)
-    again = simulated_answers.simulate_null_tests(design, replace(how, campaigns=3))
+    first = power_stage.simulate_null_tests(design, how)
+    again = power_stage.simulate_null_tests(design, replace(how, campaigns=3))
     assert asked_for == [0, 1, 2]
     assert again[:2] == first
     assert again[2].p_values["any smooth force"] == pytest.approx(0.3)
@@ -127,7 +124,7 @@ def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monk
         verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
         return SimulatedDiagnosis(effect, value, seed, verdict, names, (), 1.0)
 
-    monkeypatch.setattr(simulated_answers, "simulated_diagnosis", answered)
+    monkeypatch.setattr(power_stage, "simulated_diagnosis", answered)
     asked = PowerRequest(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
     first = power_of_target(asked)
     assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.pipeline.run_lock import OWNER_FILE, begin_run, executes_nothing
 from vinetrack.pipeline.run_stage import RunPaths, run_chain
+from vinetrack.pipeline.workflow import OWNER_FILE, begin_run, executes_nothing
 
 ROOT = Path(__file__).parents[2]
 BEGIN = """
 import os, sys, time
 from pathlib import Path
-from vinetrack.pipeline.run_lock import begin_run
+from vinetrack.pipeline.workflow import begin_run
 begin_run(Path("results/vines"), Path("vines"), Path.cwd(), print)
 Path(".snakemake/locks").mkdir(parents=True)
 Path(".snakemake/locks/0.output.lock").write_text("results/vines/trials.csv\\n")

@@ -14,9 +14,8 @@ from lsoda_vine import grown_position, vine_trial
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import run_stage
-from vinetrack.pipeline.run_folders import claim_results, command_for_results
 from vinetrack.pipeline.run_stage import RunError, RunPaths, check_before_run, run_chain, run_lines, run_paths
-from vinetrack.pipeline.workflow import make_plan
+from vinetrack.pipeline.workflow import claim_results, command_for_results, make_plan
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 

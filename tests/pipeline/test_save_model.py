@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from vinetrack.core.problems import ExperimentError
 from vinetrack.core.yaml_document import parse_yaml, with_list
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.pipeline.source_experiment import save_model
+from vinetrack.pipeline.effects_stage import save_model
 
 BASE = ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"]
 MORE = [*BASE, "reservoir_depletion"]

@@ -15,7 +15,7 @@ from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.pipeline.diagnosis_stage import sheet_contradictions, with_contradictions
 from vinetrack.pipeline.run_stage import run_lines
-from vinetrack.planning.scaling_priors import damping_prior
+from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.results.folder_layout import Results, empty_table
 
 PSI = 6.894757

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from vinetrack.dynamics.kernel import PARTS
-from vinetrack.pipeline import stage_code
-from vinetrack.pipeline.stage_code import PACKAGE, STAGE_MODULES, code_hash, imported_names, stage_files
+from vinetrack.pipeline import workflow
+from vinetrack.pipeline.workflow import PACKAGE, STAGE_MODULES, code_hash, imported_names, stage_files
 
 STAGES = tuple(STAGE_MODULES)
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
@@ -29,7 +29,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @lru_cache
 def hashes(copy: Path) -> dict[str, str]:
     """Hashes of all stages of the copy as it came."""
-    stage_code.forget_scans()
+    workflow.forget_scans()
     return {stage: code_hash(stage, copy) for stage in STAGES}
 
 
@@ -38,7 +38,7 @@ def changed_by_an_edit(path: Path, copy: Path) -> set[str]:
     before = hashes(copy)
     content = path.read_bytes()
     path.write_bytes(content + b"\n")
-    stage_code.forget_scans()
+    workflow.forget_scans()
     after = {stage: code_hash(stage, copy) for stage in STAGES}
     path.write_bytes(content)
     return {stage for stage in STAGES if before[stage] != after[stage]}

@@ -14,9 +14,7 @@ from vinetrack.core.tables import write_json
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_result import BetweenTrialSpread, Number
 from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
-from vinetrack.results.folder_layout import Results, ResultsError
-from vinetrack.results.stored_diagnosis import read_diagnosis
-from vinetrack.results.stored_fit import read_fit
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
 
 OPEN = math.nan
 

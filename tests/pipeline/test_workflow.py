@@ -11,8 +11,7 @@ import pytest
 from vinetrack.core.problems import ExperimentError
 from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.run_folders import find_experiment
-from vinetrack.pipeline.workflow import make_plan, shell_prefix
+from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
 from vinetrack.report.build import figure_caption
 
 ROOT = Path(__file__).parents[2]
@@ -204,7 +203,7 @@ def test_a_users_own_effect_is_an_input_of_the_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a{b}", "<b>x"])
 def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path, name: str) -> None:
-    from vinetrack.pipeline.check_stage import check_folder
+    from vinetrack.pipeline.run_stage import check_folder
 
     (tmp_path / name).mkdir()
     (tmp_path / name / "trials.csv").write_text("trial\n")
@@ -213,7 +212,7 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
 
 
 def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> None:
-    from vinetrack.pipeline.run_folders import path_problems
+    from vinetrack.pipeline.workflow import path_problems
 
     assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
 

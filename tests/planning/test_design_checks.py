@@ -10,9 +10,8 @@ import pytest
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.planning.design_checks import design_checks, neglected, typical_sizes
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.prediction import VinePrediction, predict_vine
+from vinetrack.planning.prediction import VinePrediction, design_checks, neglected, predict_vine, typical_sizes
 
 SAFE = {
     "diameter_mm": "18",

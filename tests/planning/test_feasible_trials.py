@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
+from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 
 
 def trial(pressure_kPa: float, **more: Any) -> Trial:

@@ -13,9 +13,18 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial
 from vinetrack.experiment.planned import planned_trial
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.prediction import EDGE, EJECTION, LEAST_TENSION, STEADY, TAIL, TENSION, TIME, predict_vine, run
-from vinetrack.planning.predictive_inputs import BAND, YIELD
-from vinetrack.planning.scaling_priors import damping_prior
+from vinetrack.planning.prediction import (
+    EDGE,
+    EJECTION,
+    LEAST_TENSION,
+    STEADY,
+    TAIL,
+    TENSION,
+    TIME,
+    predict_vine,
+    run,
+)
+from vinetrack.planning.predictive_inputs import BAND, YIELD, damping_prior
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
 EXACT = {"yield_pressure_sigma_kPa": "0"}

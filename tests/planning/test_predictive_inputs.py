@@ -14,9 +14,8 @@ from vinetrack.core.records import Trial
 from vinetrack.effects import EffectError
 from vinetrack.experiment.planned import planned_trial
 from vinetrack.inference.fit_data import FitError
-from vinetrack.planning.fit_inputs import fit_numbers, size_of
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.predictive_inputs import PRESSURE, YIELD, Size, read_sizes
+from vinetrack.planning.predictive_inputs import PRESSURE, YIELD, Size, fit_numbers, read_sizes, size_of
 
 B, N = "eversion_damping.B", "eversion_damping.n"
 VINE = "24mm-200um-280mm"

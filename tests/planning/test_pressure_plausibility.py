@@ -8,8 +8,8 @@ import pytest
 
 from vinetrack.core import published
 from vinetrack.core.records import Trial
+from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.planning.pressure_plausibility import pressure_problems
-from vinetrack.planning.scaling_priors import damping_prior
 
 PSI = 6.894757
 

@@ -12,8 +12,7 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.reservoir_design import (
+from vinetrack.planning.fastest_vine import (
     GAMMAS,
     chamber_by_gauge,
     chamber_for,
@@ -24,6 +23,7 @@ from vinetrack.planning.reservoir_design import (
     supplied_loss,
     swept_m3,
 )
+from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 
 ATM = 101_325.0
 

@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.core import published
 from vinetrack.experiment.settings import Limits
-from vinetrack.planning import scaling_priors as guess
+from vinetrack.planning import predictive_inputs as guess
 
 
 def printed(scale: int) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vinetrack.figures.style import BLUE, INK, PAPER, look, render
-from vinetrack.report.svg import circle_diameter, compact_svg, moved, parse_path, recoded_image, write_path
+from vinetrack.report.section import circle_diameter, compact_svg, moved, parse_path, recoded_image, write_path
 
 
 def drawn(draw) -> str:  # type: ignore[no-untyped-def]

@@ -14,8 +14,8 @@ from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis, Round
 from vinetrack.figures.registry import DIAGNOSIS_FIGURES
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative import verdict_summary
-from vinetrack.narrative.verdict_summary import Fact, listed_names
+from vinetrack.narrative import verdict_text
+from vinetrack.narrative.verdict_text import Fact, listed_names
 from vinetrack.report.build import ReportFigure
 from vinetrack.report.diagnosis_section import (
     DiagnosisResult,
@@ -33,15 +33,15 @@ def read(content: dict) -> Diagnosis:
 
 
 def facts(content: dict, table: pd.DataFrame | None) -> list[Fact]:
-    return verdict_summary.summary_facts(read(content), table)
+    return verdict_text.summary_facts(read(content), table)
 
 
 def sentence(content: dict) -> str:
-    return verdict_summary.verdict_sentence(read(content))
+    return verdict_text.verdict_sentence(read(content))
 
 
 def meaning(content: dict) -> str:
-    return verdict_summary.verdict_meaning(read(content))
+    return verdict_text.verdict_meaning(read(content))
 
 
 def heading(html: str) -> str:
@@ -327,7 +327,7 @@ def test_whatever_stands_in_the_file_is_escaped(place: str) -> None:
 
 def test_numbers_are_said_in_units_that_read_well() -> None:
     shown = [Number.from_json(number("a.k", "k", 2500.0, sigma, "Pa", "v")) for sigma in (100.0, None)]
-    assert [verdict_summary.estimate_text(one) for one in shown] == ["k (v) = 2.50 ± 0.10 kPa", "k (v) = 2.50 kPa"]
+    assert [verdict_text.estimate_text(one) for one in shown] == ["k (v) = 2.50 ± 0.10 kPa", "k (v) = 2.50 kPa"]
 
 
 def test_names_are_listed_with_and_before_the_last() -> None:

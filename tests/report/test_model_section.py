@@ -10,8 +10,7 @@ import pytest
 from test_report import EVIL, SVG, Tags, page
 
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.report.build import ReportFigure
-from vinetrack.report.model_section import ModelResult, model_section, verdict
+from vinetrack.report.build import ModelResult, ReportFigure, model_section, verdict
 
 FIT = {
     "model": ["gravity", "eversion_damping"],

@@ -6,8 +6,15 @@ import math
 
 import pandas as pd
 
-from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
-from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, SIMULATED, PaperRow, as_table
+from vinetrack.paper.arithmetic import (
+    COMPUTED,
+    DEPARTURE_COLUMNS,
+    DEPARTURES,
+    NOT_CHECKABLE,
+    SIMULATED,
+    PaperRow,
+    as_table,
+)
 from vinetrack.report.paper_section import paper_section, tally
 
 nan = math.nan

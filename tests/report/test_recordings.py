@@ -7,16 +7,17 @@ import math
 import pytest
 from test_report import EVIL, SVG, Tags, page, trials
 
-from vinetrack.report import trials_section as report_trials
-from vinetrack.report.build import MAX_CLIP_BYTES, Clip
-from vinetrack.report.svg import inline_svg
-from vinetrack.report.trials_section import (
+from vinetrack.report import build as report_trials
+from vinetrack.report.build import (
+    MAX_CLIP_BYTES,
     MAX_SVG_BYTES,
     SHARED_ERROR,
+    Clip,
     TrackedRecording,
     calibration_table,
     count_frames,
 )
+from vinetrack.report.section import inline_svg
 
 BOARD = {
     "kind": "charuco",

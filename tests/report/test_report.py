@@ -11,11 +11,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.narrative.law_text import damping_headline, status_tally, vines_without_law
-from vinetrack.report.build import ReportContent, ReportFigure, ReportSection, ReportTable, build_report
-from vinetrack.report.section import data_uri
-from vinetrack.report.svg import inline_svg
-from vinetrack.report.trials_section import MAX_DATA_ROWS, speed_sparkline
+from vinetrack.narrative.diagnosis_text import damping_headline, status_tally, vines_without_law
+from vinetrack.report.build import (
+    MAX_DATA_ROWS,
+    ReportContent,
+    ReportFigure,
+    ReportSection,
+    ReportTable,
+    build_report,
+    speed_sparkline,
+)
+from vinetrack.report.section import data_uri, inline_svg
 
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501

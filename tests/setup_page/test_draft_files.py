@@ -10,10 +10,17 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.experiment.folder import check_experiment
-from vinetrack.setup_page.draft_files import Draft, draft_folder, open_draft, write_draft
-from vinetrack.setup_page.settings_draft import first_settings, shared_values, with_shared
-from vinetrack.setup_page.setup_command import write_templates
-from vinetrack.setup_page.sheet_draft import SheetDraft
+from vinetrack.setup_page.draft_files import (
+    Draft,
+    SheetDraft,
+    draft_folder,
+    first_settings,
+    open_draft,
+    shared_values,
+    with_shared,
+    write_draft,
+)
+from vinetrack.setup_page.page_server import write_templates
 
 SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
 SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"

@@ -9,8 +9,7 @@ import pytest
 from vine_truth import make_track
 
 from vinetrack.core.records import Trial, with_flag
-from vinetrack.tracks.body_end import flag_end_of_body
-from vinetrack.tracks.importers import load_track
+from vinetrack.tracks.importers import flag_end_of_body, load_track
 
 CLOCK_S = np.arange(120) / 200
 NOISE_M = 2e-4

@@ -9,8 +9,7 @@ import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
-from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
-from vinetrack.tracks.step_gaps import count_missing
+from vinetrack.tracks.frame_timing import correct_frames, count_missing, frames_surely_missing
 
 FRAME_S = 1 / CAPTURE_FPS
 CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position

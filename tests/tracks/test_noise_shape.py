@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from vine_truth import Vine, ar1, record
 
-from vinetrack.tracks.noise_shape import NoiseShape, ar1_difference_gain, noise_shape
+from vinetrack.tracks.position_noise import NoiseShape, ar1_difference_gain, noise_shape
 
 BLUR_S = 60e-6
 NOISE_M = 6e-5

@@ -10,7 +10,7 @@ from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.tracks.outliers import find_outliers, reject_outliers
+from vinetrack.tracks.position_noise import find_outliers, reject_outliers
 
 FRAME_S = 1 / CAPTURE_FPS
 VINES = [(Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.6), (Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0.0)]

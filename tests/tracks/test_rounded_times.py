@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vinetrack.tracks.importers import TrackError, read_track
-from vinetrack.tracks.rounded_times import unrounded_times
+from vinetrack.tracks.importers import TrackError, read_track, unrounded_times
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from scipy.signal import savgol_filter
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
-from vinetrack.pipeline.check_stage import check_folder
+from vinetrack.pipeline.run_stage import check_folder
 from vinetrack.tracks.position_noise import ar1_noise
 from vinetrack.tracks.smoothed_positions import Smoothing, detect_smoothing
 

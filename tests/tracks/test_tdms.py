@@ -10,8 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vinetrack.tracks.importers import read_pressure_trace
-from vinetrack.tracks.track_checks import TrackError
+from vinetrack.tracks.importers import TrackError, read_pressure_trace
 
 CODES = {"<i2": 2, "<i4": 3, "<u1": 5, "<f4": 9, "<f8": 10, ">f8": 10, ">i2": 2}
 TIME_S = np.arange(12) * 2e-3 + 0.1

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.video.board_search import find_board
+from vinetrack.video.target_corners import find_board
 
 
 def charuco(squares: tuple[int, int], name: str, square_px: int = 80, marker_px: int = 60) -> np.ndarray:

@@ -16,8 +16,7 @@ from vinetrack.experiment.settings import Charuco, Checkerboard, MmPerPx, TwoPoi
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.scene import Camera, Encoding, Light, Sensor, Tube, preset
 from vinetrack.laboratory.targets import Target, render_calibration_clip, render_target
-from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures
-from vinetrack.video.plane_map import PlaneMap, fit_planes
+from vinetrack.video.calibration import CalibrationError, PlaneMap, calibrate, calibrate_pictures, fit_planes
 
 DEMO = preset("demo")
 CAMERA = Camera(m_per_px=1 / 2400, focal_px=1500, k1=-0.2, k2=0.05, tilt_x_deg=4, tilt_y_deg=-7)

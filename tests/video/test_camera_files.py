@@ -12,9 +12,8 @@ from camera_files import write_cine, write_mraw, write_side_file
 from plain_scene import Plan, plain_scene, write_images
 
 from vinetrack.core.records import Trial
-from vinetrack.video.capture_clock import capture_exposure, capture_rate
-from vinetrack.video.frames import RecordingError, Region, inspect_recording, iterate_frames, read_frames
-from vinetrack.video.raw_frames import PHANTOM_TABLE
+from vinetrack.video.frames import PHANTOM_TABLE, RecordingError, Region, inspect_recording, iterate_frames, read_frames
+from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.track import track_recording
 
 RNG = np.random.default_rng(11)

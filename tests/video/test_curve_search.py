@@ -13,12 +13,10 @@ from plain_scene import HARDER, Plan, plain_scene, write_images
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import find_axis
-from vinetrack.video.curve_search import find_curve, find_growth_axis, front_share_of_picture
-from vinetrack.video.curved_axis import CurvedAxis
+from vinetrack.video.curved_axis import CurvedAxis, find_curve, find_growth_axis, front_share_of_picture
 from vinetrack.video.frames import Frames, Recording
-from vinetrack.video.measure import measure_recording
-from vinetrack.video.quick_look import proposed_axis
 from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.survey import measure_recording, proposed_axis
 from vinetrack.video.track import Tracking, track_frames
 
 

@@ -12,12 +12,18 @@ from bent_scene import BENDS, BentPlan, BentScene, bent_scene
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.calibration import PlaneCalibration
-from vinetrack.video.curved_axis import CurvedAxis, axis_entry, axis_from_entry, axis_through, curve_problem
-from vinetrack.video.curved_strip import cut_along, straightened
+from vinetrack.video.calibration import PlaneCalibration, PlaneMap
+from vinetrack.video.curved_axis import (
+    CurvedAxis,
+    axis_entry,
+    axis_from_entry,
+    axis_through,
+    curve_problem,
+    cut_along,
+    picture_shake,
+    straightened,
+)
 from vinetrack.video.frames import Frames, Recording, RecordingError
-from vinetrack.video.plane_map import PlaneMap
-from vinetrack.video.still_ground import picture_shake
 from vinetrack.video.track import Tracking, track_frames
 
 RADIUS = 300.0

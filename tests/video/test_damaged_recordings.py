@@ -246,7 +246,7 @@ def test_a_tube_of_two_widths_has_one_of_them() -> None:
 
 
 def test_a_front_that_leaves_nothing_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinetrack.video.first_path.growth_end", lambda *given: given[2][0])
+    monkeypatch.setattr("vinetrack.video.edge.growth_end", lambda *given: given[2][0])
     for follow in (outline, track_edge):
         with pytest.raises(ValueError, match="does not stay changed: nothing grows"):
             follow(grown_strip(np.full(240, 20)))

@@ -7,23 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from vinetrack.video import edge_cover, picture_kernels, residual_kernels
+from vinetrack.video import edge_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
-from vinetrack.video.order_kernels import median, monotone_path_sums
-from vinetrack.video.registration import _pixels, reference_pixels
-from vinetrack.video.resample import sample
+from vinetrack.video.kymograph import median, monotone_path_sums
+from vinetrack.video.strip import _pixels, reference_pixels, sample
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
 def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(length: float, blur: float) -> None:
     half = 6.0 + 0.5 * length + 4 * blur
-    table = edge_cover.coverage_table(length, blur, half)
+    table = edge_kernels.coverage_table(length, blur, half)
     middle = math.ceil(half) + 1
     x = (
         middle
         - np.arange(table.shape[2])
-        + edge_cover.TABLE_STEP_PX * np.arange(edge_cover.SUBPIXEL_STEPS + 1)[:, None]
+        + edge_kernels.TABLE_STEP_PX * np.arange(edge_kernels.SUBPIXEL_STEPS + 1)[:, None]
     )
     # A box of many Gaussian steps, summed one by one.
     places = np.linspace(-0.5, 0.5, 401) * max(length, 0.02)
@@ -32,7 +31,8 @@ def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(l
         expected += np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))((x - place) / blur) / 200
     assert np.abs(table[0] - expected).max() < 2e-5
     assert (
-        np.abs(table[1, :, 1:-1] - np.gradient(expected, edge_cover.TABLE_STEP_PX, axis=0)[:, 1:-1]).max() < 0.01 / blur
+        np.abs(table[1, :, 1:-1] - np.gradient(expected, edge_kernels.TABLE_STEP_PX, axis=0)[:, 1:-1]).max()
+        < 0.01 / blur
     )
 
 
@@ -78,7 +78,7 @@ def test_what_is_seen_bare_and_covered_is_counted_apart_and_strays_hardly() -> N
     scale, offset, zeros = np.ones(16), np.zeros(16), np.zeros(16)
     early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
     seen = [
-        picture_kernels.gather(
+        edge_kernels.gather(
             strip, scale, offset, edge, zeros, np.zeros(9), 0.5, early, late, 6.0, pictures, clip, NO_SHADING
         )
         for clip in (0.0, 10.0)
@@ -130,9 +130,7 @@ def test_the_rim_is_no_part_of_what_film_looks_like() -> None:
     zeros = np.zeros(16)
     early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
     clean, freed, ignored = (
-        picture_kernels.gather(
-            seen, np.ones(16), zeros, edge, zeros, LAG, 0.5, early, late, 6.0, pictures, 0.0, shading
-        )
+        edge_kernels.gather(seen, np.ones(16), zeros, edge, zeros, LAG, 0.5, early, late, 6.0, pictures, 0.0, shading)
         for seen, shading in ((bare, NO_SHADING), (strip, RIM), (strip, NO_SHADING))
     )
     film = slice(31, 80)  # columns that the rim has crossed
@@ -149,8 +147,8 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     steady, frames = (strip, np.ones(16), np.zeros(16)), np.flatnonzero(use)
     arguments = (*steady, fit, np.zeros(16), LAG, blur, pictures, margin, frames, 0.5 * RIM)
     sums = "distance_sums", "row_sums", "misfit_sums", "place_sums"
-    found = [getattr(residual_kernels, name)(*arguments).sum(axis=0) for name in sums]
-    half = edge_cover.coverage_reach(0.0, blur) + margin
+    found = [getattr(edge_kernels, name)(*arguments).sum(axis=0) for name in sums]
+    half = edge_kernels.coverage_reach(0.0, blur) + margin
     by_distance, by_row, by_place, logs = np.zeros_like(found[0]), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
         columns: dict[int, np.ndarray] = {}

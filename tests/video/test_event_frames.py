@@ -11,10 +11,10 @@ from camera_files import write_cine
 from plain_scene import Plan, Scene, plain_scene, write_video
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.video import event_frames
+from vinetrack.video import small_pictures
 from vinetrack.video.decoding import packet_index
-from vinetrack.video.event_frames import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.frames import inspect_recording, read_frames
+from vinetrack.video.small_pictures import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.track import track_recording
 
 BEFORE, AFTER = 300, 180
@@ -50,7 +50,7 @@ def film(request: pytest.FixtureRequest, long_frames: np.ndarray, tmp_path_facto
 @pytest.fixture
 def bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every recording counts as a long one."""
-    monkeypatch.setattr(event_frames, "MAX_BYTES_WHOLE", 0)
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
 
 
 def track(path: Path, **stated: object) -> Track:
@@ -80,7 +80,7 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scen
 
 def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = track(film)
-    monkeypatch.setattr(event_frames, "MAX_BYTES_WHOLE", 0)
+    monkeypatch.setattr(small_pictures, "MAX_BYTES_WHOLE", 0)
     part = track(film)
     assert len(part.time_s) == len(whole.time_s)
     assert part.time_s == pytest.approx(whole.time_s)
@@ -102,14 +102,14 @@ def test_where_frames_at_rest_take_no_bytes_no_others_than_those_of_the_event_ar
     rest = np.ones((BEFORE, 1, 1), np.uint8)
     still = np.concatenate([scene.frames[0] * rest, scene.frames, scene.frames[-1] * rest])
     path = write_video(tmp_path / "still.mp4", still, options={"crf": "28", "g": "250"})
-    decode, looked_at = event_frames.decode_packets, []
+    decode, looked_at = small_pictures.decode_packets, []
 
     def counted(*arguments):
         for frame in decode(*arguments):
             looked_at.append(frame)
             yield frame
 
-    monkeypatch.setattr(event_frames, "decode_packets", counted)
+    monkeypatch.setattr(small_pictures, "decode_packets", counted)
     frames = read_event(inspect_recording(path))
     moving = np.flatnonzero(scene.moving) + BEFORE
     assert len(looked_at) <= len(still) / 250 + 1

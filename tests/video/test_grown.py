@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinetrack.video.motion_end import is_grown
-from vinetrack.video.point_quality import PointQuality
+from vinetrack.video.point_quality import PointQuality, is_grown
 
 EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
 

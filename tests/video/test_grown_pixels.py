@@ -14,12 +14,12 @@ from plain_scene import write_images
 from vinetrack.core.records import Trial
 from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import Axis, find_axis
-from vinetrack.video.curve_search import find_growth_axis
-from vinetrack.video.first_path import initial_front_path
+from vinetrack.video.curved_axis import find_growth_axis
+from vinetrack.video.edge import initial_front_path
 from vinetrack.video.kymograph import path_by_change
-from vinetrack.video.measure import measure_recording
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Strip, cut_strip
+from vinetrack.video.survey import measure_recording
 from vinetrack.video.track import track_recording
 
 MOUTH = (60, 120)

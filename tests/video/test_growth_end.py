@@ -12,7 +12,7 @@ from plain_scene import Plan, plain_scene
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import Frames, Recording, Region
-from vinetrack.video.motion_end import growth_end
+from vinetrack.video.point_quality import growth_end
 from vinetrack.video.strip import Strip
 from vinetrack.video.track import track_frames
 

@@ -9,7 +9,7 @@ import pytest
 from plain_scene import Plan, plain_scene, write_video
 
 from vinetrack.core.records import Correction, Track, Trial
-from vinetrack.video.hand_corrections import corrected_by_hand
+from vinetrack.video.calibration import corrected_by_hand
 from vinetrack.video.track import track_recording
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinetrack.video.hidden_tip import leap_error_px
+from vinetrack.video.edge_repair import leap_error_px
 
 FRAMES = np.arange(40.0)
 

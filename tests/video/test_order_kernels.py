@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.video.order_kernels import block_means, largest_steps, ratio_medians
+from vinetrack.video.kymograph import block_means, largest_steps, ratio_medians
 
 
 @pytest.mark.parametrize("side", [1, 3, 4])

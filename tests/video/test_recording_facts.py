@@ -17,17 +17,18 @@ from vinetrack.laboratory.scene import Tube, preset
 from vinetrack.pipeline.recordings_stage import analyse_recording
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video.axis import Axis
-from vinetrack.video.capture_clock import capture_rate
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
-from vinetrack.video.quick_look import look_at, proposed_axis
-from vinetrack.video.recording_facts import (
+from vinetrack.video.images import capture_rate
+from vinetrack.video.survey import (
     RecordingFacts,
+    Surveyor,
     axis_notes,
     direction_notes,
     exposure_problems,
+    look_at,
+    proposed_axis,
     size_problems,
 )
-from vinetrack.video.survey import Surveyor
 from vinetrack.video.track import track_recording
 
 FPS, SCALE_MM = 1069.0, 0.24

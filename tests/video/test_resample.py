@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.video.resample import warp_all
+from vinetrack.video.strip import warp_all
 
 
 @pytest.mark.parametrize("slope", [0.004, -0.03, 0.7])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from vinetrack.video.edge_repair import BANDS
-from vinetrack.video.slow_errors import SLOW_GREY, SLOW_PX, noise_and_slow, shared_disagreement, slow_error_px
+from vinetrack.video.edge_repair import BANDS, SLOW_GREY, SLOW_PX, noise_and_slow, shared_disagreement, slow_error_px
 
 FRAMES = 60
 

@@ -8,8 +8,7 @@ from plain_scene import Plan, plain_scene
 
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.resample import sample
-from vinetrack.video.strip import cut_strip, snap_to_grid
+from vinetrack.video.strip import cut_strip, sample, snap_to_grid
 
 
 def ramp(gx, gy, shape=(90, 140)):

@@ -12,8 +12,13 @@ from scipy.special import ndtr
 from vinetrack.experiment.settings import Charuco, Checkerboard
 from vinetrack.laboratory.scene import Camera, Light, Sensor, preset
 from vinetrack.laboratory.targets import Target, render_target
-from vinetrack.video.saddle import refine_saddles
-from vinetrack.video.target_corners import CornersError, charuco_corners, checkerboard_corners, eight_bits
+from vinetrack.video.target_corners import (
+    CornersError,
+    charuco_corners,
+    checkerboard_corners,
+    eight_bits,
+    refine_saddles,
+)
 
 CAMERA = Camera(focal_px=1500, k1=-0.2, tilt_x_deg=5, tilt_y_deg=-6)
 SCENE = replace(preset("demo"), camera=CAMERA)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from plain_scene import Plan, plain_scene
 
+from vinetrack.core import threads
 from vinetrack.core.records import Trial
-from vinetrack.video import threads
 from vinetrack.video.frames import Frames, Recording, Region
-from vinetrack.video.order_kernels import mean_changes
+from vinetrack.video.kymograph import mean_changes
 from vinetrack.video.track import Tracking, track_frames
 
 

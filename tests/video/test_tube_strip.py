@@ -7,10 +7,9 @@ import pytest
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
-from vinetrack.video.curved_strip import front_share_function
-from vinetrack.video.follow import follow
+from vinetrack.video.curved_axis import front_share_function
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.tube_strip import tube_strip
+from vinetrack.video.track import follow, tube_strip
 
 AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
 """Six rows beside the middle of the tube."""

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.command_frame import errors_as_sentences
-from vinetrack.cli.output import MORE, JsonFile, print_result
+from vinetrack.cli.command_frame import MORE, JsonFile, errors_as_sentences, print_result
 
 
 def register(app: typer.Typer) -> None:

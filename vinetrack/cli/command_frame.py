@@ -5,15 +5,46 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import RunSettings
+
+
+# ------------------------------------------------------------------------------
+# Output of commands: lines for the user, or with `--json` the same content for a program.
+
+START, MORE = "Start here", "More"  # Panels of the help; the first lists the commands that a new user needs
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write it as JSON to this file, - for the terminal.",
+                 show_default=False),
+]  # fmt: skip
+
+
+def json_to_terminal(json_file: Path | None) -> bool:
+    """Whether JSON is printed to the terminal instead of lines."""
+    from vinetrack.core.tables import STANDARD_OUTPUT
+
+    return json_file == STANDARD_OUTPUT
+
+
+def print_result(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
+    """Print lines, and write `content` as JSON to a file; or print it instead of the lines."""
+    from vinetrack.core.tables import write_json
+    from vinetrack.core.terminal import severity_first
+
+    for line in () if json_to_terminal(json_file) else lines:
+        typer.echo(severity_first(line))
+    if json_file is not None:
+        write_json(json_file, content)
+
 
 ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
@@ -60,8 +91,8 @@ def errors_as_sentences(log: Path | None) -> Iterator[None]:
     typer.Exit
         With status 1, after any exception.
     """
-    from vinetrack.core.files import is_disk_full
     from vinetrack.core.problems import ExperimentError, UserError, format_problems
+    from vinetrack.core.tables import is_disk_full
 
     try:
         _log_to(log)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.command_frame import errors_as_sentences
+from vinetrack.cli.command_frame import MORE, JsonFile, errors_as_sentences, print_result
 from vinetrack.cli.design_options import (
     INPUTS,
     OUT,
@@ -31,7 +31,6 @@ from vinetrack.cli.design_options import (
     column_options,
     say,
 )
-from vinetrack.cli.output import MORE, JsonFile, print_result
 
 
 @column_options(
@@ -86,8 +85,7 @@ def _predict(
 ) -> None:  # fmt: skip
     """Predict a new vine: position, speed, tension, ejection speed, with their uncertainty."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.predict_stage import predict_conditions
-        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
+        from vinetrack.pipeline.predict_stage import PredictionRequest, fit_heading, predict_conditions
 
         if tail_slack not in (None, "taut", "free"):
             raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
@@ -157,7 +155,7 @@ def _vine(
     """Find the fastest vine within limits of burst stress, diameter and length, for a choice of films."""
     with errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_vine
-        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
+        from vinetrack.pipeline.predict_stage import PredictionRequest, fit_heading
 
         request = PredictionRequest(
             cells=cells,
@@ -225,7 +223,7 @@ def _reservoir(
     """Find the chamber that limits the loss of gauge pressure, by the gas law in absolute pressure."""
     with errors_as_sentences(log):
         from vinetrack.pipeline.design_stage import design_reservoir
-        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
+        from vinetrack.pipeline.predict_stage import PredictionRequest, fit_heading
 
         request = PredictionRequest(
             cells=cells,
@@ -325,7 +323,7 @@ def _campaign(
     """Choose pressures, payloads and replicates that reach wanted standard errors of n and B, and simulate them."""
     with errors_as_sentences(log):
         from vinetrack.pipeline.campaign_stage import CampaignRequest, design_campaign
-        from vinetrack.pipeline.prediction_inputs import PredictionRequest, fit_heading
+        from vinetrack.pipeline.predict_stage import PredictionRequest, fit_heading
 
         request = PredictionRequest(
             cells=cells,

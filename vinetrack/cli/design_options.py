@@ -11,8 +11,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from vinetrack.experiment.column import Column
-from vinetrack.experiment.schema import COLUMNS, option
+from vinetrack.experiment.schema import COLUMNS, Column, option
 
 VINE, RIG, INPUTS, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
 

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vinetrack.cli.command_frame import (
+    MORE,
     ExperimentPath,
+    JsonFile,
     LogPath,
     ResultsPath,
     SettingsText,
     errors_as_sentences,
+    print_result,
     settings_from_json,
 )
-from vinetrack.cli.output import MORE, JsonFile, print_result
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
@@ -50,13 +52,13 @@ def _diagnose(
     with errors_as_sentences(log):
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.experiment.provenance import PROVENANCE
-        from vinetrack.pipeline.run_folders import find_experiment
+        from vinetrack.pipeline.workflow import find_experiment
 
         with _progress_line() as report:
             if (target / PROVENANCE).exists():
                 from vinetrack.pipeline.diagnosis_stage import diagnose_pairs, write_diagnosis
+                from vinetrack.pipeline.effects_stage import read_source_experiment
                 from vinetrack.pipeline.model_stage import measured_trials
-                from vinetrack.pipeline.source_experiment import read_source_experiment
                 from vinetrack.results.folder_layout import Results
 
                 read = read_source_experiment(target, experiment)
@@ -79,7 +81,7 @@ def _add(
     """Add an effect to the model, refit, and show the error before and after."""
     with errors_as_sentences(log):
         from vinetrack.pipeline.diagnosis_stage import add_effect
-        from vinetrack.pipeline.source_experiment import read_source_experiment
+        from vinetrack.pipeline.effects_stage import read_source_experiment
 
         read = read_source_experiment(results, experiment)
         own_file = Path(effect) if effect.endswith(".py") else None
@@ -90,8 +92,8 @@ def _add(
         with _progress_line() as report:
             lines = add_effect(read, results, effect, report)
         if save:
-            from vinetrack.pipeline.run_folders import command_for_results
-            from vinetrack.pipeline.source_experiment import save_model
+            from vinetrack.pipeline.effects_stage import save_model
+            from vinetrack.pipeline.workflow import command_for_results
 
             name = effect if own_file is None else own_file.stem
             path = save_model(read.folder, [*read.settings.model, name], [] if own_file is None else [own_file.name])
@@ -108,8 +110,7 @@ def _propose(
 ) -> None:
     """Write the force law that explains best what no known effect explains, as an effect file of your own."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.proposed_effects import propose_effect
-        from vinetrack.pipeline.source_experiment import read_source_experiment
+        from vinetrack.pipeline.effects_stage import propose_effect, read_source_experiment
 
         with _progress_line() as report:
             proposal = propose_effect(read_source_experiment(results, experiment), results, to, report)
@@ -127,7 +128,7 @@ def _diagnosis(
     with errors_as_sentences(log):
         from vinetrack.experiment.folder import read_experiment
         from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
-        from vinetrack.pipeline.run_folders import find_experiment
+        from vinetrack.pipeline.workflow import find_experiment
 
         with _progress_line() as report:
             diagnose_results(

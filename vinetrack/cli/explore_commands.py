@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.command_frame import errors_as_sentences
-from vinetrack.cli.output import START
+from vinetrack.cli.command_frame import START, errors_as_sentences
 
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
 Names = Annotated[list[str] | None, typer.Option("--add", help="Add this effect (may be repeated).")]
@@ -47,7 +46,7 @@ def _explore(
 ) -> None:
     """Open a local page that shows where the model fails, to try effects, refit, and compare errors."""
     with errors_as_sentences(log):
-        from vinetrack.explorer.command import ExploreOptions, explore
+        from vinetrack.explorer.server import ExploreOptions, explore
 
         options = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
         explore(results, experiment, options, typer.echo)

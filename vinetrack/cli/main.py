@@ -18,18 +18,20 @@ import typer
 
 from vinetrack.cli.campaign_commands import register as register_campaign
 from vinetrack.cli.command_frame import (
+    MORE,
     ExperimentPath,
+    JsonFile,
     LogPath,
     ResultsPath,
     SettingsText,
     activity_sign,
     errors_as_sentences,
+    print_result,
     settings_from_json,
 )
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
-from vinetrack.cli.output import MORE, JsonFile, print_result
 from vinetrack.cli.power_commands import register as register_power
 from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
@@ -131,7 +133,7 @@ def _effects(
     """List all effects with formulas, parameters and units, or explain one."""
     with errors_as_sentences(None):
         from vinetrack.pipeline.effects_stage import describe_effects, effects_content
-        from vinetrack.pipeline.run_folders import find_experiment
+        from vinetrack.pipeline.workflow import find_experiment
 
         folder = None if experiment is None else find_experiment(experiment)
         print_result(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
@@ -246,8 +248,8 @@ def _gather(
 def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Fit the damping law to the steady points: damping.json."""
     with errors_as_sentences(log):
-        from vinetrack.narrative.law_text import damping_headline
-        from vinetrack.pipeline.damping_stage import fit_law
+        from vinetrack.narrative.diagnosis_text import damping_headline
+        from vinetrack.pipeline.tracks_stage import fit_law
 
         with activity_sign("fitting the damping law, with bootstrap", log):
             law = fit_law(results, settings_from_json(settings).damping)
@@ -280,7 +282,7 @@ def _figures(
 ) -> None:
     """Draw the figures of the trials, of the whole experiment, or both."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
+        from vinetrack.pipeline.report_stage import draw_campaign, draw_trials
 
         if of not in ("trials", "campaign", "all"):
             raise typer.BadParameter(f"{of!r} is not one of trials, campaign, all", param_hint="--of")
@@ -299,7 +301,7 @@ def _paper(
 ) -> None:
     """Compare with the published numbers and figures of the paper: paper.csv."""
     with errors_as_sentences(log):
-        from vinetrack.pipeline.paper_stage import compare_with_paper, draw_paper
+        from vinetrack.pipeline.report_stage import compare_with_paper, draw_paper
         from vinetrack.report.paper_section import tally
 
         typer.echo(f"Comparison with the paper: {tally(compare_with_paper(_read(experiment), results))}")
@@ -325,7 +327,7 @@ def _report(
 
 def _read(folder: Path) -> Experiment:
     from vinetrack.experiment.folder import read_experiment
-    from vinetrack.pipeline.run_folders import find_experiment
+    from vinetrack.pipeline.workflow import find_experiment
 
     return read_experiment(find_experiment(folder))
 

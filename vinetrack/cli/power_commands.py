@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.command_frame import errors_as_sentences
+from vinetrack.cli.command_frame import MORE, errors_as_sentences, print_result
 from vinetrack.cli.design_options import INPUTS, OUT, FigurePath, LogPath
-from vinetrack.cli.output import MORE, print_result
 
 SIMULATION, FURTHER = "Simulation", "What to add"
 
@@ -115,9 +114,8 @@ def _power(
         import pandas as pd
 
         from vinetrack.core.tables import write_csv
-        from vinetrack.pipeline.power_campaigns import PowerRequest
-        from vinetrack.pipeline.power_stage import power_of_target, sheet_rows
-        from vinetrack.pipeline.prediction_inputs import check_figure, write_figure
+        from vinetrack.pipeline.power_stage import PowerRequest, power_of_target, sheet_rows
+        from vinetrack.pipeline.predict_stage import check_figure, write_figure
 
         check_figure(figure)
         power = power_of_target(

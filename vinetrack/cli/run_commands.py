@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.command_frame import errors_as_sentences
-from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
+from vinetrack.cli.command_frame import START, JsonFile, errors_as_sentences, json_to_terminal, print_result
 
 
 def register(app: typer.Typer) -> None:
@@ -23,8 +22,8 @@ def _check(
 ) -> None:
     """Check sheet, settings, effects, tracks and recordings in seconds; list facts about each recording."""
     with errors_as_sentences(None):
-        from vinetrack.pipeline.check_stage import check_folder
-        from vinetrack.pipeline.run_folders import find_experiment
+        from vinetrack.pipeline.run_stage import check_folder
+        from vinetrack.pipeline.workflow import find_experiment
 
         checked = check_folder(find_experiment(experiment))
         lines = checked.lines()

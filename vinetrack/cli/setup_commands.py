@@ -7,8 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.command_frame import activity_sign, errors_as_sentences
-from vinetrack.cli.output import START, JsonFile, json_to_terminal, print_result
+from vinetrack.cli.command_frame import (
+    START,
+    JsonFile,
+    activity_sign,
+    errors_as_sentences,
+    json_to_terminal,
+    print_result,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -35,7 +41,7 @@ def _setup(
 
             serve(folder, typer.echo, port, browser=browser)
         else:
-            from vinetrack.setup_page.setup_command import write_templates
+            from vinetrack.setup_page.page_server import write_templates
 
             write_templates(folder, typer.echo)
 
@@ -73,8 +79,8 @@ def _track(
 ) -> None:
     """Track the leading edge of one recording, without an experiment: a table, a strip figure and a clip."""
     with errors_as_sentences(log):
-        from vinetrack.core.numbers import or_nan
-        from vinetrack.pipeline.track_stage import TrackOptions, track_file
+        from vinetrack.core.units import or_nan
+        from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
 
         options = TrackOptions(
             fps=or_nan(fps), exposure_us=or_nan(exposure_us), mm_per_px=or_nan(mm_per_px), calibration=calibration,
@@ -96,8 +102,7 @@ def _say(line: str) -> None:
 
 def _cell(column: str, text: str | None, option: str) -> Any:
     """Read an option that is written like a cell of a column; None if it is not given."""
-    from vinetrack.experiment.cells import CellError, read_cell
-    from vinetrack.experiment.schema import COLUMNS
+    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
 
     if text is None:
         return None

@@ -1,7 +1,7 @@
 """Published numbers: Alvarez et al., IEEE Robotics and Automation Letters, 2025.
 
 Only printed numbers are listed here; the priors for other vines derived from them are in
-`vinetrack.planning.scaling_priors`.
+`vinetrack.planning.predictive_inputs`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.constants import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]

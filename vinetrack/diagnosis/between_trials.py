@@ -10,17 +10,20 @@ physics that depends on the condition. Such differences are therefore hypotheses
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from vinetrack.diagnosis.between_forms import forms_of
+from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.between_gain import (
     Difference,
     gain_p_value,
+    gains_by_onset,
     linear_gain,
     with_shared_errors,
     with_trace_errors,
@@ -29,18 +32,212 @@ from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_rat
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,
+    DAY,
+    N_BY_VINE,
     ORDER_DRIFT,
     REFITTED,
+    SPECIMEN,
     Candidate,
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
+from vinetrack.experiment.folder import trial_order
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.parameters import DAMPING
+from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm, groups_of
 from vinetrack.inference.position_errors import with_smooth_errors
+
+# ------------------------------------------------------------------------------
+# Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is
+# confounded.
+#
+# Each hypothesis has several forms, of which the best counts: a drift of B, a drift of the pressure, or a step of the
+# pressure from some trial on; specimens and days differ in B, in pressure, or in both. `between_trials` states the
+# model
+# and compares the hypotheses.
+
+SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0  # Standard deviation of ln B and of P_y among tubes of one kind
+
+DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03  # The same between days, and of ln P (chosen)
+
+MIN_TRIALS_EACH_SIDE = 2  # Minimum number of trials before and after a change (derived)
+
+FEWEST_TRIALS = 6  # Number of trials from which drifts and changes are tested (chosen)
+
+# A difference is confounded with the conditions if its variance within conditions is below this fraction of that in
+# random order (1 on average) (chosen)
+CONFOUNDED_VARIANCE_SHARE = 0.5
+
+
+def forms_of(fit: Fit, base: Solution) -> list[Difference]:
+    """List every form of every hypothesis that these trials can test."""
+    trials = [trial.trial for trial in fit.trials]
+    forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
+    forms += _changes(fit, base, trials)
+    n_forms = Counter(difference.name for difference in forms)
+    return [replace(difference, n_forms=difference.n_forms * n_forms[difference.name]) for difference in forms]
+
+
+def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
+    """An exponent n for each vine, where several vines share one."""
+    free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
+    if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
+        return []
+    return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
+
+
+def _tube(trial: Trial) -> str:
+    """The tube of a trial: its vine, and the specimen where stated."""
+    return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
+
+
+def _drifts(trials: Sequence[Trial]) -> list[Difference]:
+    """Drift of ln B with the earlier trials of the same tube, and of ln P with all earlier trials."""
+    if len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, stated = trial_order(trials)
+    uses, count = np.zeros(ranks.size), Counter[str]()
+    for i in np.argsort(ranks):
+        uses[i] = count[_tube(trials[i])]
+        count[_tube(trials[i])] += 1
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
+    return [
+        Difference(
+            ORDER_DRIFT,
+            (
+                BetweenTerm(
+                    f"{ORDER_DRIFT}.{name}", symbol, "1/trial", name == "P", ("all",) * ranks.size, past, scale=0.01
+                ),
+            ),
+            stated=stated,
+            confounded=confounded(past[:, None], trials),
+        )
+        for name, symbol, past in forms
+        if past.any()
+    ]
+
+
+def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Step of ln P from the likeliest trial on, as where a regulator is set again."""
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    begins = range(MIN_TRIALS_EACH_SIDE, len(trials) - MIN_TRIALS_EACH_SIDE + 1)
+    if len(trials) < FEWEST_TRIALS or not np.all(pressures_Pa > 0):
+        return []
+    ranks, stated = trial_order(trials)
+    ordered = [int(i) for i in np.argsort(ranks)]
+    first = begins[int(np.argmax(gains_by_onset(fit, base, _step(range(len(trials)), trials), ordered, begins)))]
+    return [replace(_step(ordered[first:], trials), stated=stated, n_forms=len(begins))]
+
+
+def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
+    """Step of ln P of some trials, in the order in which they were made, relative to the others."""
+    groups = [""] * len(trials)
+    for i in members:
+        groups[i] = f"from {trials[members[0]].name} on"
+    term = BetweenTerm(f"{ORDER_DRIFT}.step", "ΔlnP", "", True, tuple(groups), np.ones(len(trials)), scale=0.01)
+    member = np.array([[float(bool(group))] for group in groups])
+    return Difference(ORDER_DRIFT, (term,), confounded=confounded(member, trials))
+
+
+def _groups(trials: Sequence[Trial]) -> list[Difference]:
+    """Differences between the specimens and days that the sheet states."""
+    stated_differences: list[Difference] = []
+    if all(trial.specimen for trial in trials):
+        tubes = tuple(_tube(trial) for trial in trials)
+        # A vine with a single tube has its own B already.
+        several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
+        groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
+        stated_differences += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
+    days = groups_of(trials, "day")
+    stated_differences += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, gain_sd=DAY_GAIN_SD, stated=True)
+    return stated_differences
+
+
+def _forms(
+    name: str,
+    groups: Sequence[str],
+    trials: Sequence[Trial],
+    B_sd: float,
+    pressure_sd_Pa: float,
+    *,
+    gain_sd: float = 0.0,
+    stated: bool,
+) -> list[Difference]:
+    """Forms in which groups differ: in B, in pressure, or in both; with `gain_sd`, also by a factor of the pressure."""
+    if len({group for group in groups if group}) < 2 and stated:
+        return []
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    driven = np.isfinite(pressures_Pa) & (pressures_Pa > 0)
+    per_Pa = np.where(driven, 1 / np.where(driven, pressures_Pa, 1.0), 0.0)
+    groups = tuple(groups)
+    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
+    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
+    in_gain = BetweenTerm(f"{name}.gain", "ΔlnP", "", True, groups, np.ones(len(groups)), gain_sd, gain_sd)
+    member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
+    is_confounded = confounded(member, trials)
+    return [
+        Difference(name, terms, stated=stated, confounded=is_confounded)
+        for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if gain_sd else []))
+        if not any(term.pressure for term in terms) or driven.any()
+    ]
+
+
+def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Changes of tube where specimens are not stated: from some trial of each vine on, or with each condition. A tube
+    for each condition is possible only where replicates were made consecutively.
+    """
+    if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, _ = trial_order(trials)
+    groups = [""] * len(trials)
+    for vine in dict.fromkeys(trial.vine for trial in trials):
+        members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
+        begins = range(MIN_TRIALS_EACH_SIDE, len(members) - MIN_TRIALS_EACH_SIDE + 1)
+        if not begins:
+            continue
+        tube = f"{vine}, later tube"
+        vine_in_group = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
+        form = _forms(SPECIMEN, vine_in_group, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+        first = begins[int(np.argmax(gains_by_onset(fit, base, form, members, begins)))]
+        for i in members[first:]:
+            groups[i] = tube
+    conditions = [trial.condition for trial in trials]
+    changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
+    if _replicates_are_consecutive(ranks, conditions):
+        changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+    return changes
+
+
+def _replicates_are_consecutive(ranks: Floats, conditions: Sequence[str]) -> bool:
+    """Whether the replicates of every condition were made consecutively."""
+    ordered = [conditions[i] for i in np.argsort(ranks)]
+    changes = sum(before != after for before, after in itertools.pairwise(ordered))
+    return 1 < len(set(conditions)) == changes + 1 < len(conditions)
+
+
+def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
+    """Whether regressors are confounded with the conditions: they hardly vary among replicates. The criterion is the
+    mean square within conditions over that within vines, 1 on average for trials in random order. Without replicates
+    they are always confounded. Shapes: regressors (n_trials, k).
+    """
+    in_conditions, inner_degrees = _square_within(regressors, [trial.condition for trial in trials])
+    in_vines, outer_degrees = _square_within(regressors, [trial.vine for trial in trials])
+    if inner_degrees == 0 or in_vines == 0:
+        return True
+    return in_conditions / inner_degrees < CONFOUNDED_VARIANCE_SHARE * in_vines / max(outer_degrees, 1)
+
+
+def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
+    """Sum of squares about the group means, and its degrees of freedom."""
+    total, names = 0.0, sorted(set(groups))
+    for name in names:
+        member = values[np.array([group == name for group in groups])]
+        total += float(np.sum((member - member.mean(axis=0)) ** 2))
+    return total, len(groups) - len(names)
+
 
 # Largest plausible drift of ln B and of ln P per trial, and step of ln P (chosen)
 PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}

@@ -14,17 +14,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Track
+from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
-from vinetrack.diagnosis.contradictions import contradictions
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
-from vinetrack.diagnosis.lost_frames import correct_dropped_frames, dropped_frames_in, with_lost_frames
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.odd_trials import odd_trials, with_odd_trials
+from vinetrack.diagnosis.odd_trials import (
+    correct_dropped_frames,
+    dropped_frames_in,
+    odd_trials,
+    with_lost_frames,
+    with_odd_trials,
+)
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -39,17 +43,14 @@ from vinetrack.diagnosis.result import (
     Round,
     limit_reason,
 )
-from vinetrack.diagnosis.selection import SelectionStep, select_effects
-from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK
-from vinetrack.dynamics.host import host_for
-from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, contradictions, select_effects
+from vinetrack.dynamics.model import Model, base_model, host_for, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_summary import joined
-from vinetrack.narrative.verdict_text import explain
-from vinetrack.tracks.outliers import rejected_points_note
+from vinetrack.narrative.verdict_text import explain, joined
+from vinetrack.tracks.position_noise import rejected_points_note
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment

@@ -20,30 +20,451 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.numbers import decimals
-from vinetrack.core.records import Floats
-from vinetrack.core.units import display_unit
-from vinetrack.diagnosis.constancy_tests import (
-    COVARIATES,
-    BlockedDeviations,
-    ConstancyTest,
-    Covariate,
-    blocked_deviations,
-    constancy_p_value,
-    normal_deviate,
+from vinetrack.core.records import Floats, Trial
+from vinetrack.core.units import decimals, display_unit
+from vinetrack.diagnosis.force_inversion import FittedMotion, acceleration_sensitivities, motions_of
+from vinetrack.diagnosis.ladder import in_sample
+from vinetrack.diagnosis.replicates import (
+    LEAST_BETWEEN_TRIAL_SD,
+    AlignedTrials,
+    PerTrialEstimates,
+    Scatter,
+    Stretches,
+    align_trials,
+    find_scatter,
+    first_that_counts,
+    per_trial_estimates,
+    scatter_sensitivities,
+    stretch_covariance,
 )
-from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
-from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, align_trials, per_trial_estimates
-from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
-from vinetrack.diagnosis.stretches import replicate_scatter, residual_courses
+from vinetrack.diagnosis.result import MAX_STRETCHES
+from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.fit import fit_subset, rest_is_seen
+from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_result import Fit, Number, TrialFit
 from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE
-from vinetrack.inference.subset import fit_subset
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+# ------------------------------------------------------------------------------
+# Residuals of trials averaged over stretches of the growth, and the scatter of replicates in them.
+#
+# See `vinetrack.diagnosis.replicates`.
+
+MIN_FRAMES_PER_STRETCH = 2  # Least frames of a stretch: a shorter recording is cut into fewer (derived)
+
+
+@dataclass(frozen=True)
+class ResidualCourse:
+    """One trial's residuals, their response to between-trial scatter, and the coordinates along the growth. From the
+    first motion on; arrays have shape (n_points,), `scatter_response` (n_points, 2).
+    """
+
+    trial: Trial
+    residual_m: Floats
+    scatter_response: Floats
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    noise_variance_m2: float
+    origin_variance_m2: float
+
+
+def residual_courses(fit: Fit) -> tuple[list[ResidualCourse], tuple[TrialFit, ...]]:
+    """Residuals of every trial of a fit, and the trials as predicted with their own release and origin. Returns
+    courses, predicted.
+    """
+    predicted = in_sample(fit).trials
+    response = scatter_sensitivities(align_trials(fit))
+    return [_course(*members) for members in zip(predicted, response, fit.predictor.data, strict=True)], predicted
+
+
+def courses_by_condition(courses: Sequence[ResidualCourse]) -> dict[str, list[ResidualCourse]]:
+    """Courses by name of condition, in order."""
+    names = dict.fromkeys(course.trial.condition for course in courses)
+    return {name: [course for course in courses if course.trial.condition == name] for name in names}
+
+
+def replicate_scatter(fit: Fit, courses: Sequence[ResidualCourse]) -> Scatter:
+    """Estimate the scatter of replicates from stretches of time that all trials of a condition were recorded in."""
+    groups = courses_by_condition(courses).values()
+    return find_scatter(fit, [common_stretches(members, "time_s", common_edges(members)) for members in groups])
+
+
+def _course(trial: TrialFit, response: Floats, trial_data: FitTrial) -> ResidualCourse:
+    noise_variance_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
+    begin = first_that_counts(trial)
+    growth = trial.predicted_position_m - trial.origin_m
+    return ResidualCourse(
+        trial=trial.trial,
+        residual_m=trial.residual_m[begin:],
+        scatter_response=response[begin:],
+        time_s=trial.time_s[begin:] - trial.release_s,
+        lead_position_m=growth[begin:],
+        lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
+        noise_variance_m2=noise_variance_m2,
+        origin_variance_m2=noise_variance_m2 / max(trial_data.n_rest, 1),
+    )
+
+
+def common_edges(members: Sequence[ResidualCourse]) -> Floats:
+    """Edges of stretches of time that every replicate was recorded in. Shape (n_stretches + 1,)."""
+    start = max(float(member.time_s[0]) for member in members)
+    end = min(float(member.time_s[-1]) for member in members)
+    frames = min(int(np.count_nonzero((member.time_s >= start) & (member.time_s <= end))) for member in members)
+    count = max(min(MAX_STRETCHES, frames // MIN_FRAMES_PER_STRETCH), 1)
+    return np.linspace(start, max(end, start), count + 1)
+
+
+def stretch_means(course: ResidualCourse, along: str, edges: Floats) -> tuple[Floats, Floats]:
+    """Means of [residual, scatter response] in each stretch, NaN where there is no frame, and the numbers of frames.
+    Returns means, frames. Shapes: edges (n_stretches + 1,) → (n_stretches, 3).
+    """
+    values, at = np.column_stack([course.residual_m, course.scatter_response]), getattr(course, along)
+    stretch = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
+    inside = (at >= edges[0]) & (at <= edges[-1])
+    total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
+    np.add.at(total, stretch[inside], values[inside])
+    np.add.at(count, stretch[inside], 1.0)
+    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
+
+
+def common_stretches(members: Sequence[ResidualCourse], along: str, edges: Floats) -> Stretches:
+    """The stretches in which all members have frames. Shapes: edges (n_stretches + 1,)."""
+    parts = [stretch_means(member, along, edges) for member in members]
+    all_means = np.array([means for means, _ in parts])
+    reached = np.isfinite(all_means).all(axis=(0, 2))
+    noise = np.mean([_noise(course, count[reached]) for course, (_, count) in zip(members, parts, strict=True)], axis=0)
+    return Stretches(all_means[:, reached, 0], all_means[:, reached, 1:].mean(axis=0), noise)
+
+
+def _noise(course: ResidualCourse, count: Floats) -> Floats:
+    """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
+    return np.asarray(np.diag(course.noise_variance_m2 / np.maximum(count, 1.0)) + course.origin_variance_m2)
+
+
+def stretch_variances(course: ResidualCourse, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
+    """Variances of the means of one trial's stretches. Shape (n_stretches,)."""
+    means, count = part
+    single = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
+    return np.diag(stretch_covariance(scatter, single))
+
+
+# ------------------------------------------------------------------------------
+# Tests of whether per-trial estimates of a parameter vary with a condition: linear trend and differences.
+
+FEWEST_DEGREES = 2  # Degrees of freedom of replicates from which they determine the scatter of estimates (chosen)
+
+
+LEAST_SCATTER = 0.1  # Least scatter of replicates, as part of the expected scatter of pressure and B (chosen)
+
+
+@dataclass(frozen=True)
+class Covariate:
+    """A condition on which a parameter should not depend: the attribute of a trial, and how it is displayed."""
+
+    column: str
+    label: str
+    unit: str
+    factor: float
+    logarithmic: bool
+
+    def level(self, trial: Trial) -> float:
+        """The nominal value for a trial, SI."""
+        return float(getattr(trial, self.column))
+
+    def coordinate(self, levels: Floats) -> Floats:
+        """The coordinate in which a trend is linear. Shapes: levels (n_trials,) → (n_trials,)."""
+        return np.log(levels) if self.logarithmic and np.all(levels > 0) else levels
+
+    def formatted(self, level: float) -> str:
+        """A level with its unit."""
+        return f"{level * self.factor:.3g} {self.unit}"
+
+
+COVARIATES = (
+    Covariate("pressure_Pa", "pressure", "kPa", 1e-3, True),
+    Covariate("payload_kg", "payload", "g", 1e3, False),
+    Covariate("growth_angle_rad", "growth angle", "°", 180 / math.pi, False),
+    Covariate("chamber_m3", "chamber volume", "l", 1e3, True),
+    Covariate("inlet_m", "inlet", "mm", 1e3, True),
+)
+
+
+@dataclass(frozen=True)
+class BlockedDeviations:
+    """Deviations of coordinate x and estimate d from the weighted means of their block, and the scatter of replicates.
+    `variance` is that scatter relative to the estimates' own variances, with `dof` degrees of freedom; `chi2` is the
+    sum of squares between groups, with `groups` degrees of freedom.
+    """
+
+    x: Floats
+    d: Floats
+    weight: Floats
+    variance: float
+    dof: int
+    chi2: float
+    groups: int
+
+
+def blocked_deviations(
+    estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]
+) -> BlockedDeviations | None:
+    """Deviations from the mean of each vine (or of all), and the scatter of replicates; None without enough trials.
+    Shapes: x, levels, chosen (n_trials,).
+    """
+    conditions = np.array([trial.condition for trial in estimates.trials])
+    blocks = (
+        np.array([trial.vine for trial in estimates.trials])
+        if estimates.per_vine
+        else np.full(len(estimates.trials), "")
+    )
+    weight = 1 / estimates.variance
+    from_replicates = np.zeros(len(estimates.trials))
+    for condition in dict.fromkeys(conditions[np.isfinite(estimates.deviation)]):
+        k = np.flatnonzero((conditions == condition) & np.isfinite(estimates.deviation))
+        from_replicates[k] = estimates.deviation[k] - np.average(estimates.deviation[k], weights=weight[k])
+    known = np.isfinite(estimates.deviation)
+    dof = int(known.sum()) - len(set(conditions[known]))
+    xs, ds = x[chosen].copy(), estimates.deviation[chosen].copy()
+    w, block = weight[chosen], blocks[chosen]
+    for name in dict.fromkeys(block):
+        k = block == name
+        xs[k] -= np.average(xs[k], weights=w[k])
+        ds[k] -= np.average(ds[k], weights=w[k])
+    if not np.sum(w * xs**2) > 0:
+        return None
+    if dof >= FEWEST_DEGREES:
+        variance = float(np.sum(weight[known] * from_replicates[known] ** 2)) / dof
+    else:
+        dof = ds.size - len(set(block)) - 1
+        if dof < FEWEST_DEGREES:
+            return None
+        residual = ds - xs * np.sum(w * xs * ds) / np.sum(w * xs**2)
+        variance = float(np.sum(w * residual**2)) / dof
+    pairs = list(dict.fromkeys(zip(block, levels[chosen], strict=True)))
+    chi2 = 0.0
+    for name, level in pairs:
+        k = (block == name) & (levels[chosen] == level)
+        chi2 += float(np.sum(w[k]) * np.average(ds[k], weights=w[k]) ** 2)
+    return BlockedDeviations(xs, ds, w, max(variance, LEAST_SCATTER**2), dof, chi2, len(pairs) - len(set(block)))
+
+
+def constancy_p_value(deviations: BlockedDeviations) -> tuple[float, float]:
+    """F test of whether the groups have the same mean: its p-value, and that as a normal deviate. Returns
+    p, z : float.
+    """
+    from scipy.stats import f as fisher
+
+    if deviations.groups < 1:
+        return 1.0, 0.0
+    p = float(fisher.sf(deviations.chi2 / deviations.groups / deviations.variance, deviations.groups, deviations.dof))
+    return p, normal_deviate(p)
+
+
+def normal_deviate(p: float) -> float:
+    """The normal deviate with this two-sided p-value."""
+    from scipy.stats import norm
+
+    return float(norm.isf(max(p, 1e-300) / 2))
+
+
+@dataclass(frozen=True)
+class ConstancyTest:
+    """A row of the table of drifts with its p-value, and the rows of its groups."""
+
+    row: dict[str, object]
+    p: float
+    groups: list[dict[str, object]]
+
+
+# ------------------------------------------------------------------------------
+# Tests of whether B changes along the growth, and whether the fitted yield pressure agrees with the sheet.
+#
+# B is estimated for the first and second half of the growth of each trial. The scatter of pressure and B between trials
+# is the same in both halves and cancels in their difference. An effect that builds up along the growth shows here even
+# where n and the yield pressure absorb it in every comparison between trials.
+
+STEP = 1e-3  # Relative step of a finite difference (derived)
+
+DRIFT_ALONG_LEAST_SCATTER = 2e-3  # Lower limit of the standard deviation of the rise of ln B in single trials (chosen)
+
+LARGEST_STEP = 3.0  # Deviation of ln B of a half (chosen)
+
+HALVES = (0.25, 0.75)  # Midpoints of the halves, as fractions of the growth (defined)
+
+
+@dataclass(frozen=True)
+class _Halves:
+    """Best-fit deviation of ln B in each half of the growth, by trial, shape (n_trials, 2)."""
+
+    trials: tuple[Trial, ...]
+    deviation: Floats
+
+
+def along_growth(fit: Fit, aligned: AlignedTrials, estimates: PerTrialEstimates) -> Iterator[ConstancyTest]:
+    """Test B for a change along the growth, for every vine and for all."""
+    if aligned.predictor.damping_column < 0:
+        return
+    halves = _halves(fit, aligned, estimates.trial_effects)
+    vines = np.array([trial.vine for trial in halves.trials])
+    usable = (np.abs(halves.deviation) <= LARGEST_STEP).all(axis=1)
+    names = list(dict.fromkeys(vines[usable]))
+    for vine in [*names, *([""] if len(names) > 1 else [])]:
+        chosen = np.flatnonzero(usable & ((vines == vine) | (vine == "")))
+        test = _difference_test(fit, halves, str(vine), chosen)
+        if test is not None:
+            yield test
+
+
+def _halves(fit: Fit, aligned: AlignedTrials, trial_effects: Floats) -> _Halves:
+    """Deviations of ln B in both halves, linearised about each trial's own B. About the common B, the between-trial
+    scatter would enter in second order.
+    """
+    motions = motions_of(fit, trial_effects)
+    data = aligned.predictor.data
+    columns = aligned.predictor.linearise(np.empty(0), trial_effects)
+    origin_fixed = rest_is_seen(data)
+    middles_m = [
+        0.5
+        * float(np.max(np.interp(trial_data.time_s - trial_effects[i, RELEASE], motion.time_s, motion.lead_position_m)))
+        for i, (trial_data, motion) in enumerate(zip(data, motions, strict=True))
+    ]
+    pushes = [_pushes(*pair) for pair in zip(motions, middles_m, strict=True)]
+    deviation = np.full((len(data), 2), math.nan)
+    for i, sensitivities in enumerate(acceleration_sensitivities(fit, trial_effects, motions, pushes)):
+        others = columns[i][:, [RELEASE]] if origin_fixed[i] else columns[i][:, [RELEASE, ORIGIN]]
+        if aligned.predictor.has_damping_deviation[i] and np.all(np.ptp(sensitivities, axis=0) > 0):
+            design = np.column_stack([sensitivities, others])
+            deviation[i] = np.linalg.lstsq(design, columns[i][:, -1], rcond=1e-9)[0][:2]
+    return _Halves(tuple(trial_data.trial for trial_data in data), deviation + trial_effects[:, [DAMPING_DEVIATION]])
+
+
+def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
+    """Derivative of the tail's acceleration by ln B in each half of the growth, m/s², shape (n_times, 2)."""
+    value = motion.model.values[DAMPING]
+    assert isinstance(value, float)
+    increased = motion.model.with_values({DAMPING: value * math.exp(STEP)})
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    changed = evaluate(increased, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+    push = (changed - motion.model_acceleration) / STEP
+    return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
+
+
+def _difference_test(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
+    """Student's t test of the mean difference of the halves; None without enough degrees of freedom."""
+    from scipy.stats import t as student
+
+    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
+    scatter, dof = _scatter(rise, [halves.trials[i].condition for i in chosen])
+    scatter = max(scatter, DRIFT_ALONG_LEAST_SCATTER)
+    if dof < FEWEST_DEGREES:
+        return None
+    mean, sigma = float(rise.mean()), scatter / math.sqrt(rise.size)
+    p = float(2 * student.sf(abs(mean) / sigma, dof))
+    change = math.expm1(abs(mean))
+    error = math.exp(abs(mean)) * sigma
+    start, stop = HALVES if mean >= 0 else HALVES[::-1]
+    where = ("first", "second") if mean >= 0 else ("second", "first")
+    who = f"B of {vine}" if vine else "B"
+    digits = max(decimals(100 * error) - 1, 0)
+    row = {
+        "parameter": DAMPING,
+        "vine": vine,
+        "symbol": "B",
+        "unit": "N·(s/m)ⁿ",
+        "against": "growth",
+        "from_level": start,
+        "to_level": stop,
+        "change": change,
+        "change_sigma": error,
+        "relative": True,
+        "z": normal_deviate(p),
+        "z_constancy": normal_deviate(p),
+        "dof": dof,
+        "n_trials": int(chosen.size),
+        "sentence": (
+            f"{who} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} % larger in the {where[1]}"
+            f" half of the growth than in the {where[0]} ({normal_deviate(p):.1f} σ), though it should not change along"
+            " the growth."
+        ),
+    }
+    return ConstancyTest(row, p, _drift_along_groups(fit, halves, vine, chosen) if vine else [])
+
+
+def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
+    """Standard deviation of replicates about their means, or of all trials without replicates; degrees of freedom."""
+    names = np.array(conditions)
+    deviations = values.copy()
+    for name in set(conditions):
+        deviations[names == name] -= values[names == name].mean()
+    dof = values.size - len(set(conditions))
+    if dof < FEWEST_DEGREES:
+        deviations, dof = values - values.mean(), values.size - 1
+    return math.sqrt(float(np.sum(deviations**2)) / max(dof, 1)), dof
+
+
+def _drift_along_groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
+    """Mean value of each half; the variance of their difference is divided equally between them."""
+    rows: list[dict[str, object]] = []
+    conditions = [halves.trials[i].condition for i in chosen]
+    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
+    sigma = max(_scatter(rise, conditions)[0], DRIFT_ALONG_LEAST_SCATTER) / math.sqrt(2 * chosen.size)
+    base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
+    for half, level in enumerate(HALVES):
+        ratio = math.exp(float(halves.deviation[chosen, half].mean()))
+        rows.append(
+            {
+                "parameter": DAMPING,
+                "vine": vine,
+                "symbol": "B",
+                "unit": "N·(s/m)ⁿ",
+                "against": "growth",
+                "level": level,
+                "value": base * ratio,
+                "sigma": base * ratio * sigma,
+                "ratio": ratio,
+                "ratio_sigma": ratio * sigma,
+                "n_trials": int(chosen.size),
+            }
+        )
+    return rows
+
+
+def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
+    """Compare fitted yield pressures with the sheet, in units of the standard error stated there."""
+    for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
+        if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
+            continue
+        change = number.value - free.start
+        z = abs(change) / free.prior_sd
+        p = math.erfc(z / math.sqrt(2))
+        row = {
+            "parameter": number.key,
+            "vine": number.vine,
+            "symbol": number.symbol,
+            "unit": number.unit,
+            "against": "sheet",
+            "from_level": free.start,
+            "to_level": number.value,
+            "change": change,
+            "change_sigma": free.prior_sd,
+            "relative": False,
+            "z": z,
+            "z_constancy": z,
+            "dof": math.inf,
+            "n_trials": sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
+            "sentence": (
+                f"{number.symbol} of {number.vine} is pulled from the {free.start / 1e3:.2f} ±"
+                f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."
+            ),
+        }
+        yield ConstancyTest(row, p, [])
+
 
 log = logging.getLogger(__name__)
 

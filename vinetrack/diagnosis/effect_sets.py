@@ -14,17 +14,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
-from vinetrack.diagnosis.fit_memory import drop_curves, with_curves
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, likelihood_ratio, robust_ratio, sizes_of
-from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS
-from vinetrack.diagnosis.multi_start import MIN_SHARE_OF_BEST_GAIN
-from vinetrack.diagnosis.nested_forms import NestedForm, simpler_forms
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidate_fits import MIN_SHARE_OF_BEST_GAIN, CandidateFits, Report, drop_curves, with_curves
+from vinetrack.diagnosis.candidates import plausible_range
+from vinetrack.diagnosis.likelihood_ratio import (
+    ANSWER_SET_DELTA_CHI2,
+    MAX_INFLATION,
+    LikelihoodRatio,
+    NestedForm,
+    answer_set,
+    best_of,
+    in_sigmas,
+    likelihood_ratio,
+    robust_ratio,
+    simpler_forms,
+    sizes_of,
+)
+from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS, MisfitTests
+from vinetrack.diagnosis.result import Confounder
+from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.effects import Effect
+from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import Fit, Number
 
 MAX_EFFECTS = 5  # Largest number of effects in a set (chosen)
 
@@ -193,3 +206,180 @@ class EffectSets:
             of_size = {others: known for others, known in self.fitted.items() if len(others) == len(names)}
             drop_curves(of_size)
             self.fitted |= of_size
+
+
+# ------------------------------------------------------------------------------
+# Which hypotheses leave an adequate model: the misfit tests are repeated with each member of the answer set added.
+
+MISFIT_REMAINS = "a significant misfit remains once it is added"
+
+
+def adequate_hypotheses(
+    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
+) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
+    """Test the model with each hypothesis of the answer set added, and keep those that no test rejects. A hypothesis
+    that leaves a significant misfit is rejected, and no longer sets the likelihood that others are compared with.
+    Returns adequate (the likeliest first; empty where every hypothesis is rejected), rejected (reason by label), after
+    (tests of the model with the first adequate hypothesis added).
+    """
+    in_answer_set, rejected = answer_set(hypotheses)
+    best = best_of(hypotheses)
+    others = sorted(
+        (hypothesis for hypothesis in hypotheses if hypothesis not in in_answer_set),
+        key=lambda hypothesis: -hypothesis.fit.log_likelihood,
+    )
+    next_best = [
+        hypothesis
+        for hypothesis in others
+        if hypothesis.label not in rejected and hypothesis.deviance_excess(best) < ANSWER_SET_DELTA_CHI2 * MAX_INFLATION
+    ]
+    for group in (in_answer_set, next_best):
+        adequate: list[LikelihoodRatio] = []
+        after: MisfitTests | None = None
+        for hypothesis, film_free in [(each, film_free) for film_free in (False, True) for each in group]:
+            # With the best, film of another mass is a set of two effects, unless an equally likely hypothesis is
+            # adequate with the film as stated.
+            only_best = hypothesis is best and not adequate
+            if film_free and (hypothesis in adequate or only_best or hypothesis.film_gain < ANSWER_SET_DELTA_CHI2):
+                continue
+            tests = search.tests_after(hypothesis.fit, film=film_free) if has_credible_sizes(hypothesis) else None
+            # Two effects together can imitate much that is in no catalogue, so a set must also pass at the level of the
+            # first round, which rejects more readily.
+            if tests is None:
+                rejected[hypothesis.label] = hypothesis.reason
+            elif tests.rejects_model or (len(hypothesis.effects) > 1 and tests.rejects_at_first_round_level):
+                rejected[hypothesis.label] = MISFIT_REMAINS
+            elif sets is not None and len(hypothesis.effects) > 2 and (reason := sets.superfluous(hypothesis)):
+                rejected[hypothesis.label] = reason
+            elif not adequate or hypothesis in answer_set([*adequate, hypothesis])[0]:
+                adequate.append(hypothesis)
+                after = after or tests
+                rejected.pop(hypothesis.label, None)
+        if adequate:
+            return sorted(adequate, key=lambda ratio: -ratio.fit.log_likelihood), rejected, after
+        # With film of another mass the best leaves nothing to a candidate or a force: a set of both is tried instead of
+        # hypotheses that are further behind.
+        film_may_suffice = best.film_gain > ANSWER_SET_DELTA_CHI2 and best.credible
+        if film_may_suffice and not _candidate_or_probe_rejects(search.tests_after(best.fit, film=True)):
+            break
+    return [], rejected, None
+
+
+def _candidate_or_probe_rejects(tests: MisfitTests) -> bool:
+    """Whether a candidate or a smooth force would still improve the fit, whatever the trial effects absorb."""
+    return bool(tests.exceeds_slow_errors or tests.probes_reject or tests.largest_excess(tests.family) > 0)
+
+
+def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
+    """Whether the fitted sizes can be an explanation; with three effects or more all must be plausible."""
+    return hypothesis.plausible and hypothesis.credible if len(hypothesis.effects) > 2 else hypothesis.credible
+
+
+# ------------------------------------------------------------------------------
+# How much of a fitted size may belong to another, undetected effect: "this K includes up to … of drag".
+#
+# Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent.
+# If
+# another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
+# coefficient of omitted-variable bias of the linear fit (`score_test.levers_of`). The estimate of s from the
+# trajectories, N(ŝ, σ_s²), is combined with a normal prior centred on zero, scaled so that 95 % of it lies within the
+# farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis). Effects
+# are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the one with
+# the other effect left free: at least 95 %.
+
+MIN_SHIFT_SIGMAS = 1.0  # Shift, in standard errors of the size, from which a confounder is reported (chosen)
+
+MAX_LISTED = 3  # Confounders listed for each size (chosen)
+
+TWO_SIDED_95 = 1.959964  # Derived: quantile of the normal distribution
+
+
+def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:
+    """Find, for each size of the added effects, the physical effects that it may include. Returns for each size, those
+    that could shift it by more than its standard error, the largest first.
+    """
+    if after.poorly_fitted or not after.sensitivities.shapes:
+        return ()
+    levers = levers_of(after.fit, after.products)
+    chosen = []
+    for k, number in enumerate(after.fit.numbers):
+        if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
+            relevant = [confounder for confounder in _of_number(after, number, levers[k]) if _is_relevant(confounder)]
+            chosen += sorted(relevant, key=lambda confounder: -abs(confounder.value - number.value))[:MAX_LISTED]
+    return tuple(chosen)
+
+
+def _is_relevant(confounder: Confounder) -> bool:
+    return abs(confounder.value - confounder.number.value) > MIN_SHIFT_SIGMAS * confounder.number.sigma
+
+
+def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
+    """Every physical effect as a confounder of one size, in the shape that shifts the size most."""
+    physical = {effect.name: effect for effect in after.effects if effect.kind == "physical"}
+    confounders = []
+    for name in dict.fromkeys(after.sensitivities.effects):
+        # An effect that contains the added one as a limit is an alternative to it, no confounder.
+        if name not in physical or number.key.split(".")[0] in physical[name].replaces:
+            continue
+        by_shape = [_in_shape(after, number, k, float(lever[k])) for k in after.ranked_shapes(name)]
+        informative = [confounder for confounder in by_shape if confounder is not None]
+        if informative:
+            confounders.append(max(informative, key=lambda confounder: abs(confounder.value - number.value)))
+    return confounders
+
+
+def _in_shape(after: MisfitTests, number: Number, index: int, lever: float) -> Confounder | None:
+    """One shape of an effect as a confounder; None where the data hold no information about its size."""
+    shape = after.sensitivities.shapes[index]
+    sigma = float(after.scores.sigma[index])
+    if not shape.effect.parameters or shape.whole or not math.isfinite(sigma):
+        return None
+    mean, sd, limit = size_not_excluded(float(after.scores.size[index]), sigma, shape.size)
+    expected = number.value - lever * mean
+    half_width = _quantile(number) * math.hypot(number.sigma, lever * sd)
+    lower, upper = _bounds(after, number)
+    return Confounder(
+        number=number,
+        effect=shape.effect.name,
+        symbol=shape.size.symbol,
+        unit=shape.size.unit,
+        limit=shape.size.zero + limit,
+        value=min(max(number.value - lever * limit, lower), upper),
+        low_95=max(min(number.low, expected - half_width), lower),
+        high_95=min(max(number.high, expected + half_width), upper),
+    )
+
+
+def _bounds(after: MisfitTests, number: Number) -> tuple[float, float]:
+    """Bounds of a parameter, SI."""
+    effect, _, name = number.key.partition(".")
+    parameters = next(
+        effect_of_model for effect_of_model in after.fit.model if effect_of_model.name == effect
+    ).parameters
+    return next(parameter.bounds for parameter in parameters if parameter.name == name)
+
+
+def _quantile(number: Number) -> float:
+    """Half width of the 95 % interval of a fitted size, in standard errors."""
+    quantile = 0.5 * (number.high - number.low) / number.sigma
+    return max(quantile, TWO_SIDED_95) if math.isfinite(quantile) else TWO_SIDED_95
+
+
+def size_not_excluded(estimate: float, sigma: float, parameter: Parameter) -> tuple[float, float, float]:
+    """Combine the estimate of a size with its plausible range (truncated normal posterior). Returns mean, sd, limit :
+    float.
+    """
+    from scipy.stats import truncnorm
+
+    low, high = plausible_range(parameter)
+    prior_sd = max(abs(low - parameter.zero), abs(high - parameter.zero)) / TWO_SIDED_95
+    precision = 1 / sigma**2 + 1 / prior_sd**2
+    centre, width = estimate / sigma**2 / precision, 1 / math.sqrt(precision)
+    lower, upper = (-math.inf, math.inf)
+    if parameter.sign > 0:
+        lower = 0.0
+    elif parameter.sign < 0:
+        upper = 0.0
+    posterior = truncnorm((lower - centre) / width, (upper - centre) / width, loc=centre, scale=width)
+    ends = [float(posterior.ppf(share)) for share in (0.05, 0.95)]
+    return float(posterior.mean()), float(posterior.std()), max(ends, key=abs)

@@ -5,7 +5,7 @@ The fit is linearised about its parameters and about given trial effects. With a
     y = J δθ + Z b_i + S f + e
 
 J the sensitivities to the model parameters θ, Z those to the effects b_i of trial i (release, origin, pressure, B), S
-those to the force amplitudes (`vinetrack.diagnosis.force_sensitivities`), and e AR(1) noise of the tracks. θ and b_i
+those to the force amplitudes (`vinetrack.diagnosis.force_inversion`), and e AR(1) noise of the tracks. θ and b_i
 have normal priors. The trial effects are eliminated trial by trial, the model parameters over all trials (Schur
 complements of the normal equations), so that only equations for f remain.
 """
@@ -14,21 +14,342 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-from vinetrack.diagnosis.replicate_scatter import LEAST_BETWEEN_TRIAL_SD, Scatter
-from vinetrack.inference.fit_problem import track_correlation, variance_floor
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.replicates import LEAST_BETWEEN_TRIAL_SD, Scatter
+from vinetrack.dynamics.audit import evaluate
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, FitState, trial_effect_prior
-from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
+from vinetrack.inference.optimiser import FixedTerms, solve, track_correlation, variance_floor
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, RELEASE, Job
 from vinetrack.inference.whitening import whiten
+
+# ------------------------------------------------------------------------------
+# Cubic B-splines, evaluated through the four that are nonzero at each position.
+
+N_NONZERO = 4  # Cubic splines that are nonzero between two knots (derived)
+
+
+@lru_cache(maxsize=64)
+def _pieces(knots: tuple[float, ...]) -> tuple[Floats, Floats]:
+    """Knots, and the polynomials of the nonzero splines on each interval, shape (n_knots − 1, power, spline)."""
+    from scipy.interpolate import BSpline, PPoly
+
+    ends = np.array([knots[0]] * 3 + [*knots] + [knots[-1]] * 3)
+    polynomials = np.array([PPoly.from_spline(BSpline(ends, unit, 3)).c[::-1] for unit in np.eye(len(knots) + 2)])
+    pieces = [polynomials[k : k + N_NONZERO, :, 3 + k].T for k in range(len(knots) - 1)]
+    return np.array(knots), np.array(pieces)
+
+
+def nonzero_splines(at: Floats, knots: tuple[float, ...]) -> tuple[np.ndarray, Floats]:
+    """Indices and values of the splines that are nonzero at each position; constant beyond the end knots. Returns first
+    (the first of the four nonzero splines, of n_knots + 2), values (of these four; they sum to 1). Shapes: at (n,) →
+    (n,).
+    """
+    breaks, pieces = _pieces(knots)
+    inside = np.clip(at, breaks[0], breaks[-1])
+    first = np.clip(np.searchsorted(breaks, inside, side="right") - 1, 0, len(pieces) - 1)
+    offset = inside - breaks[first]
+    polynomials = pieces[first]
+    values = polynomials[:, 3]
+    for power in (2, 1, 0):
+        values = values * offset[:, None] + polynomials[:, power]
+    return first, values
+
+
+def splines(at: Floats, knots: Floats) -> Floats:
+    """Design matrix of cubic B-splines on these knots; constant beyond the end knots. Shapes: at (n,); knots (n_knots,)
+    → (n, n_knots + 2).
+    """
+    first, values = nonzero_splines(at, tuple(np.asarray(knots).tolist()))
+    design = np.zeros((len(first), len(knots) + 2))
+    np.put_along_axis(design, first[:, None] + np.arange(N_NONZERO), values, axis=1)
+    return design
+
+
+def uniform_splines(at: Floats, count: int) -> Floats:
+    """Cubic B-splines on 0 to 1 with evenly spaced knots. Shapes: at (n,) → (n, count)."""
+    return splines(at, np.array(uniform_knots(count)))
+
+
+@lru_cache
+def uniform_knots(count: int) -> tuple[float, ...]:
+    """Knots of `uniform_splines`."""
+    return tuple(np.linspace(0.0, 1.0, count - 2).tolist())
+
+
+# ------------------------------------------------------------------------------
+# Compiled integration of the variational equations: responses of motions to small accelerations.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def integrate_responses(
+    time_s: Floats, stiffness: Floats, friction: Floats, acceleration: Floats, gamma: float
+) -> tuple[Floats, Floats]:
+    """Integrate δẍ = k δx + c δẋ + a from rest, for several added accelerations a along each motion. The method is the
+    L-stable, singly diagonally implicit Runge-Kutta scheme of two stages and second order by Alexander, SIAM J. Numer.
+    Anal. 14, 1006 (1977). Returns position_change, velocity_change : arrays, shape (n_trials, n_steps + 1, n), m and
+    m/s. Shapes: time_s, stiffness, friction (n_trials, n_steps + 1); acceleration (n_trials, n_steps + 1, n).
+    """
+    trials, points, count = acceleration.shape
+    position_change, velocity_change = np.zeros_like(acceleration), np.zeros_like(acceleration)
+    for trial in range(trials):
+        for i in range(points - 1):
+            h = time_s[trial, i + 1] - time_s[trial, i]
+            implicit, explicit = gamma * h, (1 - gamma) * h
+            k, c = stiffness[trial, i + 1], friction[trial, i + 1]
+            k_stage = (1 - gamma) * stiffness[trial, i] + gamma * k
+            c_stage = (1 - gamma) * friction[trial, i] + gamma * c
+            pivot_stage = 1 - implicit * c_stage - implicit * implicit * k_stage
+            pivot = 1 - implicit * c - implicit * implicit * k
+            for j in range(count):
+                x, v, a = position_change[trial, i, j], velocity_change[trial, i, j], acceleration[trial, i + 1, j]
+                a_stage = (1 - gamma) * acceleration[trial, i, j] + gamma * a
+                rate = (k_stage * (x + implicit * v) + c_stage * v + a_stage) / pivot_stage
+                x, v = x + explicit * (v + implicit * rate), v + explicit * rate
+                v_end = v + implicit * ((k * (x + implicit * v) + c * v + a) / pivot)
+                position_change[trial, i + 1, j], velocity_change[trial, i + 1, j] = x + implicit * v_end, v_end
+    return position_change, velocity_change
+
+
+# ------------------------------------------------------------------------------
+# Sensitivities of the fitted trajectories to a small added force on the tail.
+#
+# Linearised about a motion x(t), the equation of motion m ẍ = F(x, ẋ, t) + f becomes the variational equation
+#
+#     δẍ = (∂a/∂x) δx + (∂a/∂ẋ) δẋ + f/m,   a = F/m
+#
+# It is linear in f, so that the responses to many forces of any shape are integrated together, with no model compiled
+# for
+# them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`). For a force
+# that is not small the motion is corrected and linearised again (Newton's method in function space, Kantorovich; also
+# known as quasilinearisation).
+
+N_STEPS = 400  # Steps of a motion, denser at its start (derived)
+
+# Diagonal coefficient of the two-stage, second-order, L-stable method of Alexander, SIAM J. Numer
+SDIRK_GAMMA = 1 - 1 / math.sqrt(2)
+
+EXTRA_FRAMES = 3.0  # Frames by which a motion is integrated beyond its recording, in case its release moves (chosen)
+
+# Part of the highest speed below which a vine counts as standing still and does not respond to a small force (chosen)
+LEAST_RELATIVE_SPEED = 1e-3
+
+
+@dataclass(frozen=True)
+class FittedMotion:
+    """The motion of one trial on a fine grid since release; arrays have shape (N_STEPS + 1,), SI. `mass_kg` is all
+    moving mass; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ.
+    """
+
+    trial: Trial
+    model: Model
+    measured_Pa: Floats | None
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    pressure_Pa: Floats
+    mass_kg: Floats
+    stiffness: Floats
+    friction: Floats
+    model_acceleration: Floats
+    acceleration: Floats
+    observed_slope: Floats
+    observation_offset_m: Floats
+    end_s: float
+    counts_until_s: float = math.inf
+
+    @property
+    def tail_position_m(self) -> Floats:
+        """Position of the tail, r·y, m."""
+        return self.trial.travel_ratio * self.lead_position_m
+
+    @property
+    def tail_velocity_m_s(self) -> Floats:
+        """Velocity of the tail, r·ẏ, m/s."""
+        return self.trial.travel_ratio * self.lead_velocity_m_s
+
+
+def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> list[FittedMotion]:
+    """Simulate the fitted motions with given trial effects and, optionally, other model parameters. Shapes:
+    trial_effects (n_trials, 4); theta (n_free,).
+    """
+    predictor = fit.predictor
+    jobs = predictor.jobs(fit.solution.state.theta if theta is None else theta, trial_effects)
+    trials = [trial_of_job(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
+    grids = [
+        max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + EXTRA_FRAMES * trial_data.frame_s, 1e-6)
+        * np.linspace(0, 1, N_STEPS + 1) ** 2
+        for i, trial_data in enumerate(predictor.data)
+    ]
+    traces = [
+        None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
+        for trial_data, job in zip(predictor.data, jobs, strict=True)
+    ]
+    runs = simulate_many(
+        fit.model, trials, grids, traces=traces, parameters=np.array([job.row for job in jobs]), host=predictor.host
+    )
+    return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
+
+
+def trial_of_job(trial: Trial, job: Job) -> Trial:
+    """The trial with the pressure and yield pressure that its job simulates."""
+    yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
+    return replace(trial, pressure_Pa=trial.pressure_Pa * (1 + job.pressure_deviation), yield_pressure_Pa=yield_Pa)
+
+
+def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[Floats, Floats] | None) -> FittedMotion:
+    model = model.with_values(dict(zip(model.parameter_names, job.row.tolist(), strict=True)))
+    measured = None if trace is None else np.interp(run.time_s, *trace)
+    if measured is None and any("chamber_rate" in effect.functions for effect in model):
+        # Chamber pressure is held as it is along the fitted motion: its response to a small force is of higher order.
+        measured = evaluate(model, trial, run.time_s, run.lead_position_m, run.lead_velocity_m_s).pressure_Pa
+    zeros = np.zeros_like(run.time_s)
+    unevaluated = FittedMotion(trial, model, measured, run.time_s, run.lead_position_m, run.lead_velocity_m_s, zeros,
+                  zeros, zeros, zeros, zeros, zeros, _observed_slope(run),
+                  run.observed_position_m - run.lead_position_m,
+                  run.end_time_s if run.status == "ended" else math.inf)  # fmt: skip
+    motion = with_model_terms(unevaluated)
+    return replace(motion, acceleration=motion.model_acceleration)
+
+
+def with_model_terms(motion: FittedMotion) -> FittedMotion:
+    """The motion with acceleration, mass, stiffness and friction of the model evaluated along it."""
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
+    at_motion, further, faster = (
+        evaluate(motion.model, motion.trial, motion.time_s, *at, measured_Pa=motion.measured_Pa)
+        for at in ((y, v), (y + step_y, v), (y, v + step_v))
+    )
+    r = motion.trial.travel_ratio
+    stands = v < LEAST_RELATIVE_SPEED * v.max()
+    late = motion.time_s > motion.time_s[N_STEPS // 20]
+    stiffness = (further.acceleration_m_s2 - at_motion.acceleration_m_s2) / (r * step_y)
+    friction = (faster.acceleration_m_s2 - at_motion.acceleration_m_s2) / (r * step_v)
+    return replace(
+        motion,
+        pressure_Pa=np.broadcast_to(at_motion.pressure_Pa, y.shape),
+        mass_kg=np.broadcast_to(at_motion.inertia_kg, y.shape),
+        stiffness=np.where(stands, 0.0, stiffness),
+        friction=np.where(stands & late, -1e9, np.minimum(friction, 0.0)),
+        model_acceleration=np.asarray(at_motion.acceleration_m_s2),
+    )
+
+
+def _observed_slope(run: Trajectory) -> Floats:
+    """Derivative of the observed position by the true position of the leading edge; 1 where it stands still."""
+    velocity = np.gradient(run.lead_position_m, run.time_s)
+    observed_velocity = np.gradient(run.observed_position_m, run.time_s)
+    moving = velocity > LEAST_RELATIVE_SPEED * velocity.max()
+    return np.where(moving, observed_velocity / np.where(moving, velocity, 1.0), 1.0)
+
+
+def force_sensitivities(
+    fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats]
+) -> list[Floats]:
+    """Derivatives of the observed positions of every trial with respect to force amplitudes. Shapes: trial_effects
+    (n_trials, 4) → (n_points, n_forces).
+    """
+    return acceleration_sensitivities(
+        fit, trial_effects, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions]
+    )
+
+
+def acceleration_sensitivities(
+    fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], accelerations: Sequence[Floats]
+) -> list[Floats]:
+    """As `force_sensitivities`, for added accelerations of the tail in place of forces. Shapes: trial_effects
+    (n_trials, 4); accelerations (N_STEPS + 1, n) → (n_points, n).
+    """
+    dx, _ = _responses(motions, np.array(accelerations))
+    return [
+        _interpolated(
+            trial_data.time_s - trial_effects[i, RELEASE],
+            motion,
+            response * motion.observed_slope[:, None] / motion.trial.travel_ratio,
+        )
+        for i, (trial_data, motion, response) in enumerate(zip(fit.predictor.data, motions, dx, strict=True))
+    ]
+
+
+def with_force(
+    motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats], rounds: int
+) -> list[FittedMotion]:
+    """The motions under an added force on the tail that need not be small. Each correction leaves about a tenth of the
+    error of the one before. Motions that do not satisfy their models are corrected to do so. The stiffness and friction
+    returned include the force.
+    """
+    for _ in range(rounds):
+        motions = [_with_force_derivatives(motion, force) for motion in motions]
+        defect = np.array(
+            [motion.model_acceleration + force(motion) / motion.mass_kg - motion.acceleration for motion in motions]
+        )
+        dx, dv = (response[:, :, 0] for response in _responses(motions, defect[:, :, None]))
+        motions = [_corrected(*step) for step in zip(motions, defect, dx, dv, strict=True)]
+    return [_with_force_derivatives(motion, force) for motion in motions]
+
+
+def _with_force_derivatives(motion: FittedMotion, force: Callable[[FittedMotion], Floats]) -> FittedMotion:
+    """The motion with the derivatives of the added force included in stiffness and friction."""
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
+    at_motion, r = force(motion), motion.trial.travel_ratio
+    further = (force(replace(motion, lead_position_m=y + step_y)) - at_motion) / (r * step_y * motion.mass_kg)
+    faster = (force(replace(motion, lead_velocity_m_s=v + step_v)) - at_motion) / (r * step_v * motion.mass_kg)
+    moves = v >= LEAST_RELATIVE_SPEED * v.max()
+    return replace(
+        motion,
+        stiffness=motion.stiffness + np.where(moves, further, 0.0),
+        friction=np.where(moves, np.minimum(motion.friction + faster, 0.0), motion.friction),
+    )
+
+
+def _corrected(motion: FittedMotion, defect: Floats, dx: Floats, dv: Floats) -> FittedMotion:
+    """The motion after a change of the tail's position and velocity; growth does not run backwards."""
+    r = motion.trial.travel_ratio
+    # Step limit: a correction takes away at most half of the speed; the rest is left to the next correction.
+    part = float(np.min(np.where(dv < 0, 0.5 * motion.tail_velocity_m_s / np.maximum(-dv, 1e-12), 1.0), initial=1.0,
+                        where=motion.lead_velocity_m_s > 0.05 * motion.lead_velocity_m_s.max()))  # fmt: skip
+    part = min(part, 1.0)
+    changed = replace(
+        motion,
+        lead_position_m=np.maximum(motion.lead_position_m + part * dx / r, 0.0),
+        lead_velocity_m_s=np.maximum(motion.lead_velocity_m_s + part * dv / r, 0.0),
+        acceleration=motion.acceleration + part * (motion.stiffness * dx + motion.friction * dv + defect),
+    )
+    return with_model_terms(changed)
+
+
+def _interpolated(since_s: Floats, motion: FittedMotion, values: Floats) -> Floats:
+    """Grid values interpolated linearly at other times; 0 before release and after growth has ended."""
+    grid_s = motion.time_s
+    k = np.clip(np.searchsorted(grid_s, since_s), 1, grid_s.size - 1)
+    part = np.clip((since_s - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]), 0.0, 1.0)[:, None]
+    growing = (since_s > 0) & (since_s <= motion.end_s)
+    return np.where(growing[:, None], values[k - 1] + part * (values[k] - values[k - 1]), 0.0)
+
+
+def _responses(motions: Sequence[FittedMotion], acceleration: Floats) -> tuple[Floats, Floats]:
+    """δx, m, and δẋ, m/s, of every trial to added accelerations; all of shape (n_trials, N_STEPS + 1, n)."""
+    time_s, k, c = (
+        np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction")
+    )
+    dx, dv = integrate_responses(time_s, k, c, np.ascontiguousarray(acceleration), SDIRK_GAMMA)
+    # Compiled code does not raise on overflow.
+    if np.geterr()["over"] == "raise" and not (np.isfinite(dx).all() and np.isfinite(dv).all()):
+        raise FloatingPointError("the response to a force is not finite")
+    return dx, dv
+
 
 INDEPENDENT_POINTS_PER_TRIAL = 10.0  # Effective number of independent residuals in one trial (chosen)
 
@@ -266,3 +587,82 @@ def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.b
     scale = np.where(diagonal > 0 if estimable is None else estimable, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
     inverse = np.linalg.pinv(matrix * scale[:, None] * scale, rcond=cutoff, hermitian=True)
     return np.asarray(inverse * scale[:, None] * scale)
+
+
+# ------------------------------------------------------------------------------
+# Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
+#
+# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
+# with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4). The acceleration itself is not used as
+# data: the equation of motion is linearised about this motion, and the defect there (what the model's forces lack)
+# enters
+# as one more known acceleration, so that noise in the smoothed motion cancels to first order (quasilinearisation,
+# Bellman
+# & Kalaba 1965). About the motion of a model that lacks a large force the linearisation would be poor.
+
+# Splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
+N_SPLINES = 20
+
+# Penalties on second differences, relative to the information from positions (chosen)
+SMOOTHED_MOTIONS_SMOOTHING_PENALTIES = np.geomspace(1e-8, 1e2, 21)
+
+LAST_LENGTH_FRACTION = 0.96  # Part of the length up to which points are used (chosen)
+
+
+def on_tracks(inversion: LinearInversion, trial_effects: Floats, motions: Sequence[FittedMotion]) -> list[FittedMotion]:
+    """Move motions onto their tracks and evaluate the model along them. Shapes: trial_effects (n_trials, 4)."""
+    return [_on_track(inversion.data[i], trial_effects[i], motion) for i, motion in enumerate(motions)]
+
+
+def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> FittedMotion:
+    since_s = data.time_s - trial_effects[RELEASE]
+    observed_m = data.lead_position_m - trial_effects[ORIGIN]
+    position_m = observed_m - np.interp(since_s, motion.time_s, motion.observation_offset_m)
+    length_m = motion.trial.length_m
+    growing = (since_s > 0) & ~(position_m > LAST_LENGTH_FRACTION * length_m)
+    if np.count_nonzero(growing) <= 2:
+        return motion
+    grid_s = motion.time_s
+    last_s = float(since_s[growing].max())
+    accelerations = uniform_splines(np.sqrt(np.clip(grid_s / last_s, 0.0, 1.0)), N_SPLINES)
+    velocities = _integrated(grid_s, accelerations)
+    positions = _integrated(grid_s, velocities)
+    k = np.clip(np.searchsorted(grid_s, since_s[growing]), 1, grid_s.size - 1)
+    part = ((since_s[growing] - grid_s[k - 1]) / (grid_s[k] - grid_s[k - 1]))[:, None]
+    at_frames = positions[k - 1] + part * (positions[k] - positions[k - 1])
+    coefficients = _penalised_fit(at_frames, position_m[growing])
+    r = motion.trial.travel_ratio
+    moved = replace(
+        motion,
+        lead_position_m=np.maximum.accumulate(np.maximum(positions @ coefficients, 0.0)),
+        lead_velocity_m_s=np.maximum(velocities @ coefficients, 0.0),
+        acceleration=r * (accelerations @ coefficients),
+        # The model's end of growth is not that of the track: the vine responds to forces beyond it.
+        end_s=math.inf,
+        counts_until_s=last_s,
+    )
+    return with_model_terms(moved)
+
+
+def _integrated(time_s: Floats, columns: Floats) -> Floats:
+    """Cumulative integrals of the columns by the trapezoidal rule, 0 at the first time."""
+    steps = 0.5 * (columns[1:] + columns[:-1]) * np.diff(time_s)[:, None]
+    return np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _penalised_fit(design: Floats, values: Floats) -> Floats:
+    """Coefficients with penalised second differences, the penalty chosen by generalised cross-validation."""
+    second_difference = np.diff(np.eye(design.shape[1]), 2, axis=0)
+    gram = design.T @ design
+    unit = float(np.trace(gram)) / design.shape[1]
+    roughness = unit * (second_difference.T @ second_difference + 1e-9 * np.eye(design.shape[1]))
+    best: tuple[float, Floats] | None = None
+    for penalty in SMOOTHED_MOTIONS_SMOOTHING_PENALTIES:
+        inverse = np.linalg.pinv(gram + penalty * roughness, hermitian=True)
+        coefficients = inverse @ (design.T @ values)
+        degrees_of_freedom = min(float(np.trace(inverse @ gram)), values.size - 1.0)
+        score = float(np.sum((values - design @ coefficients) ** 2)) / (values.size - degrees_of_freedom) ** 2
+        if best is None or score < best[0]:
+            best = score, coefficients
+    assert best is not None
+    return best[1]

@@ -22,8 +22,7 @@ from functools import lru_cache
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.cubic_splines import N_NONZERO, nonzero_splines, uniform_knots
-from vinetrack.diagnosis.force_sensitivities import FittedMotion
+from vinetrack.diagnosis.force_inversion import N_NONZERO, FittedMotion, nonzero_splines, uniform_knots
 
 # What a force may depend on, and the attribute of a motion that holds it
 VARIABLES = {

@@ -5,21 +5,104 @@ The answer set holds every hypothesis that the data cannot exclude.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
-from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.film_allowance import film_gain
-from vinetrack.diagnosis.plausibility_prior import log_evidence, posterior_weights, prior_penalty
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.between_gain import film_gain
+from vinetrack.diagnosis.candidates import is_plausible, plausible_range, slip_of
 from vinetrack.diagnosis.result import BETWEEN_TRIALS, limit_reason
-from vinetrack.effects import Effect
-from vinetrack.inference.film_influence import FILM
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect, Parameter
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.fit_summary import FILM
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
+
+# ------------------------------------------------------------------------------
+# Priors from plausible ranges, and the marginal likelihoods and posterior probabilities of hypotheses with them.
+#
+# A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4:
+# the range holds 95 % of it. With a likelihood that is normal about its maximum θ̂ with covariance Σ, the marginal
+# likelihood of a hypothesis is
+#
+#     ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
+#
+# which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). Each
+# parameter
+# of a hypothesis costs ln(σ/τ), and sizes outside the range cost more. What all hypotheses share cancels.
+
+# Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
+# penalised (derived)
+RANGE_EDGE_DISTANCE = 4.0
+
+
+def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
+    """Mean and standard deviation of the prior of a plausible range, in the parameter's unit. A size that a common slip
+    in the sheet would produce has its prior about that size, as wide as ordinary errors.
+    """
+    low, high = plausible_range(parameter)
+    mean, sd = 0.5 * (low + high), 0.25 * (high - low)
+    slip = slip_of(parameter, number.value, number.sigma)
+    return (mean, sd) if slip is None else (slip[0] + (1 + slip[0]) * mean, (1 + slip[0]) * sd)
+
+
+def prior_penalty(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
+    """Penalty of sizes outside their plausible ranges, on the scale of −2 ln L; 0 inside."""
+    total = 0.0
+    for number in fit.numbers:
+        parameter = parameters.get(number.key)
+        if parameter is None or not math.isfinite(number.sigma) or number.value == parameter.zero:
+            continue
+        mean, sd = _prior_of(parameter, number)
+        variance = number.sigma**2 + sd**2
+        if variance > 0:
+            total += max((number.value - mean) ** 2 / variance - RANGE_EDGE_DISTANCE, 0.0)
+    return total
+
+
+def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
+    """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant common to all fits of the same trials.
+    Parameters that no trajectory depends on, or that have no finite standard error, keep their prior and cost nothing.
+    """
+    indices, means, sds = [], [], []
+    for k, number in enumerate(fit.numbers):
+        parameter = parameters.get(number.key)
+        if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
+            mean, sd = _prior_of(parameter, number)
+            if sd > 0:
+                indices.append(k)
+                means.append(mean)
+                sds.append(sd)
+    if not indices:
+        return fit.log_likelihood
+    values = np.array([fit.numbers[k].value for k in indices])
+    scale = np.array(sds)
+    covariance = fit.covariance[np.ix_(indices, indices)] / scale[:, None] / scale
+    deviation = (values - np.array(means)) / scale
+    predictive = covariance + np.eye(len(indices))
+    occam = 0.5 * (_log_det(covariance) - _log_det(predictive))
+    return float(fit.log_likelihood + occam - 0.5 * deviation @ np.linalg.solve(predictive, deviation))
+
+
+def _log_det(matrix: Floats) -> float:
+    return float(np.linalg.slogdet(matrix + 1e-300 * np.eye(len(matrix)))[1])
+
+
+def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
+    """Posterior probabilities of hypotheses of equal prior probability; they add up to 1."""
+    if not log_evidences:
+        return []
+    values = np.array(log_evidences)
+    weights = np.exp(values - values.max())
+    return [float(weight) for weight in weights / weights.sum()]
+
 
 ANSWER_SET_DELTA_CHI2 = 9.0  # A hypothesis whose −2 ln L lies within this of the best cannot be excluded (derived)
 
@@ -50,8 +133,8 @@ class LikelihoodRatio:
     credible: bool = True
     inflation: float = 1.0
     prior_penalty: float = 0.0  #: penalty of sizes outside their plausible range, on the scale of −2 ln L
-    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.plausibility_prior`
-    film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.film_allowance`
+    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.likelihood_ratio`
+    film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.between_gain`
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,7 +150,7 @@ class LikelihoodRatio:
     def log_bayes(self) -> float:
         """Logarithm of the Bayes factor against the fit without it, with the likelihood ratio reduced by `inflation`.
         Shared parameters are at their maximum likelihood in both; those added are integrated over their priors, see
-        `vinetrack.diagnosis.plausibility_prior`.
+        `vinetrack.diagnosis.likelihood_ratio`.
         """
         return 0.5 * self.delta_chi2 / self.inflation + self.log_evidence - self.fit.log_likelihood
 
@@ -303,3 +386,46 @@ def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     """Whether an effect of one declares that it contains an effect of the other (`replaces`)."""
     replaced = {name for effect in hypothesis.effects for name in effect.replaces}
     return bool(replaced & set(other.names))
+
+
+# ------------------------------------------------------------------------------
+# Simpler forms of an effect that contains another as a special case, refitted from where the larger one ended.
+
+# Standard errors by which an additional parameter must differ from zero for the simpler form to be ruled out without a
+# fit
+CERTAIN_SIGMAS = 6.0
+
+# A hypothesis and its ln L, one of its effects, and the simpler form of that effect
+NestedForm = tuple[str, float, str, str]
+
+
+def simpler_forms(
+    before: Fit, hypothesis: LikelihoodRatio, effects: Sequence[Effect], tried: set[NestedForm]
+) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
+    """Refit a hypothesis with one of its effects replaced by a simpler effect that it contains."""
+    for larger in hypothesis.effects:
+        for simpler in effects:
+            contained = simpler.name in larger.replaces and simpler.name not in hypothesis.names
+            if not contained or _needs_larger_form(hypothesis.fit, larger, simpler):
+                continue
+            form = "+".join(sorted(hypothesis.names)), hypothesis.fit.log_likelihood, larger.name, simpler.name
+            if form in tried:
+                continue
+            tried.add(form)
+            replaced = tuple(simpler if effect is larger else effect for effect in hypothesis.effects)
+            model = before.model.with_effects(replaced)
+            values = hypothesis.fit.model.values
+            sizes = {f"{simpler.name}.{p.name}": values.get(f"{larger.name}.{p.name}") for p in simpler.parameters}
+            start = {key: size for key, size in sizes.items() if size is not None}
+            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+                yield replaced, refit(hypothesis.fit, model, start=start, thorough=False)
+
+
+def _needs_larger_form(fit: Fit, larger: Effect, simpler: Effect) -> bool:
+    """Whether a parameter that only the larger form has differs from zero beyond doubt."""
+    additional = {p.name for p in larger.parameters} - {p.name for p in simpler.parameters}
+    numbers = [n for n in fit.numbers if n.key.split(".")[0] == larger.name and n.key.split(".")[1] in additional]
+    return any(
+        math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > CERTAIN_SIGMAS * n.sigma
+        for n in numbers
+    )

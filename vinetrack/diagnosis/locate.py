@@ -2,8 +2,8 @@
 
 By condition; along time, position and speed; and by which parameter drifts with a condition on which it should not
 depend (`vinetrack.diagnosis.drift`). A prediction has its own release and origin and no other trial effect, as in
-`vinetrack.diagnosis.compare`. Standard errors are those of the mean over trials, from the scatter of replicates
-(`vinetrack.diagnosis.replicate_scatter`): a thousand frames of one trial are one trial.
+`vinetrack.diagnosis.ladder`. Standard errors are those of the mean over trials, from the scatter of replicates
+(`vinetrack.diagnosis.replicates`): a thousand frames of one trial are one trial.
 """
 
 from __future__ import annotations
@@ -15,24 +15,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.compare import position_errors
-from vinetrack.diagnosis.drift import Drift, drift
-from vinetrack.diagnosis.ladder import excess
-from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, replicate_z, stretch_covariance
-from vinetrack.diagnosis.replicates import replicates_of
-from vinetrack.diagnosis.result import MAX_STRETCHES
-from vinetrack.diagnosis.stretches import (
+from vinetrack.core.units import decimals
+from vinetrack.diagnosis.drift import (
+    Drift,
     ResidualCourse,
     common_edges,
     common_stretches,
     courses_by_condition,
+    drift,
     replicate_scatter,
     residual_courses,
     stretch_means,
     stretch_variances,
 )
+from vinetrack.diagnosis.ladder import excess, position_errors
+from vinetrack.diagnosis.replicates import Scatter, Stretches, replicate_z, replicates_of, stretch_covariance
+from vinetrack.diagnosis.result import MAX_STRETCHES
 from vinetrack.inference.fit_result import Fit, TrialFit
 
 if TYPE_CHECKING:

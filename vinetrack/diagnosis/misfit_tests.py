@@ -16,18 +16,247 @@ from functools import cached_property
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import CandidateShape, plausible_range, shapes_of
-from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
-from vinetrack.diagnosis.family_test import FamilyTest, family_test
-from vinetrack.diagnosis.score_test import Scores, linear_gains, scores_of
-from vinetrack.diagnosis.shape_products import Products, fit_columns, products_of
-from vinetrack.diagnosis.structure_test import Structure, structure_of
-from vinetrack.diagnosis.trial_effect_tests import between_conditions_p, noise_in_motion_p
+from vinetrack.diagnosis.candidates import (
+    CandidateShape,
+    EffectSensitivities,
+    effect_sensitivities,
+    plausible_range,
+    shapes_of,
+)
+from vinetrack.diagnosis.score_test import (
+    FamilyTest,
+    Products,
+    Scores,
+    family_test,
+    fit_columns,
+    linear_gains,
+    products_of,
+    scores_of,
+)
+from vinetrack.dynamics.model import probe
 from vinetrack.effects import Effect
-from vinetrack.inference.fit_problem import track_correlation
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.goodness_of_fit import is_poor_fit, relative_residual
-from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.optimiser import is_poor_fit, relative_residual, track_correlation, variance_floor
+from vinetrack.inference.robust_covariance import Systematics, cluster_variance, systematics_of
+
+# ------------------------------------------------------------------------------
+# Omnibus score test of probe forces: would any smooth force improve the fit, whether or not it is in the catalogue.
+#
+# Probes are bumps of force along the growth, over speed and over time.
+
+BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4  # Number of probe bumps along growth, speed and time (chosen)
+
+# Smallest eigenvalue of the probes' information, relative to the largest, that counts as a degree of freedom (chosen)
+MIN_INFORMATION_SHARE = 1e-4
+
+
+def _probe_shapes(fit: Fit) -> list[CandidateShape]:
+    """Bumps of force along the growth, over speed and over time, with and without a factor P."""
+    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in fit.trials)
+    fastest = max(
+        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in fit.trials
+    )
+    lengths = [trial.trial.length_m for trial in fit.trials]
+    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in fit.trials]
+    reach = max(
+        grown / length if math.isfinite(length) and length > 0 else grown
+        for grown, length in zip(reaches, lengths, strict=True)
+    )
+    varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
+    shapes = []
+    for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
+        centres = (np.arange(count) + 0.5) / count * top
+        for centre in centres:
+            for offset in (0, 3) if varied and kind == 0 else (0,):
+                shapes.append(CandidateShape(probe(), (float(kind + offset), float(centre), 0.6 * top / count), 1e-3))
+    return shapes
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Result of the probes: χ² of their scores for `degrees` of freedom, its p-value `p`, and the same as a `z`.
+    `smallest_probe_p` is the smallest p-value of single probes, Bonferroni-corrected: a narrow feature shows in one
+    probe and is diluted in the sum over all.
+    """
+
+    chi2: float
+    degrees: int
+    p: float
+    z: float
+    smallest_probe_p: float = 1.0
+
+
+def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
+    """Test a fit for misfit that a smooth force could explain. The scores of all probes are tested together, with both
+    kinds of error, in the directions that the fitted parameters leave to them.
+    """
+    answers = effect_sensitivities(fit, _probe_shapes(fit))
+    if not answers.shapes:
+        return Structure(0.0, 0, 1.0, 0.0)
+    return structure_from_scores(scores_of(fit, products_of(fit, columns, answers, systematics)))
+
+
+def structure_from_scores(scores: Scores) -> Structure:
+    """Test statistics from the scores of probes: all together, and the most significant alone; see `structure_of`."""
+    from scipy.stats import f as fisher
+    from scipy.stats import norm, t
+
+    root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
+    informative = np.diag(scores.information) > 0
+    information = (scores.information / root[:, None] / root)[np.ix_(informative, informative)]
+    score = (scores.score / root)[informative]
+    values, vectors = np.linalg.eigh(information)
+    keep = values > MIN_INFORMATION_SHARE * values.max(initial=0.0)
+    # In the principal directions the scores are uncorrelated and have variance 1 by the noise model.
+    z = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
+    directions = (vectors / root[informative][:, None])[:, keep] / np.sqrt(values[keep])
+    trial_z = scores.trial_scores[:, informative] @ directions
+    trial_informations = scores.trial_informations[:, informative][:, :, informative]
+    explained = np.einsum("jk,njl,lk->nk", directions, trial_informations, directions) * z
+    robust = cluster_variance(trial_z - explained, scores.degrees)
+    chi2 = float(np.sum(z**2 / np.maximum(1.0, robust)))
+    degrees = int(np.count_nonzero(keep))
+    p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
+    # A probe to which few trials respond has as few degrees of freedom (effective number of trials).
+    by_trial = np.einsum("njj->nj", scores.trial_informations)[:, informative]
+    n_effective = by_trial.sum(axis=0) ** 2 / np.maximum(np.sum(by_trial**2, axis=0), 1e-300)
+    p_values = 2 * t.sf(np.abs(scores.z[informative]), np.clip(n_effective - 1, 1.0, max(scores.degrees, 3.0)))
+    smallest_probe_p = min(degrees * float(np.min(p_values, initial=1.0)), 1.0)
+    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), smallest_probe_p)
+
+
+# ------------------------------------------------------------------------------
+# Two tests of whether trial effects and noise have absorbed what a model lacks.
+#
+# The deviations of pressure and B of each trial can absorb part of a misfit. Deviations by chance differ between
+# replicates of a condition; those that compensate for the model are the same in all of them. What the deviations cannot
+# absorb is estimated as noise: positions are then noisier in motion than at rest, summed over stretches as long as slow
+# errors last.
+
+STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
+
+MIN_STRETCHES = 12  # Degrees of freedom of the stretches at rest below which the noise test is not made (chosen)
+
+MIN_REPLICATE_DEGREES = 4  # Degrees of freedom between replicates from which their scatter is estimated (chosen)
+
+STATED_ERROR_FACTOR, CAREFUL_DAMPING_SCATTER = 2.0, 0.04  # Root mean square by which conditions may differ (chosen)
+
+CAREFUL_PRESSURE_SCATTER = 0.02  # Relative standard deviation of pressure that is usual between trials (chosen)
+
+REPLICATE_LIKE_P_VALUE = 0.05  # p-value from which conditions count as differing no more than their replicates (chosen)
+
+
+def between_conditions_p(fit: Fit) -> float:
+    """p-value that conditions differ in pressure or B no more than replicates do. 1 where replicates are too few, or
+    where conditions differ by less than is usual in careful work. Returns p-value.
+    """
+    stated = [
+        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
+    ]
+    known = [relative for relative in stated if math.isfinite(relative)]
+    pressure = max(STATED_ERROR_FACTOR * float(np.median(known)) if known else 0.0, CAREFUL_PRESSURE_SCATTER)
+    allowed = pressure, CAREFUL_DAMPING_SCATTER
+    p_values = [
+        _anova_p(deviations, *_grouping(fit), limit)
+        for deviations, limit in zip(_trial_deviations(fit), allowed, strict=True)
+    ]
+    return min(2 * min(p_values), 1.0)
+
+
+def has_excess_scatter(fit: Fit) -> bool:
+    """Whether trials scatter more than is usual in careful work, so that their effects may have absorbed a misfit. They
+    have not where conditions differ by no more than replicates, or than is usual: deviations that compensate for a
+    model are the same in replicates.
+    """
+    allowed = CAREFUL_PRESSURE_SCATTER, CAREFUL_DAMPING_SCATTER
+    return any(
+        spread > limit and not _differ_like_replicates(deviations, *_grouping(fit), limit)
+        for spread, limit, deviations in zip(fit.state.spread, allowed, _trial_deviations(fit), strict=True)
+    )
+
+
+def _trial_deviations(fit: Fit) -> tuple[Floats, Floats]:
+    """Deviations of pressure and of ln B, by trial."""
+    return (
+        np.array([trial.pressure_deviation for trial in fit.trials]),
+        np.log1p([trial.damping_deviation for trial in fit.trials]),
+    )
+
+
+def _grouping(fit: Fit) -> tuple[list[str], int]:
+    """The condition of each trial, and the number of parameters fitted to all."""
+    fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
+    return [trial.trial.condition for trial in fit.trials], fitted
+
+
+def _differ_like_replicates(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> bool:
+    """Whether groups differ by no more than their members do, or than is allowed; False where too few members tell.
+    With no more groups than parameters fitted to them, no difference between groups can show.
+    """
+    inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
+    testable = inner >= MIN_REPLICATE_DEGREES and outer > 0
+    return testable and _anova_p(values, groups, fitted, allowed) > REPLICATE_LIKE_P_VALUE
+
+
+def _anova_p(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
+    """p-value of a one-way analysis of variance; 1 where the group means differ by less than `allowed`, rms."""
+    from scipy.stats import f
+
+    names = sorted(set(groups))
+    members = [values[[group == name for group in groups]] for name in names]
+    within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
+    inner, outer = values.size - len(names), max(len(names) - fitted, 1)
+    between = sum(member.size * float(member.mean()) ** 2 for member in members)
+    if inner < MIN_REPLICATE_DEGREES or not within > 0 or math.sqrt(between / values.size) < allowed:
+        return 1.0
+    # Replicates that hardly differ would make any difference significant: their variance is at least (allowed / 3)².
+    within_variance = max(within / inner, allowed**2 / 9)
+    return float(f.sf(between / outer / within_variance, outer, inner))
+
+
+def noise_in_motion_p(fit: Fit) -> float:
+    """p-value that residuals summed over stretches are no noisier in motion than at rest; 1 where this is unknown.
+    Returns p-value.
+    """
+    from scipy.stats import f
+
+    at_rest: list[Floats] = []
+    in_motion: list[Floats] = []
+    rest_degrees = 0.0
+    for trial, trial_data in zip(fit.trials, fit.predictor.data, strict=True):
+        if (
+            trial_data.slow_m is not None
+            or trial_data.gauge_error > 0
+            or trial_data.noise_m**2 < variance_floor([trial_data])[0]
+        ):
+            continue
+        standstill = _stretch_sums(trial.whitened[: trial_data.n_rest])
+        if standstill.size < 2:
+            continue
+        at_rest.append((standstill - standstill.mean()) * math.sqrt(standstill.size / (standstill.size - 1)))
+        in_motion.append(_stretch_sums(trial.whitened[trial_data.n_rest :]))
+        rest_degrees += standstill.size - 1
+    if rest_degrees < MIN_STRETCHES:
+        return 1.0
+    still, moving = np.concatenate(at_rest), np.concatenate(in_motion)
+    ratio = float(np.mean(moving**2) / np.mean(still**2))
+    return float(f.sf(ratio, _degrees(moving, moving.size), _degrees(still, rest_degrees)))
+
+
+def _stretch_sums(white: Floats) -> Floats:
+    """Sums over successive stretches, of variance 1 if the residuals are white."""
+    count = white.size // STRETCH_FRAMES
+    return np.asarray(
+        white[: count * STRETCH_FRAMES].reshape(count, STRETCH_FRAMES).sum(axis=1) / math.sqrt(STRETCH_FRAMES)
+    )
+
+
+def _degrees(values: Floats, count: float) -> float:
+    """Effective degrees of freedom of a mean square, fewer where the tails are heavy."""
+    square = float(np.mean(values**2))
+    kurtosis = float(np.mean(values**4)) / square**2 if square > 0 else 3.0
+    return 2 * count / max(kurtosis - 1, 2.0)
+
 
 # Probability that the best of all candidates exceeds its threshold where nothing is missing (chosen)
 FALSE_ALARM_LEVEL_FIRST_ROUND, FALSE_ALARM_LEVEL_LATER_ROUNDS = 3e-3, 1e-4

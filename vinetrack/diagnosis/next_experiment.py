@@ -20,25 +20,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.records import Floats
+from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.plan_text import (
+from vinetrack.narrative.power_text import (
     advice_text,
     calibration_advice,
     only_measurement,
     separation_text,
     trial_entries,
 )
-from vinetrack.narrative.verdict_summary import joined
+from vinetrack.narrative.verdict_text import joined
 from vinetrack.planning.design_simulation import DesignProblem, expected_rises, mean_separation, simulated_rises
-from vinetrack.planning.discriminating_design import RefitTerms, best_design, best_new_vines, refit_terms, worth
-from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, feasible_conditions
-from vinetrack.planning.hypothesis_predictions import extend
-from vinetrack.planning.simulated_tracks import growth_courses, sampling_of
+from vinetrack.planning.discriminating_design import (
+    NEW_VINE,
+    OTHER_RIG,
+    SAME_RIG,
+    RefitTerms,
+    best_design,
+    best_new_vines,
+    extend,
+    feasible_conditions,
+    growth_courses,
+    refit_terms,
+    sampling_of,
+    worth,
+)
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 

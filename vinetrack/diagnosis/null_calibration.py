@@ -23,8 +23,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.campaign_power import CampaignDesign, with_measurement_errors
 from vinetrack.diagnosis.candidates import testable
-from vinetrack.diagnosis.family_test import family_p_value
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     SINGLE_PROBE_LEVEL,
@@ -32,7 +31,8 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
 )
 from vinetrack.diagnosis.power import Rate
-from vinetrack.dynamics.host import host_for
+from vinetrack.diagnosis.score_test import family_p_value
+from vinetrack.dynamics.model import host_for
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.fit_data import FitError

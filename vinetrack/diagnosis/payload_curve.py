@@ -17,7 +17,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.parameters import YIELD_PRESSURE
-from vinetrack.kinematics.conditions import lead_velocity_at
+from vinetrack.kinematics.summary import lead_velocity_at
 
 if TYPE_CHECKING:
     import pandas as pd

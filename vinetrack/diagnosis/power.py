@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.notebook import plot
-from vinetrack.core.numbers import or_nan
 from vinetrack.core.records import Trial
+from vinetrack.core.units import or_nan
 from vinetrack.experiment.schema import COLUMNS
 
 if TYPE_CHECKING:

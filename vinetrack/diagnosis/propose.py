@@ -11,18 +11,30 @@ from __future__ import annotations
 import math
 import tempfile
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.blas_threads import in_one_blas_thread
-from vinetrack.diagnosis.add import both_fits
+from vinetrack.core.records import Floats, Track
+from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.diagnosis.candidate_fits import (
+    SubsetFitter,
+    best_subset_fit,
+    full_fit,
+    restart_exponents,
+    restart_without,
+    start_values,
+)
+from vinetrack.diagnosis.candidates import shapes_of
+from vinetrack.diagnosis.force_inversion import uniform_splines
 from vinetrack.diagnosis.force_laws import EDGE_FRACTION
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
-from vinetrack.diagnosis.ladder import left_out
+from vinetrack.diagnosis.force_surface import VARIABLES, Domain
+from vinetrack.diagnosis.ladder import candidates_of, initial_fit, left_out, with_host
+from vinetrack.diagnosis.learned_force import LEAST_CHI2_PER_POINT, LearnedForce, variables_in_words
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET_DELTA_CHI2,
     MAX_INFLATION,
@@ -31,14 +43,299 @@ from vinetrack.diagnosis.likelihood_ratio import (
     likelihood_ratio,
 )
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
-from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, missing_force
-from vinetrack.diagnosis.multi_start import restart_exponents
-from vinetrack.diagnosis.proposed_table import LEAST_SIGMAS, ProposedTable, proposed_table
-from vinetrack.dynamics.model import Model
-from vinetrack.effects import Effect, load_effect, remember
-from vinetrack.inference.fit_data import FitError, Pairs
+from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
+from vinetrack.diagnosis.selection import MAX_RESTARTS, MIN_LOG_LIKELIHOOD_GAIN
+from vinetrack.dynamics.model import Model, check_needs, make_model
+from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_summary import joined
+from vinetrack.narrative.verdict_text import joined
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.experiment.folder import Experiment
+
+
+# ------------------------------------------------------------------------------
+# One effect added to the model by hand: both models are fitted, and compared on conditions that were left out.
+
+
+def add(
+    experiment: Experiment, tracks: Mapping[str, Track], name: str, report: Callable[[str], None]
+) -> tuple[Fit, Fit, pd.DataFrame]:
+    """Fit the model in use without and with an effect, and work out the ladder of both. Returns before, after, table
+    (the ladder of errors, one row for each model).
+    """
+    from vinetrack.diagnosis.ladder import ladder
+    from vinetrack.effects import own_effects
+
+    user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    model = make_model(experiment.settings.model, user_effects)
+    if name.endswith(".py"):
+        user_effects = {**own_effects([name]), **user_effects}
+    effect = find_effect(Path(name).stem, user_effects)
+    if effect.name in model:
+        raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
+    check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
+    report("fitting the model as it is")
+    candidates = candidates_of(model, experiment.settings.candidates, user_effects)
+    if effect not in candidates:
+        candidates = (*candidates, effect)
+    before = initial_fit(model, pairs_of(experiment, tracks)[0], candidates, profile=False)
+    before, after = both_fits(before, effect, report)
+    report("errors before and after")
+    return before, after, ladder((before, after), ("", effect.name))
+
+
+def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
+    """Fit a model without and with an effect, each from its best minimum, as the diagnosis does. Returns before, after
+    : Fit.
+    """
+    if before.chi2_per_dof > FAR_OFF_CHI2_PER_DOF:
+        before = restart_exponents(before)
+    for _ in range(1 + MAX_RESTARTS):
+        report(f"fitting it with {effect.name}")
+        after = _fit_with(before, effect)
+        refitted = restart_without(before, after)
+        if refitted.log_likelihood <= before.log_likelihood + MIN_LOG_LIKELIHOOD_GAIN:
+            break
+        before = refitted
+    return before, after
+
+
+def _fit_with(before: Fit, effect: Effect) -> Fit:
+    """Fit a model with an effect added, from several starts."""
+    fitter = SubsetFitter(before)
+    starts = [((effect,), start_values(shape, shape.step * 10)) for shape in shapes_of(effect)]
+    subset_fit = best_subset_fit(fitter, starts, float("inf"))
+    after = full_fit(before, subset_fit) if subset_fit is not None else None
+    if after is None:
+        raise FitError(f"The model with {effect.name} cannot be simulated from any start.")
+    if after.log_likelihood < before.log_likelihood:
+        from_before = refit(before, before.model + effect)
+        after = max((after, from_before), key=lambda fit: fit.log_likelihood)
+    return after
+
+
+# ------------------------------------------------------------------------------
+# A learned force as an effect file: a table of spline coefficients over one variable or two, in place of a formula.
+#
+# Where no formula reproduces the learned force, the force itself can enter the equation of motion. The file holds the
+# coefficients of its splines, N, at even steps of each normalised variable (`force_surface.Domain`), and a function
+# that
+# sums the four splines that are nonzero:
+#
+#     T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
+#
+# β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter scales the table; 1 is the force as
+# learned.
+
+CHECKS_PER_SPLINE = 4  # Positions per spline at which the two sets of splines are matched by least squares (chosen)
+
+TABLE_DIGITS = 6  # Significant digits of a coefficient in the file (chosen)
+
+_STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
+_SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
+_UNIT = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
+
+
+def table_name(learned: LearnedForce) -> str:
+    """Name of the effect that holds a learned force, such as `learned_growth_speed`."""
+    return "_".join(["learned", *learned.domain.variables])
+
+
+def table_text(learned: LearnedForce, remark: str = "") -> str:
+    """Source of an effect file that holds a learned force: docstring, table, parameter, function and a
+    worked example.
+    """
+    domain = learned.domain
+    table = uniform_table(domain, learned.best.mean)
+    variables = variables_in_words(domain.name)
+    symbols = ", ".join(_SYMBOL[name] for name in domain.variables)
+    units = [_UNIT[name] for name in domain.variables]
+    ranges = joined(
+        [
+            f"{variables_in_words(name)} from {low * factor:.3g} to {high * factor:.3g} {unit}"
+            for name, low, high, (unit, factor) in zip(domain.variables, domain.low, domain.high, units, strict=True)
+        ]
+    )
+    state, worked = _worked_example(learned)
+    axes = [line for k in range(len(domain.variables)) for line in _axis_code(domain, k)]
+    counts = " × ".join(str(count) for count in domain.counts)
+    parts = [
+        f'"""Learned force: a table over {variables}, no law.\n',
+        *textwrap.wrap(remark, 118),
+        "" if remark else None,
+        *textwrap.wrap(learned.sentence, 118),
+        "",
+        *textwrap.wrap(
+            f"It is valid for {ranges}, the range that trials visited; outside, it keeps its value at the edge, which"
+            " has no meaning. Forces are positive along the growth, so that a friction is negative. The table"
+            " reproduces these trials but explains nothing: look at its figure, and find the formula.",
+            118,
+        ),
+        "",
+        f"    tail force a T({symbols}), T the sum of {counts} cubic splines on even steps",
+        "",
+        "Make trials that differ in the variables it depends on, and compare new trials with its prediction.",
+        '"""\n',
+        "import numpy as np\n",
+        "from vinetrack.effects import Parameter, Worked\n",
+        *_table_lines(table),
+        "",
+        'PARAMETERS = (Parameter("a", "a", "1", 1.0, bounds=(-10.0, 10.0), plausible=(0.0, 2.0), '
+        'meaning="size of the table"),)',
+        "\n",
+        "def tail_force(s, rig, a):",
+        *(f"    {line}" for line in axes),
+        *(_SUM_OF_ONE if table.ndim == 1 else _SUM_OF_TWO),
+        "\n",
+        "WORKED = (",
+        "    Worked(",
+        '        "tail_force",',
+        f"        {worked:.8g},",
+        '        "the learned force at this state",',
+        f"        state={state!r},",
+        '        parameters={"a": 1.0},',
+        "    ),",
+        ")",
+    ]
+    return "\n".join(part for part in parts if part is not None) + "\n"
+
+
+_SUM_OF_ONE = ("    return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])",)
+_SUM_OF_TWO = (
+    "    r0 = g0 * TABLE[i, j] + g1 * TABLE[i, j + 1] + g2 * TABLE[i, j + 2] + g3 * TABLE[i, j + 3]",
+    "    r1 = g0 * TABLE[i + 1, j] + g1 * TABLE[i + 1, j + 1] + g2 * TABLE[i + 1, j + 2] + g3 * TABLE[i + 1, j + 3]",
+    "    r2 = g0 * TABLE[i + 2, j] + g1 * TABLE[i + 2, j + 1] + g2 * TABLE[i + 2, j + 2] + g3 * TABLE[i + 2, j + 3]",
+    "    r3 = g0 * TABLE[i + 3, j] + g1 * TABLE[i + 3, j + 1] + g2 * TABLE[i + 3, j + 2] + g3 * TABLE[i + 3, j + 3]",
+    "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)",
+)
+
+
+def uniform_table(domain: Domain, coefficients: Floats) -> Floats:
+    """Convert the coefficients of a domain's splines to those of identical splines at even steps, N. The splines of a
+    domain have repeated knots at its ends; those of the file are all alike. Both span the same functions. Shapes:
+    coefficients (n_splines,) → (n_first,).
+    """
+    table = coefficients.reshape(domain.counts)
+    for axis, count in enumerate(domain.counts):
+        at = np.linspace(0.0, 1.0, CHECKS_PER_SPLINE * count)
+        conversion = np.linalg.lstsq(_even_splines(at, count), uniform_splines(at, count), rcond=None)[0]
+        table = np.moveaxis(np.tensordot(conversion, table, axes=(1, axis)), 0, axis)
+    return np.asarray(table)
+
+
+def _even_splines(at: Floats, count: int) -> Floats:
+    d = np.abs((count - 3) * at[:, None] + 1.0 - np.arange(count))
+    return np.asarray((np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0)
+
+
+def _axis_code(domain: Domain, k: int) -> list[str]:
+    """Lines of code that find the interval of the table in which a state lies, and the four nonzero splines there."""
+    low, high, log_scale, steps = domain.low[k], domain.high[k], domain.log_scale[k], domain.counts[k] - 3
+    at, step, weight = "uv"[k], "ij"[k], "fg"[k]
+    state = f"s.{_STATE[domain.variables[k]]}"
+    from_low = f"({state} - {_code_number(low)})" if low else state
+    position = f"np.minimum(np.maximum({from_low} / {_code_number(high - low)}, 0.0), 1.0)"
+    if math.isfinite(log_scale):
+        ratio = (high - low) / log_scale
+        position = f"np.log1p({_code_number(ratio)} * {position}) / {_code_number(math.log1p(ratio))}"
+    return [
+        f"{at} = {steps}.0 * {position}",
+        f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",
+        f"{at} = {at} - {step}",
+        f"{weight}0, {weight}3 = (1.0 - {at}) ** 3 / 6.0, {at}**3 / 6.0",
+        f"{weight}1 = (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0",
+        f"{weight}2 = 1.0 - {weight}0 - {weight}1 - {weight}3",
+    ]
+
+
+def _code_number(value: float) -> str:
+    return repr(float(f"{value:.12g}"))
+
+
+def _table_lines(table: Floats) -> list[str]:
+    """The table as lines of code: a tuple of numbers, or a tuple of rows."""
+    if table.ndim == 1:
+        numbers = ", ".join(f"{value:.{TABLE_DIGITS}g}" for value in table.tolist())
+        return [
+            "TABLE = np.array((  # N",
+            *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
+            "))",
+        ]
+    rows = [f"    ({', '.join(f'{value:.{TABLE_DIGITS}g}' for value in row)})," for row in table.tolist()]
+    return ["TABLE = np.array((  # N", *rows, "))"]
+
+
+def _worked_example(learned: LearnedForce) -> tuple[dict[str, float], float]:
+    """The visited state at which the force is largest, as arguments of an effect, and the force there, N."""
+    visited = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
+    largest = int(np.argmax(np.abs(visited["force_N"].to_numpy(float))))
+    at = {name: float(f"{visited[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
+    force_N, _ = learned.best.force([np.array([value]) for value in at.values()])
+    return {_STATE[name]: value for name, value in at.items()}, float(force_N[0])
+
+
+# ------------------------------------------------------------------------------
+# The learned force fitted as an effect, where no formula reproduces it.
+
+LEAST_SIGMAS = 6.0  # Standard deviations by which a law must improve the fit to be proposed
+
+# Part of the misfit that a law must take away for the learned force not to be tried as a table (chosen)
+LAW_REPRODUCES = 0.9
+
+
+@dataclass(frozen=True)
+class ProposedTable:
+    """A learned force that was fitted as an effect; `rms_left_out_m` is with the table learned from all trials."""
+
+    learned: LearnedForce
+    effect: Effect
+    ratio: LikelihoodRatio
+    rms_left_out_m: float
+
+    def sentences(self, before: Fit) -> list[str]:
+        """How much of the misfit the table explains."""
+        after = self.ratio.fit
+        return [
+            f"No formula in the list reproduces the learned force. As a table ({self.effect.name}) it reduces χ² per"
+            f" point from {before.chi2_per_dof:.1f} to {after.chi2_per_dof:.1f}; the error on left-out conditions, with"
+            f" the table itself learned from all trials, is {1e3 * self.rms_left_out_m:.2f} mm."
+        ]
+
+
+def proposed_table(
+    model: Model, before: Fit, laws: Sequence[Fit], report: Callable[[str], None]
+) -> ProposedTable | None:
+    """Estimate the missing force as a smooth function and fit it as a table."""
+    misfit = before.chi2_per_dof - 1
+    remaining = min((fit.chi2_per_dof for fit in laws), default=before.chi2_per_dof) - 1
+    if misfit < LEAST_CHI2_PER_POINT - 1 or remaining < (1 - LAW_REPRODUCES) * misfit:
+        return None
+    report("estimating the missing force as a table")
+    learned = learn_missing_force(before)
+    if learned is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{table_name(learned)}.py"
+        path.write_text(table_text(learned), encoding="utf-8")
+        remember(path)
+        effect = load_effect(path)
+        try:
+            start, after = both_fits(with_host(before, Model((*model, effect))), effect, report)
+        except FitError:
+            return None
+        ratio = likelihood_ratio(start, (effect,), after)
+        better = all(2 * (after.log_likelihood - fit.log_likelihood) > ANSWER_SET_DELTA_CHI2 for fit in laws)
+        explains = start.chi2_per_dof - after.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit
+        if not (better and explains and ratio.sigma > LEAST_SIGMAS):
+            return None
+        report("errors with the table")
+        return ProposedTable(learned, effect, ratio, left_out(after).rms_m)
+
 
 MAX_LAWS_FITTED = 4  # Most laws that are fitted in the equation of motion (chosen)
 

@@ -14,11 +14,316 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.core.records import Floats
-from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.left_out import FEWEST_AT_REST, scaled_least_squares
-from vinetrack.tracks.outliers import FEWEST_POINTS, local_fit
-from vinetrack.tracks.position_noise import rest_points, rough_noise
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Parameter
+from vinetrack.inference.fit import FEWEST_AT_REST, aligned_to_trials, rest_is_seen, scaled_least_squares
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.parameters import DAMPING
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.tracks.position_noise import FEWEST_POINTS, local_fit, rest_points, rough_noise
+
+# ------------------------------------------------------------------------------
+# Best-fit value of one parameter for each trial, with all other parameters at their common values.
+
+NEWTON_STEPS = 5  # Gauss–Newton steps (chosen)
+
+LARGEST_STEP = 0.3  # Largest step of ln B, or of a parameter in units of its scale (chosen)
+
+MAX_DEVIATION_SCALES = 3.0  # Largest deviation from the common value, in scales (chosen)
+
+TYPICAL_SCATTER = (0.01, 0.03)  # Typical standard deviations of pressure and ln B between trials (chosen)
+
+
+@dataclass(frozen=True)
+class PerTrialEstimates:
+    """Estimates of one parameter by trial; arrays of shape (n_trials,), SI, NaN where a trial does not depend on it.
+    `value` is the best fit of the trial, `base` the common value, and `deviation` their difference, of logarithms where
+    `logarithmic`. `variance` is the variance of `value` from a typical scatter of pressure and B, up to a factor.
+    """
+
+    key: str
+    symbol: str
+    unit: str
+    per_vine: bool
+    logarithmic: bool
+    trials: tuple[Trial, ...]
+    value: Floats
+    base: Floats
+    deviation: Floats
+    variance: Floats
+    trial_effects: Floats
+
+
+@dataclass(frozen=True)
+class AlignedTrials:
+    """A fitted model aligned with its trials: each has its own release and origin, but no deviation of pressure or B.
+    `columns` are the sensitivities there, see `vinetrack.inference.sensitivity`.
+    """
+
+    predictor: Predictor
+    trial_effects: Floats
+    columns: tuple[Floats, ...]
+
+
+def align_trials(fit: Fit) -> AlignedTrials:
+    """Align the model with the trials that it was fitted to, by release and origin."""
+    predictor, trial_effects, _ = aligned_to_trials(fit, fit.predictor.data, from_rest=True)
+    try:
+        return AlignedTrials(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated: {error}") from error
+
+
+def per_trial_estimates(fit: Fit, key: str, aligned: AlignedTrials) -> PerTrialEstimates:
+    """Fit the value of `key` to each trial by least squares of position, with its release free."""
+    predictor, trial_effects = aligned.predictor, aligned.trial_effects
+    parameter = _parameter(fit, key)
+    column = fit.model.parameter_names.index(key)
+    base = predictor.layout.base[:, column].copy()
+    logarithmic = key == DAMPING
+    scale = np.ones_like(base) if logarithmic else np.full_like(base, _scale(parameter, base))
+    scaled = np.zeros_like(base)
+    projected = [np.zeros(0)] * base.size
+    for _ in range(NEWTON_STEPS):
+        scaled, trial_effects, projected = _gauss_newton_step(
+            predictor, trial_effects, column, base, scaled, scale, logarithmic
+        )
+    response = np.array([float(np.sum(sensitivity**2)) for sensitivity in projected])
+    known = response > 1e-12 * np.array(
+        [np.ptp(trial_data.lead_position_m) ** 2 * trial_data.time_s.size for trial_data in predictor.data]
+    )
+    known &= np.abs(scaled) < 0.99 * MAX_DEVIATION_SCALES
+    deviation = np.where(known, scaled * scale, np.nan)
+    return PerTrialEstimates(
+        key=key,
+        symbol=parameter.symbol,
+        unit=parameter.unit,
+        per_vine=any(number.key == key and number.vine for number in fit.numbers),
+        logarithmic=logarithmic,
+        trials=tuple(trial_data.trial for trial_data in predictor.data),
+        value=np.where(known, base * np.exp(scaled) if logarithmic else base + scaled * scale, np.nan),
+        base=base,
+        deviation=deviation,
+        variance=_variance(aligned, projected, scale),
+        trial_effects=_with_deviation(trial_effects, scaled) if logarithmic else trial_effects,
+    )
+
+
+def _with_deviation(trial_effects: Floats, deviation: Floats) -> Floats:
+    changed = trial_effects.copy()
+    changed[:, DAMPING_DEVIATION] = deviation
+    return changed
+
+
+def _parameter(fit: Fit, key: str) -> Parameter:
+    for effect in fit.model:
+        for parameter in effect.parameters:
+            if f"{effect.name}.{parameter.name}" == key:
+                return parameter
+    raise KeyError(key)
+
+
+def _scale(parameter: Parameter, base: Floats) -> float:
+    low, high = parameter.plausible or (0.0, 0.0)
+    return max(float(np.max(np.abs(base - parameter.zero))), 0.1 * (high - low), 1e-12)
+
+
+def _gauss_newton_step(
+    predictor: Predictor,
+    trial_effects: Floats,
+    column: int,
+    base: Floats,
+    scaled: Floats,
+    scale: Floats,
+    logarithmic: bool,
+) -> tuple[Floats, Floats, list[Floats]]:
+    """One Gauss–Newton step for every trial: scaled deviation, trial effects, and the projected sensitivities. The
+    sensitivities of position to the parameter are projected off those to release and origin.
+    """
+    step = 1e-3
+    plain = predictor.jobs(np.empty(0), trial_effects)
+
+    def at(shift: float) -> list[Floats]:
+        rows = []
+        for i, job in enumerate(plain):
+            row = job.row.copy()
+            deviation = scaled[i] + shift
+            row[column] = base[i] * np.exp(deviation) if logarithmic else base[i] + deviation * scale[i]
+            rows.append(row)
+        return rows
+
+    jobs = [job._replace(row=row) for shift in (0.0, step) for job, row in zip(plain, at(shift), strict=True)]
+    runs = predictor.run(jobs)
+    trial_effects, scaled, projected = trial_effects.copy(), scaled.copy(), []
+    origin_fixed = rest_is_seen(predictor.data)
+    for i, trial_data in enumerate(predictor.data):
+        here, stepped = runs[i], runs[i + base.size]
+        sensitivity = (stepped.observed_position_m - here.observed_position_m) / step
+        others = [-here.lead_velocity_m_s] if origin_fixed[i] else [-here.lead_velocity_m_s, np.ones(sensitivity.size)]
+        residual = trial_data.lead_position_m - trial_effects[i, ORIGIN] - here.observed_position_m
+        design = np.column_stack([sensitivity, *others])
+        best = np.linalg.lstsq(design, residual, rcond=1e-9)[0]
+        scaled[i] = np.clip(
+            scaled[i] + np.clip(best[0], -LARGEST_STEP, LARGEST_STEP), -MAX_DEVIATION_SCALES, MAX_DEVIATION_SCALES
+        )
+        trial_effects[i, RELEASE] += np.clip(best[1], -2 * trial_data.frame_s, 2 * trial_data.frame_s)
+        trial_effects[i, ORIGIN] += 0.0 if origin_fixed[i] else best[2]
+        projected.append(orthogonal_part(sensitivity, np.column_stack(others)))
+    return scaled, trial_effects, projected
+
+
+def orthogonal_part(column: Floats, others: Floats) -> Floats:
+    """Component of a column that is orthogonal to all linear combinations of others. Shapes: column (n_points,); others
+    (n_points, n) → (n_points,).
+    """
+    return np.asarray(column - others @ np.linalg.lstsq(others, column, rcond=1e-9)[0])
+
+
+def _variance(aligned: AlignedTrials, projected: list[Floats], scale: Floats) -> Floats:
+    """Variance of each trial's value from a typical scatter of pressure and B, and from its noise."""
+    origin_fixed = rest_is_seen(aligned.predictor.data)
+    variance = np.empty(scale.size)
+    for i, (c, sensitivity) in enumerate(zip(aligned.columns, projected, strict=True)):
+        square = max(float(np.sum(sensitivity**2)), 1e-300)
+        others = c[:, [RELEASE]] if origin_fixed[i] else c[:, [RELEASE, ORIGIN]]
+        levers = [float(sensitivity @ orthogonal_part(c[:, k], others)) / square for k in (PRESSURE, DAMPING_DEVIATION)]
+        scatter = sum((sd * lever) ** 2 for sd, lever in zip(TYPICAL_SCATTER, levers, strict=True))
+        noise = aligned.predictor.data[i].mean_noise_m ** 2 / square
+        variance[i] = (scatter + noise + 1e-12) * scale[i] ** 2
+    return variance
+
+
+# ------------------------------------------------------------------------------
+# Between-trial scatter from replicates alone, and the standard error of a condition's mean residual that follows.
+#
+# Residuals of one trial are correlated from frame to frame: a trial with 3 % more B is late everywhere. Frames are
+# therefore not counted as independent. Every trial is cut into a few stretches, and the covariance of the stretch means
+# between replicates has three parameters for all conditions: the scatter of pressure and of B, propagated by the
+# sensitivities of the trajectories, and a residual scatter that is independent between stretches. They are estimated
+# from
+# differences between replicates alone, so that a model that fails does not inflate them.
+
+START_VALUES = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
+
+LOWER_BOUNDS, UPPER_BOUNDS = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)  # Bounds of the search (chosen)
+
+# Lower limits of the standard deviations of pressure and B where both are needed (chosen)
+LEAST_BETWEEN_TRIAL_SD = (0.005, 0.015)
+
+POSITION_FLOOR_M = 1e-6  # Lower limit of the error of a stretch mean, m (chosen)
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """Stretches of the motion that all replicates of a condition cover. `means_m`, shape (n_trials, n), are the mean
+    residuals; `sensitivities`, shape (n, 2), their derivatives by pressure and ln B; `noise_m2`, shape (n, n), their
+    covariance from the noise of the tracks alone.
+    """
+
+    means_m: Floats
+    sensitivities: Floats
+    noise_m2: Floats
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Between-trial standard deviations of pressure (relative) and ln B, and of a residual, relative to their effect.
+    `dof` counts replicates beyond the first of each condition. Where it is 0, the standard deviations of pressure and B
+    are those of the fit.
+    """
+
+    pressure: float
+    damping: float
+    residual: float
+    dof: int
+
+    @property
+    def variances(self) -> Floats:
+        """Squares of the three, shape (3,)."""
+        return np.array([self.pressure, self.damping, self.residual]) ** 2
+
+
+def scatter_sensitivities(aligned: AlignedTrials) -> list[Floats]:
+    """Sensitivities of positions to pressure and ln B, orthogonal to those to release and origin, of every trial. Where
+    growth has ended in the model they would be zero, but the vine may still grow: the last values are kept. Shape
+    (n_points, 2).
+    """
+    origin_fixed = rest_is_seen(aligned.predictor.data)
+    sensitivities = []
+    for i, columns in enumerate(aligned.columns):
+        moving = np.flatnonzero(columns[:, RELEASE] != 0)
+        extended = columns.copy()
+        if moving.size:
+            extended[moving[-1] + 1 :, [RELEASE, PRESSURE, DAMPING_DEVIATION]] = columns[
+                moving[-1], [RELEASE, PRESSURE, DAMPING_DEVIATION]
+            ]
+        others = extended[:, [RELEASE]] if origin_fixed[i] else extended[:, [RELEASE, ORIGIN]]
+        sensitivities.append(
+            np.column_stack([orthogonal_part(extended[:, k], others) for k in (PRESSURE, DAMPING_DEVIATION)])
+        )
+    return sensitivities
+
+
+def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
+    """Maximum-likelihood estimate of the between-trial scatter from the differences between replicates."""
+    from scipy.optimize import minimize
+
+    dof = sum(len(group.means_m) - 1 for group in groups)
+    if dof < 1:
+        spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]
+        return Scatter(spreads[0], spreads[1], START_VALUES[2], 0)
+    parts = []
+    for group in groups:
+        if len(group.means_m) > 1:
+            deviations = group.means_m - group.means_m.mean(axis=0)
+            parts.append((len(deviations) - 1, deviations.T @ deviations, group))
+
+    def minus_two_log_likelihood(logs: Floats) -> float:
+        variances = np.exp(2 * np.clip(logs, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS)))
+        total = 0.0
+        for count, square, group in parts:
+            covariance = _covariance(group, variances)
+            total += count * float(np.linalg.slogdet(covariance)[1])
+            total += float(np.trace(np.linalg.solve(covariance, square)))
+        return total
+
+    best = minimize(
+        minus_two_log_likelihood, np.log(START_VALUES), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01}
+    )
+    pressure, damping, residual = np.exp(np.clip(best.x, np.log(LOWER_BOUNDS), np.log(UPPER_BOUNDS))).tolist()
+    return Scatter(pressure, damping, residual, dof)
+
+
+def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
+    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m². Shape (n_stretches,
+    n_stretches).
+    """
+    return _covariance(group, scatter.variances)
+
+
+def _covariance(group: Stretches, variances: Floats) -> Floats:
+    shared = (group.sensitivities * variances[:2]) @ group.sensitivities.T
+    residual = variances[2] * float(np.trace(shared)) / len(shared)
+    return np.asarray(shared + group.noise_m2 + (residual + POSITION_FLOOR_M**2) * np.eye(len(shared)))
+
+
+def replicate_z(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
+    """Test whether between-trial scatter explains stretch means as large as observed; the p-value as a normal deviate.
+    The test statistic is the mean square of the means in units of their standard errors, with the effective degrees of
+    freedom of Satterthwaite's approximation, because stretches are correlated. Shapes: mean (n_stretches,); covariance
+    (n_stretches, n_stretches).
+    """
+    from scipy.stats import chi2, norm
+    from scipy.stats import f as fisher
+
+    sigma = np.sqrt(np.diag(covariance))
+    degrees = mean.size**2 / float(np.sum((covariance / sigma[:, None] / sigma) ** 2))
+    square = trials * float(np.mean((mean / sigma) ** 2))
+    p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
+    return float(norm.isf(max(p, 1e-300)))
+
 
 # Smallest scaled singular value with which a shift in time and one in position are both fitted (chosen)
 MIN_SINGULAR_VALUE = 0.05

@@ -1,7 +1,7 @@
 """Score tests (Rao 1948): what each candidate would explain of the residuals, by linear algebra, without a refit.
 
 About a fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
-the sensitivities to the candidates' sizes a (`vinetrack.diagnosis.effect_sensitivities`). The random effects u_i of
+the sensitivities to the candidates' sizes a (`vinetrack.diagnosis.candidates`). The random effects u_i of
 each trial, release, origin and the deviations of pressure and B, are integrated out, and the free parameters θ are
 projected off. Each candidate then has a score, an information, and a cosine with every other.
 
@@ -13,28 +13,151 @@ many independent trials whatever the noise within a trial is like.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.shape_products import Products, products_without_trial_effects
+from vinetrack.diagnosis.candidates import EffectSensitivities
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     LEAST_BETWEEN_TRIAL_SD,
     FitState,
+    MixedProblem,
     inverse_of_block,
     solve_per_trial,
     sum_matrix_blocks,
     sum_vector_blocks,
+    trial_effects_eliminated,
 )
 from vinetrack.inference.mixed_effects import trial_deviation_sd as between_trial_sd
 from vinetrack.inference.position_errors import with_shapes
-from vinetrack.inference.robust_covariance import cluster_variance
+from vinetrack.inference.robust_covariance import Systematics, cluster_variance
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
-from vinetrack.inference.whitening import at_correlation
+from vinetrack.inference.whitening import all_products, at_correlation
+
+# ------------------------------------------------------------------------------
+# Columns of a fit, of candidates and of systematic errors, and their cross products by trial.
+#
+# In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic errors.
+
+TRIALS_AT_ONCE = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
+
+
+@dataclass(frozen=True)
+class Products:
+    """Columns of a fit, of candidate shapes and of systematic errors, shape (n_points, n_columns) a trial. In this
+    order: trial effects, keys, residual, shapes, systematic errors.
+    """
+
+    columns: tuple[Floats, ...]
+    data: Sequence[FitTrial]
+    n_keys: int
+    n_shapes: int
+    places: NDArray[np.int_]
+    n_systematics: int = 0
+
+    @property
+    def n_tested(self) -> int:
+        """Number of shapes and systematic errors of the campaign."""
+        return self.n_shapes + self.n_systematics
+
+    @property
+    def tested_indices(self) -> NDArray[np.int_]:
+        """Indices of each trial's shapes and systematic errors among all, shape (n_trials, n_shapes + n_affecting).
+        `n_tested` for a systematic error that does not affect a trial.
+        """
+        shapes = np.tile(np.arange(self.n_shapes), (len(self.columns), 1))
+        return np.concatenate([shapes, self.n_shapes + self.places], axis=1)
+
+    @cached_property
+    def parts(self) -> list[slice]:
+        """Slices of the trials whose cross products are held at once."""
+        return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
+
+    def cross_products(self, part: slice) -> Floats:
+        """Cross products of a part of the trials, see `whitening`. They are cached where there is only one part; those
+        of several would be three times as large as the columns. Shape (n_trials, 3, n_columns, n_columns).
+        """
+        return self._all_cross_products if len(self.parts) == 1 else self._cross_products_of(part)
+
+    def of(self, places: Sequence[int]) -> Products:
+        """The same for some of the trials, which may be repeated."""
+        columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
+        return replace(self, columns=columns, data=data, places=self.places[list(places)])
+
+    @cached_property
+    def _all_cross_products(self) -> Floats:
+        return self._cross_products_of(self.parts[0])
+
+    def _cross_products_of(self, part: slice) -> Floats:
+        data = self.data[part]
+        first = [trial_data.first for trial_data in data]
+        relative = [trial_data.relative_sd for trial_data in data]
+        return all_products(self.columns[part], first, relative)
+
+
+def fit_columns(fit: Fit) -> list[Floats]:
+    """Columns of a fit's trial effects, parameters and residual, with the same derivatives as those of the candidates.
+    Shape (n_points, 4 + n_keys + 1).
+    """
+    state = fit.solution.state
+    try:
+        return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
+    except SimulationError:
+        # A vine that sticks may fail to simulate with another finite-difference step: use the last columns of the fit.
+        return list(fit.solution.columns)
+
+
+def products_of(
+    fit: Fit, columns: Sequence[Floats], sensitivities: EffectSensitivities, systematics: Systematics
+) -> Products:
+    """Assemble the columns of a fit, of the candidates and of the systematic errors. Afterwards the columns of
+    `sensitivities` are views of those made here, so that no trial's are held twice.
+    """
+    keys, shapes = columns[0].shape[1] - N_TRIAL_EFFECTS - 1, len(sensitivities.shapes)
+    of_shapes = slice(N_TRIAL_EFFECTS + keys + 1, N_TRIAL_EFFECTS + keys + 1 + shapes)
+    assembled: list[Floats] = []
+    for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
+        assembled.append(np.column_stack([of_fit, sensitivities.columns[i], systematic]))
+        sensitivities.columns[i] = assembled[-1][:, of_shapes]
+    return Products(tuple(assembled), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
+
+
+def products_without_trial_effects(fit: Fit, products: Products, state: FitState) -> Floats:
+    """Cross products of keys, residual, shapes and systematic errors of every trial, its trial effects integrated out.
+    Shape (n_trials, n_keys + 1 + n_shapes + n_affecting, the same again).
+    """
+    size = products.columns[0].shape[1] - N_TRIAL_EFFECTS
+    blocks = np.empty((len(products.columns), size, size))
+    for part in products.parts:
+        of_part = _of_trials(fit.solution.problem, state, part)
+        blocks[part] = trial_effects_eliminated(products.cross_products(part), products.n_keys, *of_part)
+    return blocks
+
+
+def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
+    """Problem and state restricted to a part of the trials."""
+    arrays = (
+        "index",
+        "has_deviation",
+        "gauge_error",
+        "release_origin_mean",
+        "release_origin_precision",
+        "points",
+        "stretches",
+    )
+    return (
+        replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
+        replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),
+    )
+
 
 # Share of its information below which what remains of a shape is rounding, because other columns reproduce it exactly
 # (derived)
@@ -308,3 +431,140 @@ def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> 
     gradient = sum_vector_blocks(blocks[:, :p, p], problem) - problem.prior_precision * deviation
     total = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * deviation**2))
     return max(float(total - projection.step @ gradient), 1e-9 * float(total))
+
+
+# ------------------------------------------------------------------------------
+# Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
+#
+# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
+# for all scores the first would take most of the false alarms and raise the threshold of the second. The largest score
+# of
+# each candidate is therefore converted to a p-value of its own, and the family is tested by the smallest (min-p;
+# Westfall
+# & Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold that it alone exceeds with
+# probability q, and q is such that any candidate exceeds its own with probability `level`.
+#
+# The probability that any of many correlated normal scores exceeds its threshold is found by importance sampling
+# (Adler,
+# Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail probability
+# and drawn beyond its threshold, and the others are drawn conditionally on it.
+
+DRAWS, SEED = 2000, 20  # Draws of the scores, and the seed (measured)
+
+NODES = 6  # Thresholds at which a candidate's exceedance probability p is computed (chosen)
+
+HALVINGS = 30  # Bisection steps for ln q (derived)
+
+
+@dataclass(frozen=True)
+class FamilyTest:
+    """Thresholds of all candidates, in standard deviations of a score. `candidate_level` is the probability with which
+    each candidate alone exceeds its threshold; `thresholds` are by name of effect.
+    """
+
+    level: float
+    candidate_level: float
+    thresholds: Mapping[str, float]
+
+    def threshold(self, name: str) -> float:
+        """Threshold of a candidate; of one without shapes, that of a single two-sided score."""
+        return self.thresholds.get(name, self.single_shape_threshold)
+
+    @property
+    def single_shape_threshold(self) -> float:
+        """Threshold of a candidate with one shape and a size of either sign (two-sided)."""
+        return -float(ndtri(self.candidate_level / 2))
+
+
+class _Scores:
+    """Correlated normal scores, one-sided or two-sided, and the probability that any exceeds its threshold."""
+
+    def __init__(self, cosines: Floats, signs: Sequence[int]) -> None:
+        self.informative = np.diag(cosines) > 0
+        self.cosines, self.signs = cosines, np.array(signs)
+        values, vectors = np.linalg.eigh(cosines)
+        draw = np.random.default_rng(SEED)
+        self.normal = draw.standard_normal((DRAWS, len(signs))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        self.tail_uniform, self.random_sign = draw.random(DRAWS), draw.choice([-1.0, 1.0], DRAWS)
+        self.choice_uniform = (np.arange(DRAWS) + 0.5) / DRAWS
+        self.choice_uniform = draw.permutation(self.choice_uniform)
+
+    def exceedance(self, indices: NDArray[np.intp], thresholds: Floats) -> float:
+        """Probability that any of these scores exceeds its threshold."""
+        signs = self.signs[indices]
+        tails = ndtr(-thresholds)
+        weights = np.where(signs == 0, 2.0, 1.0) * tails
+        total = float(weights.sum())
+        if len(indices) == 1 or total == 0:
+            return total
+        chosen = np.minimum(np.searchsorted(np.cumsum(weights) / total, self.choice_uniform), len(indices) - 1)
+        side = np.where(signs[chosen] == 0, self.random_sign, signs[chosen])
+        scores = self.normal[:, indices]
+        beyond = -ndtri(self.tail_uniform * tails[chosen]) * side
+        shift = beyond - scores[np.arange(DRAWS), chosen]
+        # The other scores move with the chosen one by their correlation with it.
+        scores = scores + self.cosines[np.ix_(indices, indices)][chosen] * shift[:, None]
+        exceed = np.where(signs == 0, np.abs(scores), scores * signs) > thresholds
+        return total * float(np.mean(1.0 / np.maximum(exceed.sum(axis=1), 1)))
+
+
+def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], level: float) -> FamilyTest:
+    """Compute the threshold of every candidate. Shapes: cosines (n_shapes, n_shapes)."""
+    if not effects:
+        return FamilyTest(level, level, {})
+    scores = _Scores(cosines, signs)
+    names = np.array(effects)
+    shapes = {name: np.flatnonzero((names == name) & scores.informative) for name in dict.fromkeys(effects)}
+    shapes = {name: indices for name, indices in shapes.items() if indices.size}
+    if not shapes:
+        return FamilyTest(level, level, {})
+    tables = {name: _exceedance_table(scores, indices, level, len(shapes)) for name, indices in shapes.items()}
+    all_shapes = np.concatenate(list(shapes.values()))
+
+    def thresholds(log_q: float) -> dict[str, float]:
+        squares = {name: float(np.interp(-log_q, -logs, nodes)) for name, (nodes, logs) in tables.items()}
+        return {name: math.sqrt(square) for name, square in squares.items()}
+
+    low, high = math.log(level / len(shapes)), math.log(level)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        by_name = thresholds(middle)
+        by_shape = np.concatenate([np.full(indices.size, by_name[name]) for name, indices in shapes.items()])
+        low, high = (middle, high) if scores.exceedance(all_shapes, by_shape) < level else (low, middle)
+    return FamilyTest(level, math.exp(low), thresholds(low))
+
+
+def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
+    """Family-wise p-value of the most significant candidate. Returns 1 where there is no candidate. Shapes: observed
+    (n_shapes,).
+    """
+    scores = _Scores(cosines, signs) if effects else None
+    if scores is None or not scores.informative.any():
+        return 1.0
+    names = np.array(effects)
+    shapes = [
+        indices
+        for name in dict.fromkeys(effects)
+        if (indices := np.flatnonzero((names == name) & scores.informative)).size
+    ]
+    p_values = [
+        scores.exceedance(indices, np.full(indices.size, max(float(observed[indices].max()), 0.0)))
+        for indices in shapes
+    ]
+    smallest = min(p_values)
+    thresholds = []
+    for indices in shapes:
+        nodes, logs = _exceedance_table(scores, indices, smallest, len(shapes))
+        thresholds.append(math.sqrt(float(np.interp(-math.log(max(smallest, 1e-300)), -logs, nodes))))
+    by_shape = np.concatenate([np.full(k.size, threshold) for k, threshold in zip(shapes, thresholds, strict=True)])
+    return min(scores.exceedance(np.concatenate(shapes), by_shape), 1.0)
+
+
+def _exceedance_table(
+    scores: _Scores, indices: NDArray[np.intp], level: float, candidates: int
+) -> tuple[Floats, Floats]:
+    """Squares of thresholds of a candidate, increasing, and ln of the probability that it exceeds each."""
+    n_tests = 2.0 * len(indices) * candidates
+    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / n_tests)), NODES)
+    probabilities = [scores.exceedance(indices, np.full(indices.size, node)) for node in nodes]
+    return nodes**2, np.log(np.maximum(probabilities, 1e-300))

@@ -8,37 +8,213 @@ is added: first single effects are tried, then sets of two to five. If no set pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-from vinetrack.diagnosis.adequate_hypotheses import MISFIT_REMAINS, adequate_hypotheses, has_credible_sizes
+import numpy as np
+
 from vinetrack.diagnosis.between_trials import between_fits, differences, significant
-from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
-from vinetrack.diagnosis.confounded_sizes import confounders_of
-from vinetrack.diagnosis.confounder import Confounder
-from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
-from vinetrack.diagnosis.effect_sets import MAX_EFFECTS, MIN_LOG_LIKELIHOOD_GAIN, EffectSets
-from vinetrack.diagnosis.initial_fit import with_host
-from vinetrack.diagnosis.likelihood_ratio import (
-    ANSWER_SET_DELTA_CHI2,
-    LikelihoodRatio,
-    best_of,
-    likelihood_ratio,
+from vinetrack.diagnosis.candidate_fits import (
+    CandidateFits,
+    Report,
+    SubsetFitter,
+    best_subset_fit,
+    exponent_starts,
+    full_fit,
+    restart_exponents,
+    restart_without,
 )
+from vinetrack.diagnosis.drift import drift
+from vinetrack.diagnosis.effect_sets import (
+    MAX_EFFECTS,
+    MIN_LOG_LIKELIHOOD_GAIN,
+    MISFIT_REMAINS,
+    EffectSets,
+    adequate_hypotheses,
+    confounders_of,
+    has_credible_sizes,
+)
+from vinetrack.diagnosis.ladder import left_out, with_host
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, LikelihoodRatio, best_of, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
     FAR_OFF_CHI2_PER_DOF,
     SEARCH_SIGMAS,
     MisfitTests,
+    has_excess_scatter,
     misfit_tests,
 )
-from vinetrack.diagnosis.multi_start import restart_exponents, restart_without
-from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED
-from vinetrack.diagnosis.slack_hypothesis import slack_fit
-from vinetrack.diagnosis.trial_effect_tests import has_excess_scatter
-from vinetrack.effects import Effect
-from vinetrack.inference.fit_result import Fit
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
+from vinetrack.dynamics.audit import evaluate
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect, EffectError
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.sensitivity import Predictor
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# ------------------------------------------------------------------------------
+# Results of a diagnosis that contradict its verdict: errors on left-out conditions, and drifting parameters.
+#
+# The verdict rests on likelihoods. Two results are independent of it: how well left-out conditions are predicted, and
+# whether the best parameter values of single trials are the same under every condition. Where they disagree with the
+# verdict, notes report it.
+
+CONTRADICTING_DRIFT_SIGMAS = 4.0  # Significance of a drift from which it contradicts an adequate model (chosen)
+
+
+def displacement_m(before: Fit, after: Fit) -> float:
+    """Root mean square displacement of the predicted positions by an added effect. Returns over trials, of the largest
+    difference of predicted positions, each fit with its own release and origin, m.
+    """
+    moved = [
+        float(np.max(np.abs(trial.predicted_position_m - later.predicted_position_m)))
+        for trial, later in zip(before.trials, after.trials, strict=True)
+    ]
+    return float(np.sqrt(np.mean(np.square(moved))))
+
+
+def is_within_position_errors(before: Fit, after: Fit) -> bool:
+    """Whether an effect moves positions by less than their systematic error and does not improve left-out predictions.
+    Such a gain in likelihood may be lens distortion. The left-out error is computed only for so small a displacement.
+    """
+    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in before.predictor.data]))
+    if not displacement_m(before, after) < systematic_m:
+        return False
+    try:
+        without_m, with_m = left_out(before).rms_m, left_out(after).rms_m
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return False
+    return math.isfinite(without_m + with_m) and with_m >= without_m
+
+
+def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[str, ...]:
+    """List the results that contradict the final model of a diagnosis where the verdict calls it adequate. Returns
+    sentences; empty where nothing contradicts the verdict.
+    """
+    return (*_not_better(added, ladder), *_still_drifts(fits[-1]))
+
+
+def _not_better(added: Sequence[str], ladder: pd.DataFrame | None) -> Iterator[str]:
+    if ladder is None:
+        return
+    errors_m = [float(value) for value in ladder["rms_left_out_m"]]
+    for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False):
+        if math.isfinite(without_m + with_m) and with_m >= without_m:
+            yield (
+                f"The error on left-out conditions does not fall with {name}: {without_m * 1e3:.2f} mm without "
+                f"it, {with_m * 1e3:.2f} mm with it. The data support {name} by the shape of the motion alone."
+            )
+
+
+def _still_drifts(fit: Fit) -> Iterator[str]:
+    try:
+        result = drift(fit)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return
+    table = result.table
+    sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > CONTRADICTING_DRIFT_SIGMAS)]
+    model = " + ".join(fit.model.names)
+    yield from (f"With {model}: {line}" for line in sure.drop_duplicates(["parameter", "against"])["sentence"])
+
+
+# ------------------------------------------------------------------------------
+# The rule that a tail cannot push, as a hypothesis: the same model with `tail_slack: free`.
+#
+# Eq. (2) holds while the tail's tension T₁ = ½(P − P_y)A − ½Bẋⁿ − … is positive. It becomes negative where a payload
+# falls faster than the tip everts: the real tail goes slack there, but the model predicts that it pushes. The rule has
+# no
+# parameter, so that any rise of the likelihood is due to it alone.
+
+# Stands for the rule in answer sets
+TAIL_SLACK = Effect(
+    name="tail_slack",
+    kind="physical",
+    summary="Tail slack: a tail cannot push.",
+    text="Tail slack: a tail cannot push.\n\n    tension ≥ 0\n\nReduce it with a lighter payload or a higher pressure.",
+    parameters=(),
+    functions=MappingProxyType({}),
+    needs=(),
+    easily_taken_for=(),
+    worked=(),
+    path=Path(__file__).resolve(),
+)
+
+# Compression of the tail, as a fraction of the drive ½PA, from which the rule is tried (chosen)
+MIN_PUSH_FRACTION = 0.02
+
+# Rise of −2 ln L per point, on one trial of every condition, from which the rule is refuted without a full fit where
+# trials scatter much (derived)
+REFUTED_DEVIANCE_PER_POINT = 1.0
+
+
+def pushes(fit: Fit) -> bool:
+    """Whether the fitted model predicts compression in the tail of any trial that is not allowed to go slack."""
+    return any(_pushes(fit, trial) for trial in fit.trials)
+
+
+def _pushes(fit: Fit, trial: TrialFit) -> bool:
+    if trial.trial.tail_slack == "free" or trial.trial.travel_ratio == 1:
+        return False
+    moving = trial.time_s > trial.release_s
+    if not moving.any():
+        return False
+    since_s = trial.time_s[moving] - trial.release_s
+    trace = next(trial_data.trace for trial_data in fit.predictor.data if trial_data.trial is trial.trial)
+    measured_Pa = None if trace is None else np.interp(trial.time_s[moving], *trace)
+    position_m = trial.predicted_position_m[moving] - trial.origin_m
+    velocity_m_s = trial.predicted_velocity_m_s[moving]
+    fitted_trial = replace(trial.trial, pressure_Pa=trial.trial.pressure_Pa * (1 + trial.pressure_deviation))
+    try:
+        terms = evaluate(fit.model, fitted_trial, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
+    except EffectError:
+        return False
+    ratio = trial.trial.travel_ratio
+    damping_N = terms.tip_N.get("eversion_damping", np.zeros_like(since_s))
+    tension_N = terms.tension_N + trial.damping_deviation * damping_N / ratio
+    return bool(np.any(tension_N < -MIN_PUSH_FRACTION * terms.pressure_Pa * terms.area_m2 / ratio))
+
+
+def slack_fit(fit: Fit) -> LikelihoodRatio | None:
+    """Refit the model with tails that may go slack; None where no tail pushes or the fit fails. Trial effects may have
+    absorbed the misfit until no tail pushes. Where trials scatter much, the rule is therefore also tried from other
+    exponents, without the fitted deviations, on one trial of every condition first.
+    """
+    taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
+    scattered = taut and has_excess_scatter(fit)
+    if not scattered and not pushes(fit):
+        return None
+    data = [
+        replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
+    ]
+    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
+    subset_fit = None
+    if scattered:
+        fitter = SubsetFitter(slack)
+        subset_fit = best_subset_fit(fitter, exponent_starts(slack), math.inf)
+        allowed_rise = REFUTED_DEVIANCE_PER_POINT * fitter.n_points
+        if subset_fit is not None and subset_fit.deviance > SubsetFitter(fit).null_deviance() + allowed_rise:
+            return None
+    fits = []
+    with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+        fits.append(refit(slack, thorough=False))
+    if subset_fit is not None:
+        fits += [other for other in (full_fit(slack, subset_fit, reset=True),) if other is not None]
+    if not fits:
+        return None
+    after = max(fits, key=lambda known: known.log_likelihood)
+    return likelihood_ratio(fit, (TAIL_SLACK,), after)
+
 
 MAX_RESTARTS = 2  # Times that the selection is repeated from a better minimum of the model (chosen)
 

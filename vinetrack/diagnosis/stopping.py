@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vinetrack.core.numbers import or_nan
+from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,

@@ -7,6 +7,9 @@ their own (`EquationsType`), so that the integrator is compiled for each model a
 The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -56,9 +59,9 @@ class Equations:
     averaged_over: Callable  #: square of the time that positions are averaged over, s², of (trial) alone
     tip_tension: Callable  #: tension that the tip leaves for the tail, N, and rate of the chamber; one more argument
     free_fall: Callable  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
-    slack_fraction: Callable  #: `vinetrack.dynamics.slack_tail.slack_fraction`
-    slack_at_rest: Callable  #: `vinetrack.dynamics.slack_tail.slack_at_rest`
-    follow_slack: Callable  #: `vinetrack.dynamics.slack_tail.follow_slack`
+    slack_fraction: Callable  #: `vinetrack.dynamics.integrator.slack_fraction`
+    slack_at_rest: Callable  #: `vinetrack.dynamics.integrator.slack_at_rest`
+    follow_slack: Callable  #: `vinetrack.dynamics.integrator.follow_slack`
 
 
 class EquationsType(types.Opaque):
@@ -205,3 +208,354 @@ def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
 def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
     """Placeholder for `follow_slack` if no tail may go slack."""
     return TAUT, row, start, 0.0
+
+
+# ------------------------------------------------------------------------------
+# One step of Radau IIA, order 5, for the speed and position of a tail and the pressure of its chamber.
+#
+# Position follows from the speeds by the same quadrature, so that the Newton system is that of the three stage speeds
+# alone; the chamber pressure has a Newton system of its own. `vinetrack.dynamics.integrator` states why this method is
+# used.
+#
+# Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections IV.5 (the
+# method,
+# table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error estimate).
+
+SQRT6 = 6.0**0.5  # Derived: √6, which appears in the nodes
+
+C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
+A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
+A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
+A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9  # Nodes c and matrix A of the method; the third node is 1
+
+S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))  # Derivative at the end of a step of the cubic through (0, 0), (C1, z1),
+S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
+S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)  # Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2),
+
+MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)  # source: below
+# The real eigenvalue of A⁻¹ and the weights of the estimate of the local error
+E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
+
+MOST_NEWTON_ITERATIONS = 9  # Newton iterations before a step is given up; chosen near the 7 of RADAU5
+
+NEWTON_TOLERANCE = 1e-2  # Change of the speeds at which the iterations stop, relative to the tolerance of a step
+
+# Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen
+FAST_CONTRACTION = 0.1
+
+
+class Stages(NamedTuple):
+    """Increments of speed at the three stages of a step of size h, m/s and s; h is 0 if there is no previous step."""
+
+    h: float
+    z1: float
+    z2: float
+    z3: float
+
+
+NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)  # For a step without a previous one: after a start and after a rejected step
+
+
+@inlined
+def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
+    """Solve three linear equations by Cramer's rule: the Newton step of the three stages."""
+    k1 = m22 * m33 - m23 * m32
+    k2 = m23 * m31 - m21 * m33
+    k3 = m21 * m32 - m22 * m31
+    scale = 1 / (m11 * k1 + m12 * k2 + m13 * k3)
+    z1 = (b1 * k1 + m12 * (m23 * b3 - b2 * m33) + m13 * (b2 * m32 - m22 * b3)) * scale
+    z2 = (m11 * (b2 * m33 - m23 * b3) + b1 * k2 + m13 * (m21 * b3 - b2 * m31)) * scale
+    z3 = (m11 * (m22 * b3 - b2 * m32) + m12 * (b2 * m31 - m21 * b3) + b1 * k3) * scale
+    return z1, z2, z3
+
+
+@inlined
+def _speed_derivative(equations, trial, time, x, v, chamber, acceleration, scale):
+    """∂a/∂v, 1/s, by a one-sided difference towards higher speed, since a different law holds at rest."""
+    delta = 1e-6 * max(abs(v), 1e-4 * scale)
+    higher, _rate = equations.rates(time, x, v + delta, chamber, trial)
+    return (higher - acceleration) / delta
+
+
+@inlined
+def starting_values(point, h, previous):
+    """Starting values of the Newton iterations: the collocation polynomial of the last step, extrapolated. Without a
+    previous step they follow from the acceleration at the start. No stage speed is set below a tenth of the speed at
+    the start.
+    """
+    lowest = -0.9 * point.v
+    if previous.h > 0:
+        r = h / previous.h
+        p1, p2, p3 = (
+            _collocation_polynomial(1 + C1 * r, previous),
+            _collocation_polynomial(1 + C2 * r, previous),
+            _collocation_polynomial(1 + r, previous),
+        )
+        w1, w2, w3 = p1 - previous.z3, p2 - previous.z3, p3 - previous.z3
+    else:
+        w1, w2, w3 = C1 * h * point.acceleration, C2 * h * point.acceleration, h * point.acceleration
+    return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
+
+
+@inlined
+def _collocation_polynomial(s, stages):
+    """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
+    l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
+    l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
+    l3 = s * (s - C1) * (s - C2) / ((1 - C1) * (1 - C2))
+    return l1 * stages.z1 + l2 * stages.z2 + l3 * stages.z3
+
+
+@inlined
+def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
+    """Newton step of the stage speeds: (I − h A J) d = h A f − z, J the derivatives ∂a/∂v."""
+    return _solve3(
+        1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
+        -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
+        -h * A31 * j1, -h * A32 * j2, 1 - h * A33 * j3,
+        h * (A11 * f1 + A12 * f2 + A13 * f3) - z1,
+        h * (A21 * f1 + A22 * f2 + A23 * f3) - z2,
+        h * (A31 * f1 + A32 * f2 + A33 * f3) - z3,
+    )  # fmt: skip
+
+
+@inlined
+def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
+    """Newton step of the chamber pressures at the stages; jc is h times the derivative of the rate."""
+    return _solve3(
+        1 - A11 * jc, -A12 * jc, -A13 * jc,
+        -A21 * jc, 1 - A22 * jc, -A23 * jc,
+        -A31 * jc, -A32 * jc, 1 - A33 * jc,
+        h * (A11 * g1 + A12 * g2 + A13 * g3) - (q1 - chamber),
+        h * (A21 * g1 + A22 * g2 + A23 * g3) - (q2 - chamber),
+        h * (A31 * g1 + A32 * g2 + A33 * g3) - (q3 - chamber),
+    )  # fmt: skip
+
+
+@inlined
+def radau_step(equations, trial, point, stages, scale, rtol):
+    """One step from `point`, with the size and the starting values in `stages`."""
+    time, x, v, _acceleration, chamber = point
+    h, z1, z2, z3 = stages
+    j1 = j2 = j3 = 0.0
+    g1 = g2 = g3 = 0.0
+    tolerance = NEWTON_TOLERANCE * rtol * max(scale, abs(v))
+    previous_size = 1e300
+    q1 = q2 = q3 = chamber
+    jc = 0.0
+    chamber_active = False
+    jacobian_current = False
+    converged = False
+    for iteration in range(MOST_NEWTON_ITERATIONS):
+        v1, v2, v3 = v + z1, v + z2, v + z3
+        x1 = x + h * (C1 * v + A11 * z1 + A12 * z2 + A13 * z3)
+        x2 = x + h * (C2 * v + A21 * z1 + A22 * z2 + A23 * z3)
+        x3 = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
+        t1, t2, t3 = time + C1 * h, time + C2 * h, time + h
+        f1, g1 = equations.rates(t1, x1, v1, q1, trial)
+        f2, g2 = equations.rates(t2, x2, v2, q2, trial)
+        f3, g3 = equations.rates(t3, x3, v3, q3, trial)
+        if not jacobian_current:
+            j1 = _speed_derivative(equations, trial, t1, x1, v1, q1, f1, scale)
+            j2 = _speed_derivative(equations, trial, t2, x2, v2, q2, f2, scale)
+            j3 = _speed_derivative(equations, trial, t3, x3, v3, q3, f3, scale)
+            jacobian_current = True
+            # The equation of a chamber is stiff if its supply is fast.
+            chamber_active = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
+            if chamber_active:
+                dq = 1e-6 * (abs(q3) + 1e3)
+                _f, higher = equations.rates(t3, x3, v3, q3 + dq, trial)
+                jc = h * (higher - g3) / dq
+        change = 0.0
+        if chamber_active:
+            c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)
+            q1, q2, q3 = q1 + c1, q2 + c2, q3 + c3
+            change = max(abs(c1), abs(c2), abs(c3)) / (abs(q3) + 1e3)
+        d1, d2, d3 = _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
+        z1, z2, z3 = z1 + d1, z2 + d2, z3 + d3
+        size = max(abs(d1), abs(d2), abs(d3), change * scale)
+        if not size < 1e300:
+            break
+        ratio = size / previous_size
+        # The next iteration would change the speeds by about ratio · size.
+        if size <= tolerance or (iteration > 0 and ratio < FAST_CONTRACTION and ratio * size <= 0.1 * tolerance):
+            converged = True
+            break
+        if ratio > FAST_CONTRACTION:
+            jacobian_current = False
+        if iteration > 3 and size > previous_size:
+            break
+        previous_size = size
+    new_stages = Stages(h, z1, z2, z3)
+    if not converged:
+        return False, 1e300, point, new_stages
+    return True, _local_error(point, new_stages, scale, rtol), _end_of_step(point, new_stages, q3), new_stages
+
+
+@inlined
+def _local_error(point, stages, scale, rtol):
+    """Hairer's estimate of the local error of the speed, in units of the tolerance. Hairer filters it with (μ/h − J)⁻¹.
+    This is omitted: the filter hides the error of a long stiff step at its far end.
+    """
+    h, z1, z2, z3 = stages
+    raw = (h * point.acceleration + E1 * z1 + E2 * z2 + E3 * z3) / MU
+    # At least a tenth of the final speed: an error at the start affects the whole growth.
+    weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
+    return abs(raw) / weight
+
+
+@inlined
+def _end_of_step(point, stages, chamber):
+    """The vine at the end of a step; `chamber` is the pressure at its last stage."""
+    h, z1, z2, z3 = stages
+    x_end = point.x + h * (point.v + A31 * z1 + A32 * z2 + A33 * z3)
+    acceleration_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
+    return Point(point.time + h, x_end, point.v + z3, acceleration_end, chamber)
+
+
+@inlined
+def quintic(s, h, start, end):
+    """Motion within a step: the Hermite polynomial of degree 5 through position, speed and acceleration."""
+    d = end.x - start.x - h * start.v - 0.5 * h * h * start.acceleration
+    e = h * (end.v - start.v - h * start.acceleration)
+    f = h * h * (end.acceleration - start.acceleration)
+    c3 = 10 * d - 4 * e + 0.5 * f
+    c4 = -15 * d + 7 * e - f
+    c5 = 6 * d - 3 * e + 0.5 * f
+    s2 = s * s
+    x = start.x + h * s * start.v + 0.5 * h * h * s2 * start.acceleration + s2 * s * (c3 + s * (c4 + s * c5))
+    v = start.v + h * s * start.acceleration + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
+    a = start.acceleration + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
+    return x, v, a
+
+
+# ------------------------------------------------------------------------------
+# Interpolation of the motion between the requested times.
+#
+# It is the Hermite polynomial of degree 5 through position, speed and acceleration on either side; next to the end of
+# growth, where the acceleration jumps, that of degree 4 without the acceleration at the jump. The jump at the start of
+# motion is not treated separately: over a frame that is an error of micrometres.
+
+
+@inlined
+def _point(times, out, k):
+    return Point(times[k], out[k, 0], out[k, 1], out[k, 2], 0.0)
+
+
+@compiled
+def motion_at(times, out, ratio, end, k, read):
+    """Position, m, and speed, m/s, of the tail at a time, and the camera's offset of the lead position, m."""
+    last = times.size - 1
+    while k < last and times[k + 1] <= read:
+        k += 1
+    while k > 0 and times[k] > read:
+        k -= 1
+    before = _point(times, out, k)
+    offset = out[k, 3] - before.x / ratio
+    if k < last and times[k] <= read:
+        part = (read - times[k]) / (times[k + 1] - times[k])
+        offset += part * (out[k + 1, 3] - out[k + 1, 0] / ratio - offset)
+    if read >= end.time:
+        return end.x, 0.0, offset
+    if k == last or times[k] > read:
+        since = read - before.time
+        x = before.x + since * (before.v + 0.5 * since * before.acceleration)
+        return max(x, 0.0), before.v + since * before.acceleration, offset
+    after = _point(times, out, k + 1)
+    if after.time >= end.time:
+        x, v = _without_far_acceleration(before, end, read)
+        return min(x, end.x), v, offset
+    x, v, _a = quintic((read - before.time) / (after.time - before.time), after.time - before.time, before, after)
+    return x, v, offset
+
+
+@inlined
+def _without_far_acceleration(near, far, read):
+    """Position, m, and speed, m/s, of the tail between a time and another at which the acceleration jumps."""
+    h = far.time - near.time
+    part = (read - near.time) / h
+    d = far.x - near.x - h * near.v - 0.5 * h * h * near.acceleration
+    e = h * (far.v - near.v - h * near.acceleration)
+    c3, c4 = 4 * d - e, e - 3 * d
+    moved = h * near.v + part * (h * h * near.acceleration + part * (3 * c3 + part * 4 * c4))
+    x = near.x + part * h * (near.v + 0.5 * part * h * near.acceleration) + part**3 * (c3 + part * c4)
+    return x, moved / h
+
+
+# ------------------------------------------------------------------------------
+# Rolling shutter: the rows of a picture are read one after the other, and show the edge at different times.
+#
+# A frame stamped t shows the edge at t + s·y, with y its position at that time and s the delay per metre. At the start
+# of
+# growth s·y is negligible, and rows are read at their stamps.
+
+STEEPEST = 0.1  # Least 1 − s·ẏ by which Newton's method divides (chosen)
+
+TURNS = 8  # Maximum number of Newton iterations (derived)
+
+SETTLED_S = 1e-10  # Step that ends the iterations, s (derived)
+
+
+@compiled
+def read_by_rows(times, out, ratio, end, delay):
+    """Replace the positions recorded by an instantaneous shutter by those recorded row by row."""
+    # Positions that are still needed must not be replaced yet: later ones at a positive delay, else earlier ones.
+    count = times.size
+    for step in range(count):
+        i = step if delay > 0 else count - 1 - step
+        read = times[i] + delay * out[i, 3]
+        seen = out[i, 3]
+        for _turn in range(TURNS):
+            x, v, offset = motion_at(times, out, ratio, end, i, read)
+            seen = x / ratio + offset
+            change = (read - times[i] - delay * seen) / max(1.0 - delay * v / ratio, STEEPEST)
+            read -= change
+            if abs(change) < SETTLED_S:
+                break
+        out[i, 3] = seen
+
+
+# ------------------------------------------------------------------------------
+# Positions averaged over time: the position reported at t is the mean from t − T/2 to t + T/2.
+
+# Gauss–Legendre quadrature with three nodes, and its weights (derived)
+NODE, WEIGHT, MIDDLE_WEIGHT = math.sqrt(0.6), 5 / 18, 4 / 9
+
+
+@compiled
+def average_over(times, out, means, ratio, end, square):
+    """Replace instantaneous positions by their means over the time around each."""
+    half = 0.5 * math.sqrt(square)
+    for i in range(times.size):
+        first, last = times[i] - half, times[i] + half
+        k = i
+        while k > 0 and times[k] > first:
+            k -= 1
+        area, at = 0.0, first
+        while at < last:
+            # The intervals before the first time and after the last are one piece each.
+            until = last
+            if at < times[0]:
+                until = min(last, times[0])
+            elif k < times.size - 1:
+                until = min(last, times[k + 1])
+            if at < end.time < until:
+                until = end.time
+            area += _integral(times, out, ratio, end, k, at, until)
+            at = until
+            while k < times.size - 1 and times[k + 1] <= at:
+                k += 1
+        means[i] = area / (2 * half)
+    for i in range(times.size):
+        out[i, 3] = means[i]
+
+
+@compiled
+def _integral(times, out, ratio, end, k, low, high):
+    """Integral of the reported position, m s, over an interval in which the motion is one polynomial."""
+    middle, reach = 0.5 * (low + high), 0.5 * NODE * (high - low)
+    total = 0.0
+    for place in range(3):
+        x, _v, offset = motion_at(times, out, ratio, end, k, middle + (place - 1) * reach)
+        total += (MIDDLE_WEIGHT if place == 1 else WEIGHT) * (x / ratio + offset)
+    return total * (high - low)

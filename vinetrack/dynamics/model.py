@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 
 from vinetrack.core.notebook import html_table
 from vinetrack.core.records import Floats, Trial
-from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
+from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, TrialInputs, catalogue, find_effect, load_effect
+from vinetrack.experiment.schema import COLUMNS
 
 Value = float | Mapping[str, float]  # A parameter's value: one number, or one for each vine or each day by name
 
@@ -254,3 +258,113 @@ def base_model() -> Model:
     Model(pressure_drive + eversion_damping + yield_pressure)
     """
     return make_model()
+
+
+# ------------------------------------------------------------------------------
+# The inputs of effects that are constant for a trial, as SI numbers.
+
+
+def trial_inputs(trial: Trial) -> TrialInputs:
+    """The inputs of effects for a trial."""
+    whole_body = trial.travel_ratio == 1
+    length = trial.length_m if math.isfinite(trial.length_m) else 0.0
+    area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
+    linear_density = trial.linear_density_kg_m
+    pressure = 0.0 if whole_body and not math.isfinite(trial.pressure_Pa) else trial.pressure_Pa
+    yield_pressure = 0.0 if whole_body and not math.isfinite(trial.yield_pressure_Pa) else trial.yield_pressure_Pa
+    gas_density = (pressure + trial.ambient_pressure_Pa) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    fold = 0.0 if linear_density == 0 else linear_density * math.pi * trial.thickness_m
+    return TrialInputs(
+        set_pressure=pressure,
+        yield_pressure=yield_pressure,
+        diameter=trial.diameter_m,
+        thickness=trial.thickness_m,
+        length=length,
+        area=area,
+        linear_density=linear_density,
+        mass_loss=trial.mass_loss_kg_m if linear_density else 0.0,
+        payload_mass=trial.payload_kg,
+        cos_angle=math.cos(trial.growth_angle_rad),
+        travel_ratio=trial.travel_ratio,
+        ambient_pressure=trial.ambient_pressure_Pa,
+        chamber_volume=trial.chamber_m3,
+        inlet_area=math.pi * trial.inlet_m**2 / 4,
+        least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
+        has_bends=float(bool(trial.bends)),
+        tail_on_reel=float(trial.tail_store == "reel"),
+        bend_count=float(len(trial.bends)),
+        bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
+        as_printed=float(trial.mass_loss == "as_printed"),
+        tail_free=float(trial.tail_slack == "free" and not whole_body),
+    )
+
+
+def with_pressures(inputs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
+    """The inputs of trials at other pressures; the mass of the gas in them changes accordingly. Returns A changed copy.
+    Shapes: inputs (n_trials, n_fields); set_pressure_Pa, yield_pressure_Pa (n_trials,) → (n_trials, n_fields).
+    """
+    place = {name: k for k, name in enumerate(TrialInputs._fields)}
+    changed = inputs.copy()
+    denser = (set_pressure_Pa - inputs[:, place["set_pressure"]]) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    volume = inputs[:, place["area"]] * inputs[:, place["length"]] / inputs[:, place["travel_ratio"]] ** 2
+    changed[:, place["set_pressure"]] = set_pressure_Pa
+    changed[:, place["least_mass"]] += denser * volume
+    given = ~np.isnan(yield_pressure_Pa)
+    changed[given, place["yield_pressure"]] = yield_pressure_Pa[given]
+    return changed
+
+
+def _of_trial(column: str, trial: Trial) -> object:
+    """Value of a trial in a column of the sheet, SI; NaN for a column that no sheet has."""
+    return getattr(trial, COLUMNS[column].field, math.nan) if column in COLUMNS else math.nan
+
+
+def stated(column: str, trial: Trial) -> bool:
+    """Whether the sheet gives a trial a value other than zero in this column."""
+    value = _of_trial(column, trial)
+    return not isinstance(value, float) or (math.isfinite(value) and value != 0)
+
+
+def check_needs(model: Model, *trials: Trial) -> None:
+    """Raise an error for a trial without a value that an effect of the model needs."""
+    needs = [(effect, column) for effect in model for column in effect.needs]
+    for trial in trials:
+        for effect, column in needs:
+            value = _of_trial(column, trial)
+            if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
+                raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
+
+
+# ------------------------------------------------------------------------------
+# One model with the whole catalogue, compiled once for all that is asked of any of its effects.
+#
+# A model takes seconds to compile, an effect of no size next to nothing to simulate. What compares models therefore
+# simulates each by the compiled form of one larger model, the host. Wherever no effect of a user's own is involved it
+# is
+# the same model, so that fits, designs, diagnoses and the explorer share what is compiled. An effect that is switched
+# off
+# is skipped, so that the trajectories are those of the smaller model to the last bit.
+
+PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
+
+
+@lru_cache(maxsize=1)
+def probe() -> Effect:
+    """The probe force of the diagnosis (`probes/probe_force.py`)."""
+    return load_effect(PROBE_FILE)
+
+
+def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
+    """Return one model of the catalogue, the probe force, a model and further effects."""
+    held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
+    return Model(tuple(held[name] for name in held))
+
+
+@lru_cache(maxsize=256)
+def shared_host(effects: tuple[Effect, ...]) -> Model | None:
+    """Return the host for a model of which none is stated. It is worth 3 s to compile a further model, while a
+    trajectory takes 1.4 times as long by the host (`benchmarks/catalogue_speed.py`): 15 µs more each, less than the 3 s
+    for 200 000 of them, which is twenty fits.
+    """
+    known = all(catalogue().get(effect.name) == effect for effect in effects)
+    return host_for(Model(())) if known and not {effect.name for effect in effects} <= set(BASE_EFFECTS) else None

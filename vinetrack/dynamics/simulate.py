@@ -5,16 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import UserError
-from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.batch import RELATIVE_TOLERANCE, Batch, Trace, lay_out, starts_of
-from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs
-from vinetrack.effects import TrialInputs
+from vinetrack.core.records import Bend, Floats, Trial
+from vinetrack.dynamics.kernel import RELATIVE_TOLERANCE, Batch, Trace, lay_out, starts_of
+from vinetrack.dynamics.model import Model, base_model, check_needs, host_for, trial_inputs
+from vinetrack.effects import Effect, TrialInputs, catalogue
 
 STATUS = ("running", "ended", "stalled", "too hard")
 ENDED, TOO_HARD = STATUS.index("ended"), STATUS.index("too hard")
@@ -167,3 +167,112 @@ def _trajectory(r: float, times_s: Floats, motion: Floats, observed_m: Floats, e
         n_steps=int(end[3]),
         slack_from_s=end[4],
     )
+
+
+# ------------------------------------------------------------------------------
+# Motion of a reference vine with and without one effect: the data of the effect's figure.
+
+# The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long
+REFERENCE = Trial(
+    name="reference",
+    vine="reference",
+    diameter_m=24e-3,
+    thickness_m=200e-6,
+    length_m=0.4,
+    pressure_Pa=28e3,
+    yield_pressure_Pa=3e3,
+    payload_kg=35.6e-3,
+    chamber_m3=3.7e-3,
+    inlet_m=6e-3,
+)
+
+REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
+
+BENDS = (Bend(0.1, 0.1, 0.1),)  # One radian after 10 cm, for effects of bends
+
+# A pressure that rises and falls through the threshold, for effects that act on a vine at rest
+SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3]))
+
+
+# A pressure that is recorded while a valve opens, for effects on the record of the pressure
+OPENED: Trace = (np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3]))
+
+
+def effect_motion(effect: Effect) -> pd.DataFrame:
+    """Motion of the reference vine with an effect at its default size and without it. An effect of the base model is
+    removed from it, any other is added.
+    """
+    with_it, without = _models(effect)
+    trial = replace(REFERENCE, bends=BENDS) if effect.name == "capstan_friction" else REFERENCE
+    at_rest = _acts_at_rest(effect)
+    trial = replace(trial, growth_angle_rad=math.pi / 2) if at_rest else trial
+    trace = SLOW_PRESSURE if at_rest else OPENED if "trace_time" in effect.functions else None
+    until = _end_s(with_it, without, trial, trace)
+    times = np.linspace(0.0, until, 400)
+    a, b = simulate(without, trial, times, trace=trace), simulate(with_it, trial, times, trace=trace)
+    return pd.DataFrame(
+        {
+            "time_s": times,
+            "without_position_m": a.observed_position_m,
+            "with_position_m": b.observed_position_m,
+            "without_velocity_m_s": _seen_velocity(a),
+            "with_velocity_m_s": _seen_velocity(b),
+            "difference_m": b.observed_position_m - a.observed_position_m,
+        }
+    )
+
+
+def reference_words(effect: Effect) -> str:
+    """Describe the vine and trial of `effect_motion`, for the caption of a picture."""
+    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
+    if _acts_at_rest(effect):
+        return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
+    if "trace_time" in effect.functions:
+        return f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
+    bends = ", one radian of bend after 100 mm" if effect.name == "capstan_friction" else ""
+    return f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm{bends}"
+
+
+def size_words(effect: Effect) -> str:
+    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`."""
+    values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
+    return ", ".join(
+        f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
+        for p, value in zip(effect.parameters, values, strict=True)
+    )
+
+
+def _acts_at_rest(effect: Effect) -> bool:
+    return set(effect.functions) == {"rest_force"}
+
+
+def _models(effect: Effect) -> tuple[Model, Model]:
+    """The base model with an effect and without. Both are the whole catalogue with all other effects at size zero, so
+    that one compiled model serves all figures.
+    """
+    if effect.kind == "base" and not effect.parameters:
+        base = base_model().with_values(REFERENCE_VALUES)
+        return base, base - effect
+    whole = host_for(base_model()) if catalogue().get(effect.name) == effect else base_model() + effect
+    nothing = {f"{e.name}.{p.name}": p.zero for e in whole for p in e.parameters if e.kind != "base"}
+    none = whole.with_values({**nothing, **REFERENCE_VALUES})
+    sizes = {f"{effect.name}.{p.name}": p for p in effect.parameters}
+    if effect.kind == "base":
+        return none, none.with_values({name: p.zero for name, p in sizes.items()})
+    return none.with_values({name: p.default for name, p in sizes.items()}), none
+
+
+def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) -> float:
+    if trace is not None:
+        return float(trace[0][-1])
+    ends = []
+    for model in (with_it, without):
+        motion = simulate(model, trial, np.linspace(0.0, 2.0, 50))
+        ends.append(motion.end_time_s if motion.status == "ended" else math.inf)
+    end = min(ends)
+    return 0.99 * end if math.isfinite(end) else 0.5
+
+
+def _seen_velocity(motion: Trajectory) -> Floats:
+    """Speed of the reported position of the edge."""
+    return np.gradient(motion.observed_position_m, motion.time_s)

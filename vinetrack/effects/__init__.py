@@ -6,7 +6,7 @@ own, `own_effects(paths)` all of them, tried out.
 
 from __future__ import annotations
 
-from vinetrack.core.constants import BASE_EFFECTS
+from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import (
     EffectError,
@@ -16,9 +16,9 @@ from vinetrack.effects._catalogue import (
     listing,
     load_effect,
     remedy,
+    remember,
     told_apart,
 )
-from vinetrack.effects._first_run import remember
 from vinetrack.effects._own import own_effects
 
 __all__ = [

@@ -17,7 +17,7 @@ Source: drag of blunt bodies, Hoerner (1965), Fluid-Dynamic Drag, chapter 3. The
 speed and no pulley.
 """
 
-from vinetrack.core.constants import AIR_DENSITY_KG_M3
+from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"

@@ -18,7 +18,7 @@ Source: the balance of momentum of a lengthening column of gas, the unsteady Ber
 White, Fluid Mechanics.
 """
 
-from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"

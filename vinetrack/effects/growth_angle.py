@@ -19,7 +19,7 @@ Source: Alvarez et al. (2025), Eq. (1).
 
 import numpy as np
 
-from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"

@@ -16,7 +16,7 @@ during growth is the loss.
 Source: loss coefficients K as in Idelchik (1986), Handbook of Hydraulic Resistance, chapters 3 and 4.
 """
 
-from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"

@@ -16,7 +16,7 @@ Source: drag of blunt bodies and of bodies in tubes, Hoerner (1965), Fluid-Dynam
 Hydraulic Resistance.
 """
 
-from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"

@@ -16,7 +16,7 @@ payload through a vine that is held; and weigh it, and hold a plumb-line beside 
 Source: Coulomb's law of friction.
 """
 
-from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"

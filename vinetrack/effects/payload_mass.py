@@ -15,7 +15,7 @@ Reduce it by weighing the payload as it is put in, mount and tape included.
 Source: Eq. (2) of Alvarez et al. (2025).
 """
 
-from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"

@@ -6,25 +6,37 @@ of a single row makes that trial `failed`, unless the experiment is `strict`.
 
 from __future__ import annotations
 
+import csv
 import difflib
+import io
+import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vinetrack.core.files import file_size, missing_file_message
 from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem, format_problems
-from vinetrack.core.records import Correction, Trial
-from vinetrack.core.tables import Table, TableError, read_table, safe_join
-from vinetrack.experiment.cells import unusual_value_hint
-from vinetrack.experiment.corrections import read_corrections, unmatched_corrections
-from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.other_units import in_sheet_units, keys_in_other_units
-from vinetrack.experiment.schema import COLUMNS, SHARED
-from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
+from vinetrack.core.records import CORRECTION_ACTIONS, Correction, Floats, Trial
+from vinetrack.core.tables import (
+    Table,
+    TableError,
+    file_size,
+    missing_file_message,
+    parse_number,
+    read_table,
+    safe_join,
+)
+from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
+from vinetrack.experiment.settings import (
+    ExperimentSettings,
+    in_sheet_units,
+    keys_in_other_units,
+    read_experiment_settings,
+)
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
@@ -35,8 +47,191 @@ from vinetrack.experiment.sheet import (
     read_row,
     unknown_columns,
 )
-from vinetrack.experiment.trial_order import order_problems
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
+
+# ------------------------------------------------------------------------------
+# The order in which trials were run, and whether it is confounded with pressure.
+#
+# A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure rises
+# with the order, the data cannot distinguish such a drift from an effect of pressure.
+
+CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
+
+FEWEST_TRIALS = 8  # Fewest trials for which the correlation is computed (derived)
+
+REMEDY = "run the trials in random order, or repeat six of them in random order, and number them under order"
+
+
+def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
+    """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
+    Returns ranks, stated: Ranks from 0, shape (n_trials,).
+    """
+    order = np.array([trial.order for trial in trials], dtype=float)
+    stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
+    ranks = np.argsort(np.argsort(order)) if stated else np.arange(order.size)
+    return ranks.astype(float), stated
+
+
+def order_pressure_correlation(trials: Sequence[Trial]) -> float:
+    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines. Returns −1 to
+    1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
+    """
+    from scipy.stats import rankdata
+
+    ranks, _ = trial_order(trials)
+    pairs: list[Floats] = []
+    for vine in dict.fromkeys(trial.vine for trial in trials):
+        members = [i for i, trial in enumerate(trials) if trial.vine == vine and math.isfinite(trial.pressure_Pa)]
+        pressures = np.array([trials[i].pressure_Pa for i in members])
+        if len(members) > 1 and np.ptp(pressures) > 0:
+            both = np.array([rankdata(ranks[members]), rankdata(pressures)])
+            pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
+    if sum(pair.shape[1] for pair in pairs) < FEWEST_TRIALS:
+        return math.nan
+    order, pressure = np.hstack(pairs)
+    return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
+
+
+def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
+    """Warn of confounding: order with pressure, and specimen or day with condition."""
+    correlation = order_pressure_correlation(trials)
+    _, stated = trial_order(trials)
+    if abs(correlation) >= CONFOUNDING_CORRELATION and stated:
+        message = (
+            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
+        )
+        yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
+    elif abs(correlation) >= CONFOUNDING_CORRELATION:
+        message = (
+            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials were "
+            "run in this order, a drift would look like a physical effect"
+        )
+        yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
+    for column in ("specimen", "day"):
+        if _confounded_with_condition(trials, column):
+            message = f"differs for every condition: a difference between {column}s would look like a physical effect"
+            remedy = f"spread every condition over two {column}s"
+            yield Problem(message=message, file=file, column=column, severity="warning", remedy=remedy)
+
+
+def _confounded_with_condition(trials: Sequence[Trial], column: str) -> bool:
+    """Whether every condition has a single value of `specimen` or `day`, while values differ within a vine."""
+    values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
+    if not values or any(not value for _, _, value in values):
+        return False
+    in_condition = Counter(condition for _, condition, _ in values)
+    in_vine = Counter(vine for vine, _ in {(vine, value) for vine, _, value in values})
+    return max(in_condition.values()) == 1 and max(in_vine.values()) > 1
+
+
+# ------------------------------------------------------------------------------
+# Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
+#
+# One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`;
+# the
+# position that it had found itself is kept in the results.
+
+CORRECTIONS_FILE = "corrections.csv"
+CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
+
+
+def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
+    """Read the corrections of an experiment. Returns corrections, problems : by name of trial, and what is wrong with
+    the file; both empty if there is no file.
+    """
+    path = folder / CORRECTIONS_FILE
+    if not os.path.lexists(path):
+        return {}, []
+    try:
+        table = read_table(path)
+    except TableError as error:
+        return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
+    missing = [name for name in CORRECTION_COLUMNS if name not in table.columns]
+    if missing:
+        remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
+        return {}, [Problem(message="is missing", file=CORRECTIONS_FILE, column=missing[0], remedy=remedy)]
+    by_trial: dict[str, dict[int, Correction]] = {}
+    problems: list[Problem] = []
+    for i, row in enumerate(table.rows):
+        correction = _read_line(table, i, problems)
+        by_frame = by_trial.setdefault(row["trial"], {})
+        if correction is None:
+            continue
+        if correction.frame in by_frame:
+            problems.append(_problem(table, i, "frame", "is corrected twice", "keep one of the lines"))
+        by_frame[correction.frame] = correction
+    return {
+        trial: tuple(by_frame[frame] for frame in sorted(by_frame)) for trial, by_frame in by_trial.items()
+    }, problems
+
+
+def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction | None:
+    """Read one line; None if it is faulty, in which case the fault is added to `problems`."""
+    row = table.rows[index]
+    if row["action"] not in CORRECTION_ACTIONS:
+        remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
+        problems.append(_problem(table, index, "action", "is not an action", remedy))
+        return None
+    numbers = {}
+    for column in ("frame", "edge_px"):
+        if column == "edge_px" and row["action"] != "move":
+            continue
+        try:
+            numbers[column] = parse_number(row[column], table.decimal)
+        except TableError as error:
+            message, _, remedy = str(error).partition(": ")
+            problems.append(_problem(table, index, column, message, remedy))
+            return None
+    if numbers["frame"] < 0 or numbers["frame"] != int(numbers["frame"]):
+        problems.append(_problem(table, index, "frame", "is not a frame number", "frames are counted 0, 1, 2, …"))
+        return None
+    return Correction(int(numbers["frame"]), row["action"], numbers.get("edge_px", math.nan))
+
+
+def _problem(table: Table, index: int, column: str, message: str, remedy: str) -> Problem:
+    row = table.rows[index]
+    return Problem(
+        message=message,
+        file=CORRECTIONS_FILE,
+        line=table.lines[index],
+        trial=row["trial"],
+        column=column,
+        value=row[column],
+        remedy=remedy,
+    )
+
+
+def unmatched_corrections(
+    corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]
+) -> list[Problem]:
+    """Warn of corrections of a trial that is not in the sheet, or is not a recording."""
+    in_sheet, recordings = set(names), set(filmed)
+    return [
+        Problem(
+            message="is not a recording; its corrections are ignored"
+            if trial in in_sheet
+            else "is not in the sheet; its corrections are ignored",
+            file=CORRECTIONS_FILE,
+            column="trial",
+            value=trial,
+            severity="warning",
+        )
+        for trial in corrections
+        if trial not in recordings
+    ]
+
+
+def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
+    """Return the content of `corrections.csv` for these corrections."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(CORRECTION_COLUMNS)
+    for trial, of_trial in corrections.items():
+        for correction in of_trial:
+            edge = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
+            writer.writerow([trial, correction.frame, correction.action, edge])
+    return out.getvalue()
+
 
 __all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
 

@@ -14,10 +14,8 @@ from pathlib import Path
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table
-from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.other_units import in_sheet_units
-from vinetrack.experiment.schema import COLUMNS, SHARED, option
-from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
+from vinetrack.experiment.schema import COLUMNS, SHARED, option, with_names
+from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,

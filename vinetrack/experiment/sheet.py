@@ -14,9 +14,7 @@ from typing import Any
 from vinetrack.core.problems import Problem, did_you_mean
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
-from vinetrack.experiment.cells import CellError, read_cell, unusual_value_hint
-from vinetrack.experiment.column import Column
-from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, read_cell, unusual_value_hint
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"

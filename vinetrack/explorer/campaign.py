@@ -6,27 +6,27 @@ It is read once and never changed; the choice of the user is in `choice`, its cu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
-from vinetrack.dynamics.host import host_for
-from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.trial_inputs import check_needs
-from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.left_out import rest_is_seen
-from vinetrack.inference.parameters import group_names
-from vinetrack.inference.prepared_trials import prepare
-from vinetrack.inference.starts import initial_trial_effects
+from vinetrack.core.units import SLIDER_UNITS, display_unit
+from vinetrack.dynamics.kernel import Trace
+from vinetrack.dynamics.model import Model, Value, check_needs, host_for
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
+from vinetrack.inference.fit import LEAST_EIGENVALUE, rest_is_seen, scaled_least_squares
+from vinetrack.inference.fit_data import FitTrial, prepare
+from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
+from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured_trials
-from vinetrack.results.folder_layout import Results, ResultsError, read_result
-from vinetrack.results.stored_fit import read_fit
+from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -278,3 +278,341 @@ def _settings(trial: Trial) -> dict[str, str]:
         "bends": (len(trial.bends) if trial.bends else math.nan, "bends"),
     }
     return {key: f"{value:.3g} {unit}" for key, (value, unit) in numbers.items() if math.isfinite(value)}
+
+
+# ------------------------------------------------------------------------------
+# Curves of a model with given sizes for every trial, fast enough for a slider.
+#
+# As in a comparison, a prediction is aligned only by the trial's own release and origin. The origin is the rest
+# position
+# of the vine; the release, and the origin if no rest was filmed, minimise the mean square residual. Each trial is
+# simulated once on a grid, which is then shifted. A motion under a recorded pressure is tied to the clock of that
+# pressure and cannot be shifted: its release remains that of the comparison.
+
+GRID_POINTS = 500  # Points of the simulation grid (derived)
+
+MARGIN_FRAMES = 25  # Frames by which the grid extends beyond the recording
+
+MAX_NEWTON_STEPS = 12  # Newton steps of the alignment at most
+
+MAX_STEP_FRAMES = 5.0  # Largest step, in frames; chosen: keeps the release within the data even from a poor start
+
+CONVERGED_STEP_FRAMES = 1e-3  # Step, in frames, below which the alignment has converged (chosen)
+
+
+@dataclass(frozen=True)
+class SizedModel:
+    """A model with its parameter values, and yield pressures, Pa, by name of trial."""
+
+    model: Model
+    yield_Pa: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ModelCurves:
+    """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames. `release_s` and
+    `origin_m` are in the coordinates of the track. `growth_m` is the position that the camera would report, from the
+    origin of the page (`ExplorerTrial.origin_m`), `residual_m` is measurement minus model.
+    """
+
+    release_s: float
+    origin_m: float
+    growth_m: Floats
+    residual_m: Floats
+    mean_square_m2: float
+    path_s: Floats
+    path_m: Floats
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the residuals while anything moves, m."""
+        return math.sqrt(self.mean_square_m2)
+
+    def lead_position_m(self, time_s: Floats) -> Floats:
+        """Return positions at times, both in the coordinates of the track; NaN beyond the simulation."""
+        since_release = time_s - self.release_s
+        return self.origin_m + np.interp(since_release, self.path_s, self.path_m, right=math.nan)
+
+
+Curves = tuple[ModelCurves, ...]  # The predicted motion of every trial of a campaign, in its order
+
+
+def simulate_curves(campaign: Campaign, sized_model: SizedModel, before: Curves | None = None) -> Curves:
+    """Simulate every trial and align it with its measurement."""
+    trials = campaign.trials
+    starts = [trial.release_s for trial in trials]
+    if before is not None:
+        starts = [
+            curve.release_s if trial.data.trace is None else start
+            for curve, trial, start in zip(before, trials, starts, strict=True)
+        ]
+    grids = [_grid(trial) for trial in trials]
+    trajectories = simulate_many(
+        sized_model.model,
+        [with_yield_pressure(trial.data.trial, sized_model.yield_Pa) for trial in trials],
+        grids,
+        traces=[_trace_since_release(trial) for trial in trials],
+        host=campaign.host,
+    )
+    return tuple(_aligned(*parts) for parts in zip(trials, grids, trajectories, starts, strict=True))
+
+
+def with_yield_pressure(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
+    """Return the trial with the fitted yield pressure of its vine, if there is one."""
+    return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
+
+
+def _grid(aligned: ExplorerTrial) -> Floats:
+    """Times since release, up to the end of the recording plus a margin."""
+    data = aligned.data
+    last_s = max(data.time_s[-1] - aligned.release_s, 0.0) + MARGIN_FRAMES * data.frame_s
+    return np.linspace(0.0, last_s, GRID_POINTS)
+
+
+def _trace_since_release(aligned: ExplorerTrial) -> Trace | None:
+    trace = aligned.data.trace
+    return None if trace is None else (trace[0] - aligned.release_s, trace[1])
+
+
+def _aligned(aligned: ExplorerTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
+    """Newton steps in release, and in the origin if the vine was not filmed at rest."""
+    data, position = aligned.data, moved.observed_position_m
+    speed = np.gradient(position, grid)
+    release_s, origin_m = start_s, aligned.origin_m
+    longest_s = MAX_STEP_FRAMES * data.frame_s
+    for _ in range(MAX_NEWTON_STEPS):
+        since_release = data.time_s - release_s
+        residual = data.lead_position_m - origin_m - np.interp(since_release, grid, position)
+        # Before release the vine is at rest: its velocity is zero.
+        is_fixed = data.trace is not None
+        slope = (
+            np.zeros(since_release.size) if is_fixed else -np.interp(since_release, grid, speed, left=0.0, right=0.0)
+        )
+        shift_s, rise_m = _step(slope, residual, free_origin=not aligned.origin_known)
+        shift_s = min(max(shift_s, -longest_s), longest_s)
+        release_s += shift_s
+        origin_m += rise_m
+        if abs(shift_s) < CONVERGED_STEP_FRAMES * data.frame_s:
+            break
+    growth = np.interp(data.time_s - release_s, grid, position)
+    residual = data.lead_position_m - origin_m - growth
+    counted = residual[aligned.first_counted_frame(release_s) :]
+    offset = origin_m - aligned.origin_m
+    return ModelCurves(release_s, origin_m, growth + offset, residual, float(np.mean(counted**2)), grid, position)
+
+
+def _step(slope: Floats, residual: Floats, *, free_origin: bool) -> tuple[float, float]:
+    """Least-squares fit of the residuals by a shift in time, and one in position if that is free."""
+    if not free_origin:
+        square = float(slope @ slope)
+        return (float(slope @ residual) / square if square > 0 else 0.0), 0.0
+    design = np.column_stack([slope, np.ones(slope.size)])
+    shift, rise = scaled_least_squares(design, residual, math.sqrt(LEAST_EIGENVALUE))
+    return float(shift), float(rise)
+
+
+def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
+    """Return the root mean square position error by condition, m; all trials have the same weight."""
+    return {
+        condition: math.sqrt(
+            float(np.mean([curves[i].mean_square_m2 for i in campaign.indices_of_condition(condition)]))
+        )
+        for condition in campaign.conditions
+    }
+
+
+def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
+    """Return the root mean square over conditions with a known error, m; NaN if there are none."""
+    known = [errors[name] for name in conditions if math.isfinite(errors.get(name, math.nan))]
+    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
+
+
+def fitted_yield_pressures(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Return fitted yield pressures by trial, from those by vine (and stated value, if a vine has several)."""
+    yields_Pa = {}
+    for aligned in campaign.trials:
+        trial = aligned.data.trial
+        for vine in (trial.vine, f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"):
+            value = numbers.get(f"{YIELD_PRESSURE}[{vine}]")
+            if value is not None:
+                yields_Pa[trial.name] = value
+    return yields_Pa
+
+
+# ------------------------------------------------------------------------------
+# The user's choice: the effects in the model and their sizes. Immutable; a change returns a new choice.
+
+
+class ChoiceError(UserError, ValueError):
+    """An effect, parameter or value that does not exist or is not allowed; one sentence with a remedy."""
+
+
+@dataclass(frozen=True)
+class SizeControl:
+    """One parameter of an effect with a slider, SI; `vine` is blank if one value applies to all trials."""
+
+    effect: str
+    parameter: Parameter
+    vine: str
+    low: float
+    high: float
+
+    @property
+    def key(self) -> str:
+        """`effect.parameter`."""
+        return f"{self.effect}.{self.parameter.name}"
+
+    @property
+    def name(self) -> str:
+        """`effect.parameter`, with the vine in brackets if each has its own value."""
+        return f"{self.key}[{self.vine}]" if self.vine else self.key
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The displayed unit, and the factor from SI."""
+        return display_unit(self.parameter.unit, SLIDER_UNITS)
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """Effects in the model, in the order they were added, and the value of every parameter, in the model or not.
+    `numbers` also holds the fitted yield pressures by vine, which have no slider.
+    """
+
+    effects: tuple[str, ...]
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def __contains__(self, effect: object) -> bool:
+        return effect in self.effects
+
+    def with_effect(self, effect: str, wanted: bool = True) -> ModelChoice:
+        """Return the choice with an effect added (at the end) or removed; its sizes are kept for when it returns."""
+        if wanted == (effect in self.effects):
+            return self
+        kept = tuple(name for name in self.effects if name != effect)
+        return replace(self, effects=(*kept, effect) if wanted else kept)
+
+    def with_size(self, name: str, value: float) -> ModelChoice:
+        """Return the choice with another value of one parameter."""
+        return replace(self, numbers={**self.numbers, name: value})
+
+
+def choice_in_use(campaign: Campaign) -> ModelChoice:
+    """Return the model in use with its fitted values, and all other parameters at their defaults."""
+    numbers = {
+        size.name: size.parameter.default
+        for effect in campaign.effects.values()
+        for size in sizes_of(campaign, effect, {})
+    }
+    return ModelChoice(campaign.in_use, {**numbers, **campaign.numbers})
+
+
+def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
+    """Return the sliders of an effect: one per parameter, or one per vine or day if each has its own value. Their
+    ranges include the present value.
+    """
+    sizes = []
+    for parameter in effect.parameters:
+        for vine in campaign.groups(parameter.shared):
+            bare = SizeControl(effect.name, parameter, vine, 0.0, 1.0)
+            low, high = slider_range(bare.key, parameter, numbers.get(bare.name, parameter.default))
+            sizes.append(replace(bare, low=low, high=high))
+    return sizes
+
+
+def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
+    """Return the range of a slider: the plausible range, extended to the size without effect and the present value.
+    Returns low, high, >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)),
+    5.0), (0.0, 6.25).
+    """
+    low, high = parameter.plausible or parameter.bounds
+    if key == DAMPING or not (math.isfinite(low) and math.isfinite(high)):
+        reach = 2.0 * max(abs(value), abs(parameter.default), 1e-12)
+        low, high = (0.0 if parameter.bounds[0] >= 0 else -reach), reach
+    low, high = min(low, parameter.zero, value), max(high, parameter.zero)
+    if value >= high:
+        high = value + 0.25 * (value - low)
+    return max(low, parameter.bounds[0]), min(high, parameter.bounds[1]) if value < parameter.bounds[1] else value
+
+
+def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
+    """Return the chosen model with its sizes, ready to be simulated."""
+    effects = tuple(campaign.effects[name] for name in choice.effects)
+    values: dict[str, Value] = {}
+    for effect in effects:
+        for size in sizes_of(campaign, effect, choice.numbers):
+            value = choice.numbers.get(size.name, size.parameter.default)
+            if size.vine:
+                by_vine = values.get(size.key, {})
+                assert isinstance(by_vine, Mapping)
+                values[size.key] = {**by_vine, size.vine: value}
+            else:
+                values[size.key] = value
+    return SizedModel(Model(effects, values), fitted_yield_pressures(campaign, choice.numbers))
+
+
+def is_removable(effect: str) -> bool:
+    """Return whether an effect may be removed: the base effects may not, since all others are added to them."""
+    return effect not in BASE_EFFECTS
+
+
+def added_and_dropped(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
+    """Return the effects added to the model in use, and those removed from it. Returns added, dropped : list of str,
+    relative to the model in use.
+    """
+    added = [name for name in choice.effects if name not in campaign.in_use]
+    dropped = [name for name in campaign.in_use if name not in choice.effects]
+    return added, dropped
+
+
+def choice_from_options(
+    campaign: Campaign, start: ModelChoice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
+) -> ModelChoice:
+    """Return the choice described by options of the command line."""
+    choice = start
+    for name in add:
+        choice = choice.with_effect(_testable_effect(campaign, name))
+    for name in drop:
+        if not is_removable(name):
+            raise ChoiceError(
+                f"{name} is one of the base effects, to which all others are added: it cannot be dropped."
+            )
+        choice = choice.with_effect(name, False)
+    for text in sizes:
+        choice = _with_parsed_size(campaign, choice, text)
+    return choice
+
+
+def _testable_effect(campaign: Campaign, name: str) -> str:
+    import difflib
+
+    if name not in campaign.effects:
+        near = difflib.get_close_matches(name, campaign.effects, n=1)
+        raise ChoiceError(
+            f"There is no effect named {name!r}: {f'did you mean {near[0]}?' if near else 'see vinetrack effects'}"
+        )
+    if name in campaign.unusable:
+        raise ChoiceError(f"{name} {campaign.unusable[name]}.")
+    return name
+
+
+def _with_parsed_size(campaign: Campaign, choice: ModelChoice, text: str) -> ModelChoice:
+    name, equals, written = text.partition("=")
+    name = name.strip()
+    effect = _testable_effect(campaign, name.split(".")[0])
+    sizes = sizes_of(campaign, campaign.effects[effect], choice.numbers)
+    matching = [size for size in sizes if name in (size.name, size.key)]
+    if not equals or not matching:
+        known = ", ".join(size.name for size in sizes) or "none"
+        raise ChoiceError(f"{text!r} is no size: write NAME=VALUE, SI, with one of {known}.")
+    try:
+        value = float(written)
+    except ValueError:
+        raise ChoiceError(f"{written!r} is no number: write {name}=0.5, say, in SI units.") from None
+    low, high = matching[0].parameter.bounds
+    if not low <= value <= high:
+        raise ChoiceError(f"{name} = {value:g} is outside its bounds, {low:g} to {high:g}.")
+    choice = choice.with_effect(effect)
+    for size in matching:
+        choice = choice.with_size(size.name, value)
+    return choice

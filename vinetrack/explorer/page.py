@@ -11,12 +11,12 @@ from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.explorer.choice import ModelChoice, sized_model
-from vinetrack.explorer.controls import EffectPanel, SavePanel, TrialSelector
-from vinetrack.explorer.curves import Curves, errors_m, simulate_curves
+from vinetrack.explorer.campaign import Curves, ModelChoice, errors_m, simulate_curves, sized_model
+from vinetrack.explorer.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
 from vinetrack.explorer.film_panel import FilmPanel
 from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, fit_choice, with_numbers
-from vinetrack.explorer.look import (
+from vinetrack.explorer.plots import (
+    Plots,
     escaped,
     html_div,
     page_style,
@@ -25,10 +25,8 @@ from vinetrack.explorer.look import (
     screen_script,
     stylesheet,
     theme,
+    vine_colours,
 )
-from vinetrack.explorer.plots import Plots
-from vinetrack.explorer.proposal import ProposalPanel, Reopen
-from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.text_panels import (
     DIAGNOSIS,
     DiagnosisSummary,
@@ -42,7 +40,7 @@ from vinetrack.explorer.text_panels import (
     read_summary,
     tied_panel,
 )
-from vinetrack.figures.page_tokens import follows_screen
+from vinetrack.figures.style import follows_screen
 from vinetrack.inference.optimiser import Step
 
 # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw

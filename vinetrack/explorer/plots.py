@@ -2,24 +2,297 @@
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from bokeh.models import ColumnDataSource, CustomJSTickFormatter, HoverTool, Range1d, Span, TapTool
-
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.curves import Curves
-from vinetrack.explorer.look import GRID, INK, MUTED, plot, vine_colour
-from vinetrack.explorer.series import (
-    axis_ranges,
-    error_bars,
-    measured_lines,
-    model_lines,
-    replicate_bands,
-    residual_lines,
-    symmetric_range,
+import numpy as np
+from bokeh.models import (
+    CategoricalColorMapper,
+    ColumnDataSource,
+    CustomJS,
+    CustomJSTickFormatter,
+    Div,
+    HoverTool,
+    InlineStyleSheet,
+    Range1d,
+    Span,
+    TapTool,
 )
+from bokeh.plotting import figure
+from bokeh.themes import Theme
+
+from vinetrack.core.records import Floats
+from vinetrack.explorer.campaign import Campaign, Curves, ExplorerTrial, condition_labels
+from vinetrack.figures.style import GRID, INK, MUTED, TOKENS, VINE_COLOURS, page_frame, vine_styles
+
+# ------------------------------------------------------------------------------
+# Style shared with the report: colours, fonts, and the pieces of HTML of the page.
+
+TEMPLATES = Path(__file__).with_name("templates")
+SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+# Colours over a grey picture: the tracked edge, the edge of the model for comparison, and of the current model
+MEASURED_EDGE, REFERENCE_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
+
+_AXIS = {
+    "axis_label_text_font": SANS,
+    "axis_label_text_font_size": "13px",
+    "axis_label_text_font_style": "normal",
+    "axis_label_text_color": INK,
+    "axis_line_color": INK,
+    "major_label_text_font": SANS,
+    "major_label_text_font_size": "12px",
+    "major_label_text_color": INK,
+    "major_tick_line_color": INK,
+    "minor_tick_line_color": None,
+    "axis_label_standoff": 6,
+}
+THEME: dict[str, Any] = {
+    "attrs": {
+        "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
+        "Axis": _AXIS,
+        "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
+    }
+}
+
+
+def theme() -> Theme:
+    """Return the style of plots and widgets."""
+    return Theme(json=THEME)
+
+
+def page_template() -> str:
+    """Return the template of the page, for jinja2."""
+    return (TEMPLATES / "page.html").read_text(encoding="utf-8")
+
+
+def page_style() -> str:
+    """Return the CSS of the page around the widgets."""
+    return page_frame() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
+
+
+def screen_script(figures: Sequence[figure]) -> CustomJS:
+    """Return a script that adapts figures to a light or dark colour scheme."""
+    code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
+    return CustomJS(args={"plots": list(figures), "tokens": TOKENS}, code=code)
+
+
+def vine_colour() -> dict[str, Any]:
+    """Return the colour of glyphs with a column `colour`: a palette, so that a page can change it."""
+    colours = list(VINE_COLOURS)
+    return {"field": "colour", "transform": CategoricalColorMapper(factors=colours, palette=colours)}
+
+
+def stylesheet(more: str = "") -> InlineStyleSheet:
+    """Return CSS inside a widget, which the CSS of the page does not reach."""
+    return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
+
+
+def html_div(text: str = "", name: str | None = None, **keywords: Any) -> Div:
+    """Return a piece of HTML as a widget."""
+    return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[stylesheet()], margin=0, **keywords)
+
+
+def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
+    """Return an empty figure as wide as its card."""
+    fig = figure(
+        height=height,
+        sizing_mode="stretch_width",
+        tools="box_zoom,pan,reset",
+        active_drag=None,
+        active_scroll=None,
+        toolbar_location="above",
+        x_axis_label=x_label,
+        y_axis_label=y_label,
+        min_border_right=14,
+        margin=0,
+        **keywords,
+    )
+    fig.toolbar.autohide = True
+    fig.toolbar_inner = True
+    fig.toolbar.logo = None
+    return fig
+
+
+def escaped(text: object) -> str:
+    """Return text escaped for HTML."""
+    return html.escape(str(text))
+
+
+def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
+    """Return a table in HTML; cells are escaped, columns `numeric` are right-aligned."""
+    kinds = [' class="n"' if k in numeric else "" for k in range(len(header))]
+    head = "".join(f"<th{kind}>{escaped(cell)}</th>" for kind, cell in zip(kinds, header, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td{kind}>{escaped(cell)}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def progress_bar(share: float, text: str) -> str:
+    """Return a bar filled to a fraction, with text below it."""
+    percent = 100 * min(max(share, 0.02), 1.0)
+    return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escaped(text)}</small>'
+
+
+def command_block(lines: Sequence[str]) -> str:
+    """Return commands to copy, as HTML."""
+    return f"<pre><code>{escaped(chr(10).join(lines))}</code></pre>"
+
+
+# ------------------------------------------------------------------------------
+# Data of the page's figures, as plain columns in milliseconds and millimetres.
+
+MAX_POINTS = 250  # Points of a line on the page; chosen: one per three or four pixels
+
+Columns = dict[str, list[Any]]
+
+
+def colours(campaign: Campaign) -> dict[str, str]:
+    """Return the colour of each condition: that of its vine, as in every figure."""
+    styles = vine_styles(campaign.vines)
+    return {aligned.condition: styles[aligned.data.trial.vine].colour for aligned in campaign.trials}
+
+
+def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
+    """Return a distinguishing label and the colour of each vine."""
+    styles = vine_styles(campaign.vines)
+    first = {aligned.data.trial.vine: aligned.data.trial for aligned in reversed(campaign.trials)}
+    bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
+    labels = condition_labels(bare) if len(bare) > 1 else dict.fromkeys(bare, "measured")
+    return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
+
+
+def plotted_rows(count: int, first: int) -> slice:
+    """Return the rows of a track to draw: from a little before the motion, at most `MAX_POINTS`."""
+    begin = max(first - max((count - first) // 20, 2), 0)
+    return slice(begin, None, max(math.ceil((count - begin) / MAX_POINTS), 1))
+
+
+def measured_lines(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Return lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`,
+    `condition`.
+    """
+    trials = [campaign.trials[i] for i in shown]
+    return _lines_by_trial(campaign, [(aligned, aligned.time_s, aligned.growth_m) for aligned in trials])
+
+
+def _lines_by_trial(campaign: Campaign, lines: Iterable[tuple[ExplorerTrial, Floats, Floats]]) -> Columns:
+    """One line per trial, from its abscissae and ordinates in SI, scaled by 1000."""
+    colour = colours(campaign)
+    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
+    for aligned, x, y in lines:
+        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        columns["xs"].append(1e3 * x[rows])
+        columns["ys"].append(1e3 * _with_gaps(aligned, rows, y[rows]))
+        columns["colour"].append(colour[aligned.condition])
+        columns["trial"].append(aligned.name)
+        columns["condition"].append(campaign.labels[aligned.condition])
+    return columns
+
+
+def _with_gaps(aligned: ExplorerTrial, rows: slice, values: Floats) -> Floats:
+    """Insert NaN after each gap, so that no line is drawn across frames that were left out."""
+    stretch = np.cumsum(aligned.data.first)[rows]
+    out = values.copy()
+    out[np.flatnonzero(np.diff(stretch) > 0) + 1] = math.nan
+    return out
+
+
+def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Return outlines of one standard deviation of the replicates around their mean, ms and mm."""
+    colour = colours(campaign)
+    columns: Columns = {"xs": [], "ys": [], "colour": []}
+    for condition in _conditions(campaign, shown):
+        band = campaign.bands.get(condition)
+        if band is None or band.time_s.size < 2:
+            continue
+        rows = plotted_rows(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
+        time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
+        columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
+        columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
+        columns["colour"].append(colour[condition])
+    return columns
+
+
+def model_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
+    columns: Columns = {"xs": [], "ys": []}
+    for condition in _conditions(campaign, shown):
+        members = [i for i in shown if campaign.trials[i].condition == condition]
+        longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
+        aligned = campaign.trials[longest]
+        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        columns["xs"].append(1e3 * aligned.time_s[rows])
+        columns["ys"].append(1e3 * curves[longest].growth_m[rows])
+    return columns
+
+
+def residual_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm."""
+    trials = [(campaign.trials[i], curves[i]) for i in shown]
+    return _lines_by_trial(campaign, [(aligned, aligned.growth_m, motion.residual_m) for aligned, motion in trials])
+
+
+def error_bars(
+    campaign: Campaign,
+    now_m: Mapping[str, float],
+    before_m: Mapping[str, float],
+    floors_m: Mapping[str, float],
+    shown: Sequence[str],
+) -> Columns:
+    """Return one row per condition, the first at the bottom: `label`, `now`, `before`, `floor` (mm),
+    `colour`, `alpha`.
+    """
+    colour = colours(campaign)
+    names = list(reversed(campaign.conditions))
+    return {
+        "condition": names,
+        "label": [campaign.labels[name] for name in names],
+        "now": [_mm(now_m.get(name)) for name in names],
+        "before": [_mm(before_m.get(name)) for name in names],
+        "floor": [_mm(floors_m.get(name)) for name in names],
+        "colour": [colour[name] for name in names],
+        "alpha": [0.95 if name in shown else 0.3 for name in names],
+    }
+
+
+def axis_ranges(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return ranges that contain all lines with a margin. Returns (left, right), (bottom, top)."""
+    if not columns["xs"]:
+        return (0.0, 1.0), (0.0, 1.0)
+    ranges = []
+    for key in ("xs", "ys"):
+        low = min(float(np.nanmin(part)) for part in columns[key])
+        high = max(float(np.nanmax(part)) for part in columns[key])
+        room = share * ((high - low) or 1.0)
+        ranges.append((low - room, high + room))
+    return ranges[0], ranges[1]
+
+
+def symmetric_range(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
+    """Return a symmetric range for residuals, rounded so that it rarely changes while a slider moves. Returns low, high
+    : float, mm.
+    """
+    parts: list[Floats] = columns["ys"]
+    largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)
+    step = 10 ** math.floor(math.log10(max(largest, least_mm)))
+    reach = next(step * k for k in (1.2, 2, 3, 5, 7, 10) if step * k >= 1.05 * max(largest, least_mm) or k == 10)
+    return -reach, reach
+
+
+def _conditions(campaign: Campaign, shown: Sequence[int]) -> list[str]:
+    present = {campaign.trials[i].condition for i in shown}
+    return [name for name in campaign.conditions if name in present]
+
+
+def _mm(value: float | None) -> float:
+    return math.nan if value is None else 1e3 * value
+
 
 ROW_PX = 25  # Height of a bar of the errors; chosen: a label of 12 pixels and a gap of equal height
 

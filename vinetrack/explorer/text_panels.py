@@ -8,22 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.numbers import decimals
-from vinetrack.core.units import SLIDER_UNITS, display_unit
+from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import ModelChoice
-from vinetrack.explorer.curves import Curves, overall_m
-from vinetrack.explorer.export import model_text
-from vinetrack.explorer.fitting import Fitted, correlated_pairs_text, likelihood_change_text
-from vinetrack.explorer.look import command_block, escaped, table
-from vinetrack.explorer.series import vine_colours
-from vinetrack.figures.candidate_figures import TIED_COSINE
+from vinetrack.explorer.campaign import Campaign, Curves, ModelChoice, overall_m
+from vinetrack.explorer.fitting import Fitted, correlated_pairs_text, likelihood_change_text, model_text
+from vinetrack.explorer.plots import command_block, escaped, table, vine_colours
+from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.verdict_summary import estimate_text
-from vinetrack.results.folder_layout import Results, ResultsError
-from vinetrack.results.stored_diagnosis import read_diagnosis
+from vinetrack.narrative.verdict_text import estimate_text
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
 FLOOR_MARGIN = 1.15  # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it
 

@@ -7,14 +7,35 @@ are hollow.
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.numbers import number, with_interval
-from vinetrack.figures.panels import legend_above, line_key, plain_log_ticks
-from vinetrack.figures.style import INK, METHOD_COLOURS, METHOD_LINES, MUTED, PAPER, VineStyle, blank, look, vine_styles
-from vinetrack.narrative.law_text import METHOD_NAMES
+from vinetrack.core.units import interval, number, with_interval
+from vinetrack.figures.style import (
+    DASHED,
+    INK,
+    METHOD_COLOURS,
+    METHOD_LINES,
+    MUTED,
+    PAPER,
+    VINE_COLOURS,
+    VineStyle,
+    blank,
+    counted,
+    error_points,
+    legend_above,
+    line_key,
+    look,
+    note_below,
+    panel_grid,
+    plain_log_ticks,
+    rows,
+    up_from_zero,
+    vine_styles,
+)
+from vinetrack.narrative.diagnosis_text import METHOD_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,6 +43,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 _TWO_LINE_VINES = 6  # Chosen: a legend with two lines for each of six vines is 2.5 in high, of 5.6 in of figure
 
@@ -55,12 +77,12 @@ def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure:
 
 
 def _draw_points(ax: Axes, group: pd.DataFrame, style: VineStyle) -> None:
-    for used, rows in group.groupby("used"):
+    for used, points in group.groupby("used"):
         ax.errorbar(
-            rows["x_ss_m_s"],
-            rows["force_N"],
-            xerr=_below(rows["x_ss_sigma_m_s"], rows["x_ss_m_s"]),
-            yerr=_below(rows["force_sigma_N"], rows["force_N"]),
+            points["x_ss_m_s"],
+            points["force_N"],
+            xerr=_below(points["x_ss_sigma_m_s"], points["x_ss_m_s"]),
+            yerr=_below(points["force_sigma_N"], points["force_N"]),
             fmt=style.marker,
             color=style.colour,
             mfc=style.colour if used else PAPER,
@@ -225,3 +247,260 @@ def _draw_published_law(
         if vine in published["B"]:
             deviation = _deviation(published["B"][vine], best[vine]["B"])
             right.plot([deviation, deviation], [i - 0.4, i + 0.4], **line)
+
+
+# ------------------------------------------------------------------------------
+# Damping, steady speed, efficiency and final speed against the size and the load of the vine.
+#
+# Both straight lines and power laws are drawn, because neither is known to be right.
+
+_LABELS = {"diameter_mm": "diameter (mm)", "thickness_um": "wall thickness (µm)"}
+_TITLES = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
+_MAX_SCALING_FAMILIES = 4  # Chosen: four families have twelve lines of legend above the axes
+
+
+def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure:
+    """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter."""
+    from matplotlib.figure import Figure
+
+    kinds = [kind for kind in _TITLES if scaling.get(kind)]
+    if not kinds:
+        return blank(f"Nothing to draw B against: {scaling.get('reason') or 'no vine has a damping coefficient'}.")
+    with look():
+        fig = Figure(figsize=(6.6 if len(kinds) == 1 else 11.0, 5.2), layout="constrained")
+        for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
+            families = scaling[kind][:_MAX_SCALING_FAMILIES]
+            ax.set(xscale="log", yscale="log", xlabel=_LABELS[families[0]["along"]], ylabel="B (N·(s/m)ⁿ)")
+            for i, family in enumerate(families):
+                _draw_B_family(ax, family, i)
+            _draw_published_B(ax, families, published)
+            _finish_scaling(ax, families)
+            left_out = len(scaling[kind]) - len(families)
+            title = _TITLES[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
+            legend_above(ax, n_columns=1, title=title, alignment="left")
+        note_below(fig, note)
+    return fig
+
+
+def _draw_B_family(ax: Axes, family: dict[str, Any], index: int) -> None:
+    colour = VINE_COLOURS[index]
+    sizes, B = np.array(family["sizes"], dtype=float), np.array(family["B"], dtype=float)
+    low, high = np.array(family["B_95"], dtype=float).T
+    errors = np.vstack([B - low, high - B]).clip(min=0)
+    refused = f"\nno line: {family['refused']}" if family.get("refused") else ""
+    label = f"B with 95 % interval, N = {B.size} vines{refused}"
+    error_points(ax, sizes, B, errors, index, label, elinewidth=1.3, zorder=3)
+    span = np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
+    if power := family["power"]:
+        label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}), R² {number(power['R2'])}"
+        ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.5, label=label)
+    if line := family["line"]:
+        straight = line["intercept"] + line["slope"] * span
+        drawn = straight > 0.5 * B.min()
+        label = f"straight line, intercept {number(line['intercept'])}, R² {number(line['R2'])}"
+        ax.plot(span[drawn], straight[drawn], color=colour, lw=1.3, ls=DASHED, label=label)
+
+
+def _draw_published_B(ax: Axes, families: list[dict[str, Any]], published: dict[str, Any] | None) -> None:
+    given = (published or {}).get("B", {})
+    pairs = [
+        (size, given[vine])
+        for family in families
+        for vine, size in zip(family["vines"], family["sizes"], strict=True)
+        if vine in given
+    ]
+    if published and pairs:
+        x, B = zip(*pairs, strict=True)
+        ax.plot(x, B, "D", mfc="none", mec=MUTED, ms=11, mew=1.3, label=published["source"])
+
+
+def _finish_scaling(ax: Axes, families: list[dict[str, Any]]) -> None:
+    sizes = sorted({size for family in families for size in family["sizes"]})
+    ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
+    plain_log_ticks(ax)
+    if len(sizes) <= 8:
+        ax.set_xticks(sizes)
+
+
+_MAX_SPEED_FAMILIES = 5  # Chosen: each pressure has three lines of legend above the axes
+_SPEED_PANELS = (
+    ("x_ss_m_s", "x_ss_sigma_m_s", "steady tail speed x_ss (m/s)", "Speed"),
+    ("x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "x_ss / diameter (1/s)", "Speed over diameter"),
+)
+
+
+def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
+    """Draw x_ss and x_ss/D against D: straight lines full, power laws dashed. Error bars are standard errors; that of a
+    single trial does not include replicate scatter.
+    """
+    from matplotlib.figure import Figure
+
+    families = scaling.get("steady_speed") or []
+    if not families:
+        return blank("No two vines that are scaled copies of each other have a steady speed at one pressure.")
+    with look():
+        fig = Figure(figsize=(11.0, 5.2 + 0.45 * min(len(families), _MAX_SPEED_FAMILIES)), layout="constrained")
+        for ax, (key, sigma, label, title) in zip(fig.subplots(1, 2), _SPEED_PANELS, strict=True):
+            for i, family in enumerate(families[:_MAX_SPEED_FAMILIES]):
+                lines = family if key == "x_ss_m_s" else family["over_diameter"]
+                _draw_speed_family(ax, family, key, sigma, lines, i)
+            ax.set(xlabel="diameter (mm)", ylabel=label)
+            up_from_zero(ax, x=True)
+            left_out = len(families) - _MAX_SPEED_FAMILIES
+            more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
+            legend_above(ax, n_columns=1, title=title + more, alignment="left", fontsize=9)
+        note_below(fig, " ".join(filter(None, [note, _single_trial_note(families[:_MAX_SPEED_FAMILIES])])))
+    return fig
+
+
+def _draw_speed_family(
+    ax: Axes, family: dict[str, Any], key: str, sigma: str, lines: dict[str, Any], index: int
+) -> None:
+    colour = VINE_COLOURS[index % len(VINE_COLOURS)]
+    sizes, values, errors = (np.array(family[name], dtype=float) for name in ("sizes", key, sigma))
+    counts = [int(count) for count in family["n_steady"]]
+    trials = counted(min(counts), max(counts), "trial")
+    label = f"{family['pressure_kPa']:.4g} kPa, N = {counted(sizes.size, sizes.size, 'vine')} of {trials}"
+    error_points(ax, sizes, values, errors, index, f"{label}{_trend_text(lines)}", elinewidth=1.3)
+    span = np.linspace(0.8 * sizes.min(), 1.1 * sizes.max(), 100)
+    if line := lines["line"]:
+        ax.plot(span, line["intercept"] + line["slope"] * span, color=colour, lw=1.5)
+    if power := lines["power"]:
+        curve = np.exp(power["intercept"]) * span ** power["slope"]
+        ax.plot(span, curve, color=colour, lw=1.3, ls=DASHED)
+
+
+def _trend_text(lines: dict[str, Any]) -> str:
+    if lines["refused"]:
+        return f"\nno trend: {lines['refused']}"
+    line, power = lines["line"], lines["power"]
+    slope = f"{number(power['slope'], 2)} ({interval(power['slope_95'])}), p = {number(power['p'], 2)}"
+    return f"\npower (dashed) {slope}\nline (full): R² {number(line['R2'])}, p = {number(line['p'], 2)}"
+
+
+def _single_trial_note(families: list[dict[str, Any]]) -> str:
+    if not any(count == 1 for family in families for count in family["n_steady"]):
+        return ""
+    return "The error bar of a single trial does not include replicate scatter."
+
+
+_EFFICIENCIES = {
+    "efficiency": "½ m(x) ẋ² / (P₀ A y)",
+    "efficiency_payload": "payload's motion alone",
+    "efficiency_with_weight": "work of the weight in the denominator",
+}
+_SIZE_AXES = {"thickness_um": ("wall thickness (µm)", "wall"), "diameter_mm": ("diameter (mm)", "diameter")}
+_SIZE_UNITS = {"thickness_um": "µm", "diameter_mm": "mm"}
+
+
+def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
+    """Draw the largest family of conditions that differ only in size."""
+    from matplotlib.figure import Figure
+
+    families = scaling.get("efficiency") or []
+    if not families:
+        return blank("No two vines of different size were grown to the same length at one pressure with one payload.")
+    family = families[0]
+    along = [name for name in _SIZE_AXES if len(set(family[name])) > 1]
+    shown = [key for key in _EFFICIENCIES if np.any(np.array(family[key], dtype=float) > 0)]
+    with look():
+        fig = Figure(figsize=(0.9 + 3.6 * len(shown), 1.0 + 3.5 * len(along)), layout="constrained")
+        axes = fig.subplots(len(along), len(shown), squeeze=False, sharey=True)
+        for row, x in enumerate(along):
+            for ax, key in zip(axes[row], shown, strict=True):
+                _draw_efficiency(ax, family, key, x)
+                ax.set_xlabel(_SIZE_AXES[x][0])
+                if row == 0:
+                    ax.set_title(_EFFICIENCIES[key], fontsize=10.5)
+            axes[row][0].set(ylabel="energy efficiency (%)", ylim=(0, 1.08 * max(ax.dataLim.y1 for ax in axes[row])))
+            axes[row][-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
+        fig.suptitle(_efficiency_title(family, len(families)), fontsize=11, x=0.01, ha="left")
+        note_below(fig, note)
+    return fig
+
+
+def _draw_efficiency(ax: Axes, family: dict[str, Any], key: str, x: str) -> None:
+    other = next(name for name in _SIZE_AXES if name != x)
+    sizes, others, values, errors = (np.array(family[name], dtype=float) for name in (x, other, key, f"{key}_sigma"))
+    for i, size in enumerate(np.unique(others)):
+        chosen = np.flatnonzero(others == size)
+        chosen = chosen[np.argsort(sizes[chosen])]
+        label = f"{size:.4g} {_SIZE_UNITS[other]}"
+        error_points(ax, sizes[chosen], 100 * values[chosen], 100 * errors[chosen], i, label, ls="-", ms=5.5, lw=1.2)
+    ax.set_xlim(0, 1.12 * sizes.max())
+    ax.text(0.03, 0.03, _power_text(family["trend"][key], x), transform=ax.transAxes, fontsize=8.5, color=MUTED)
+
+
+def _power_text(trend: dict[str, Any], x: str) -> str:
+    if trend.get("refused"):
+        return f"no trend: {textwrap.fill(str(trend['refused']), 30)}"
+    if x not in trend:
+        return ""
+    power = trend[x]
+    spread, p = interval(power["power_95"]), number(power["p"], 2)
+    return f"power of the {_SIZE_AXES[x][1]} {number(power['power'], 2)}\n({spread}), p = {p}"
+
+
+def _efficiency_title(family: dict[str, Any], n_families: int) -> str:
+    counts = [int(count) for count in family["n_efficiency"]]
+    error = ", ± standard error" if max(counts) > 1 else ""
+    load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
+    left = n_families - 1
+    more = f"; {left} more {'family' if left == 1 else 'families'} in scaling.json" if left else ""
+    return (
+        f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
+        f"N = {counted(min(counts), max(counts), 'trial')} per point{error}{more}"
+    )
+
+
+_SIZE_FIGURES_MAX_VINES = 6  # Chosen: two rows of three panels
+PAYLOAD_LINE = "model and its 95 %"  # Name of the model's curve in the legend
+
+
+def draw_payload_speed(
+    conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = PAYLOAD_LINE
+) -> Figure:
+    """Draw final speeds of vines grown with more than one payload."""
+    from matplotlib.figure import Figure
+
+    reached = conditions[conditions["final_lead_velocity_m_s"] > 0]
+    reached = reached[reached.groupby(["vine", "pressure_kPa"])["payload_g"].transform("nunique") > 1]
+    vines = [str(vine) for vine in dict.fromkeys(reached["vine"])][:_SIZE_FIGURES_MAX_VINES]
+    if not vines:
+        return blank("No vine was grown with more than one payload at one pressure.")
+    with look():
+        n_columns = min(len(vines), 3)
+        width_in = 6.6 if len(vines) == 1 else 4.4 * n_columns
+        fig = Figure(figsize=(width_in, 0.6 + 4.2 * math.ceil(len(vines) / n_columns)), layout="constrained")
+        for ax, vine in zip(panel_grid(fig, len(vines), n_columns), vines, strict=True):
+            _draw_vine(ax, reached[reached["vine"] == vine], model[model["vine"] == vine], line)
+        note_below(fig, note)
+    return fig
+
+
+def _draw_vine(ax: Axes, measured: pd.DataFrame, model: pd.DataFrame, line: str) -> None:
+    for i, (pressure_kPa, group) in enumerate(measured.groupby("pressure_kPa")):
+        colour = VINE_COLOURS[i % len(VINE_COLOURS)]
+        speed, sigma = (group[f"final_lead_velocity{part}_m_s"] for part in ("", "_sigma"))
+        error_points(ax, group["payload_g"], speed, sigma, i, f"{float(str(pressure_kPa)):.4g} kPa")
+        curve = model[np.isclose(model["pressure_kPa"], float(str(pressure_kPa)))].sort_values("payload_g")
+        if len(curve):
+            _draw_curve(ax, curve, colour, line if i == 0 else "")
+    first = next(rows(measured))
+    counts = measured["n_final"].astype(int)
+    times = counted(int(counts.min()), int(counts.max()), "trial")
+    ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
+    up_from_zero(ax)
+    error = ", ± standard error" if counts.max() > 1 else ""
+    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} per point{error}"
+    legend_above(ax, n_columns=2, title=title, alignment="left", fontsize=9)
+
+
+def _draw_curve(ax: Axes, curve: pd.DataFrame, colour: str, label: str) -> None:
+    payload_g, speed_m_s, sigma_m_s = (
+        curve[name].to_numpy(float)
+        for name in ("payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s")
+    )
+    half_width = 1.96 * np.nan_to_num(sigma_m_s)
+    ax.plot(payload_g, speed_m_s, color=colour, lw=1.5, label=label or None)
+    ax.fill_between(payload_g, speed_m_s - half_width, speed_m_s + half_width, color=colour, alpha=0.2, lw=0)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core import published
-from vinetrack.core.numbers import number, with_interval
-from vinetrack.figures.panels import plain_log_ticks
+from vinetrack.core.units import number, with_interval
 from vinetrack.figures.style import (
     BLUE,
     DASHED,
@@ -23,6 +22,7 @@ from vinetrack.figures.style import (
     VINE_MARKERS,
     blank,
     look,
+    plain_log_ticks,
 )
 
 if TYPE_CHECKING:

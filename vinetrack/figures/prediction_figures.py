@@ -3,19 +3,167 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.panels import fitting_size, plain_log_ticks
-from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, VINE_COLOURS, look
+from vinetrack.figures.style import (
+    BLUE,
+    DASHED,
+    GRID,
+    INK,
+    MUTED,
+    VERMILLION,
+    VINE_COLOURS,
+    VINE_MARKERS,
+    blank,
+    fitting_size,
+    look,
+    plain_log_ticks,
+    vine_styles,
+)
+from vinetrack.narrative.power_text import size_text
+from vinetrack.narrative.verdict_text import spaced_name
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from vinetrack.diagnosis.power import EffectPower, Power
+
+
+# ------------------------------------------------------------------------------
+# Figures of designs: the conditions of a campaign, the fastest vine, and the pressure loss of a chamber.
+
+# Vine, pressure in kPa, payload in g, speed of the leading edge at y/L = 0.95 in m/s, of one trial
+PlannedPoint = tuple[str, float, float, float]
+
+
+def draw_campaign(points: Sequence[PlannedPoint], n_error: float, B_errors: Mapping[str, float]) -> Figure:
+    """Draw every condition, with its number of trials, at its expected speed."""
+    from matplotlib.figure import Figure
+
+    counts = Counter(points)
+    styles = vine_styles([point[0] for point in points])
+    loads = sorted({point[2] for point in points})
+    with look():
+        fig = Figure(figsize=(7.8, 4.8), layout="constrained")
+        ax = fig.subplots()
+        for vine, style in styles.items():
+            curve = sorted({(pressure, speed) for name, pressure, _, speed in points if name == vine})
+            ax.plot(*zip(*curve, strict=True), color=style.colour, lw=1.2, alpha=0.6)
+            label = f"{vine}\nB ± {100 * B_errors.get(vine, 0.0):.2g} %"
+            for (name, pressure, load, speed), count in counts.items():
+                if name != vine:
+                    continue
+                face = style.colour if load == loads[0] else "none"
+                ax.plot(pressure, speed, style.marker, color=style.colour, mfc=face, ms=9, label=label)
+                label = "_"
+                if load == loads[0]:
+                    ax.annotate(f"×{count}", (pressure, speed), (7, -4), textcoords="offset points", va="top",
+                                fontsize=8.8, color=MUTED)  # fmt: skip
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        plain_log_ticks(ax, "both")
+        ax.set_xlabel("gauge pressure (kPa)")
+        ax.set_ylabel("leading edge at y/L = 0.95 (m/s)")
+        ax.set_title(f"{len(points)} trials: n ± {n_error:.2g} expected", fontsize=11)
+        fig.legend(loc="outside right upper", fontsize=9, labelspacing=0.9)
+        if len(loads) > 1:
+            words = ", ".join(f"{load:g} g" for load in loads[1:])
+            fig.text(0.01, 0.005, f"filled: {loads[0]:g} g, hollow: {words}", color=MUTED, fontsize=9, va="bottom")
+    return fig
+
+
+@dataclass(frozen=True)
+class FilmChoice:
+    """One film."""
+
+    thickness_um: float
+    diameters_mm: np.ndarray
+    speeds_m_s: np.ndarray
+    best: tuple[float, float]
+    band: tuple[float, float]
+    odds: float
+
+
+def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
+    """Draw the films side by side: speed against diameter, and the certainty of the choice."""
+    from matplotlib.figure import Figure
+
+    label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
+    with look():
+        fig = Figure(figsize=(9.6, 4.4))
+        curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+        for k, film in enumerate(films):
+            colour, marker = VINE_COLOURS[k % len(VINE_COLOURS)], VINE_MARKERS[k % len(VINE_MARKERS)]
+            curves.plot(film.diameters_mm, film.speeds_m_s, color=colour, label=f"{film.thickness_um:g} µm")
+            curves.plot(*film.best, marker, color=colour, ms=8, clip_on=False)
+            bars.plot([k, k], film.band, color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
+            bars.plot(k, film.best[1], marker, color=colour, ms=8)
+            bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), textcoords="offset points", ha="center",
+                          fontsize=10)  # fmt: skip
+        curves.set_xlabel("diameter (mm)")
+        curves.set_ylabel(label)
+        curves.set_ylim(0.0, 1.12 * max(film.band[1] for film in films))
+        curves.set_title("best length and pressure at each diameter", fontsize=10, fontweight="normal")
+        curves.legend(title="film", fontsize=9.5)
+        bars.set_xlim(-0.6, len(films) - 0.4)
+        bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
+        bars.set_xlabel("film (µm)")
+        bars.set_title("90 % band; percentage of draws in which it is the fastest", fontsize=10, fontweight="normal")
+        fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
+        fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
+    return fig
+
+
+_MIN_LITRE_AXIS = 1e-4  # Chosen: below 0.1 mL an axis is in millilitres, so that its ticks need no exponent
+
+
+@dataclass(frozen=True)
+class GasLawLoss:
+    """One gas law: its name, and the fraction of the gauge pressure lost at every volume, shape (n_volumes,)."""
+
+    name: str
+    losses: np.ndarray
+
+
+def draw_reservoir(
+    volumes_m3: np.ndarray, laws: Sequence[GasLawLoss], loss: float, swept_m3: float, chosen_m3: float | None
+) -> Figure:
+    """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume. Shapes: volumes_m3
+    (n_volumes,).
+    """
+    from matplotlib.figure import Figure
+
+    factor, unit = (1e3, "L") if volumes_m3[0] >= _MIN_LITRE_AXIS / 10 else (1e6, "mL")
+    with look():
+        fig = Figure(figsize=(7.2, 4.4), layout="constrained")
+        ax = fig.subplots()
+        for law, colour, style in zip(laws, (BLUE, VERMILLION), ("-", DASHED), strict=False):
+            ax.plot(factor * volumes_m3, 100 * law.losses, color=colour, ls=style, label=law.name)
+        slow, fast = (100 * law.losses for law in laws[:2])
+        ax.fill_between(factor * volumes_m3, slow, fast, color=MUTED, alpha=0.12, lw=0)
+        ax.axhline(100 * loss, color=INK, lw=1.0)
+        ax.annotate(f"allowed: {100 * loss:g} %", (0.99, 100 * loss), (0, 3), ("axes fraction", "data"),
+                    textcoords="offset points", ha="right", fontsize=9.5)  # fmt: skip
+        if chosen_m3 is not None and volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
+            ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
+            ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", (factor * chosen_m3, 0.97), (5, 0),
+                        ("data", "axes fraction"), textcoords="offset points", va="top", fontsize=9.5)  # fmt: skip
+        ax.set_xscale("log")
+        ax.set_ylim(0.0, min(8 * 100 * loss, 100.0))
+        ax.set_xlim(factor * volumes_m3[0], factor * volumes_m3[-1])
+        plain_log_ticks(ax, "x")
+        ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
+        ax.set_ylabel("gauge pressure lost (%)")
+        ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9))
+    return fig
+
 
 MAX_CURVES = len(VINE_COLOURS)  # Derived: the number of colours
 _PREDICTION_WIDTH_IN = 9.6  # Chosen: two panels of 4 in with their labels
@@ -192,3 +340,90 @@ def _bulk_limits(table: pd.DataFrame) -> tuple[float, float]:
     speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
     top = 1.15 * float(np.quantile(speeds, 0.99))
     return min(0.0, 1.15 * float(np.quantile(speeds, 0.01))), top if top > 0 else 1.0
+
+
+# ------------------------------------------------------------------------------
+# Detection power of a campaign: the probability of detecting each effect against its size, as a map.
+#
+# One row per effect; columns are sizes relative to the largest plausible one. The sizes of 50 and 90 % power are listed
+# at the end of each row in the unit of the effect.
+
+# Range of sizes relative to the largest plausible one, and columns of the map (chosen)
+MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS = 1e-4, 3.0, 108
+
+_TEXT_COLUMN_X = (0.0, 0.35, 0.7)  # Abscissae of the columns of sizes, relative to their width (chosen)
+
+_ROW_IN, _WIDTH_IN = 0.31, 9.6  # Chosen: one line of 10 pt per row; a map of 4 in between names and sizes
+
+
+def draw_power(power: Power) -> Figure:
+    """Draw the power to detect each effect against its size."""
+    from matplotlib.figure import Figure
+
+    entries = sorted(power.effects, key=_order)
+    if not entries or power.wary:
+        return blank(f"Detectable sizes were not computed: {power.wary or 'no candidate acts here'}.")
+    parts = np.geomspace(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS)
+    probabilities = np.array(
+        [
+            [entry.probability_at(entry.zero + part * (entry.largest - entry.zero)) for part in parts]
+            for entry in entries
+        ]
+    )
+    with look():
+        fig = Figure(figsize=(_WIDTH_IN, _ROW_IN * len(entries) + 1.75), layout="constrained")
+        ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
+        edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, N_COLUMNS + 1)
+        mesh = ax.pcolormesh(
+            edges, np.arange(len(entries) + 1) - 0.5, probabilities, cmap=_colours(), vmin=0, vmax=1, rasterized=True
+        )
+        _mark_rows(ax, entries)
+        _list_sizes(sizes, entries)
+        bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
+        bar.set_label("power: probability of detection (%)")
+        bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
+        bar.outline.set_visible(False)
+        trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
+        ax.set_title(f"What {trials} can detect", loc="left", pad=26)
+    return fig
+
+
+def _order(entry: EffectPower) -> float:
+    """Sort key: effects detected at the smallest fraction of their plausible size first."""
+    return abs((entry.size_at(0.9) - entry.zero) / (entry.largest - entry.zero))
+
+
+def _colours() -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", BLUE, "#003f66"])
+
+
+def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
+    """Label the rows, and draw a line at the largest plausible size."""
+    ax.set_xscale("log")
+    ax.set_xlim(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE)
+    ax.set_ylim(len(entries) - 0.5, -0.5)
+    ax.grid(visible=False)
+    ax.set_xlabel("size relative to the largest plausible")
+    ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
+    # A white line below the dots keeps them visible on the dark part of the map.
+    ax.axvline(1.0, color="white", linewidth=2.2)
+    ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
+    ax.set_yticks(range(len(entries)), [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
+    ax.tick_params(axis="y", length=0)
+    for row in range(1, len(entries)):
+        ax.axhline(row - 0.5, color=GRID, linewidth=0.7)
+
+
+def _list_sizes(ax: Axes, entries: list[EffectPower]) -> None:
+    """Write sizes next to the rows of the map, in the unit of each effect; grey beyond the plausible range."""
+    ax.set_axis_off()
+    ax.set_ylim(len(entries) - 0.5, -0.5)
+    ax.set_xlim(0, 1)
+    for row, entry in enumerate(entries):
+        for column, value in zip(_TEXT_COLUMN_X, (entry.size_at(0.5), entry.size_at(0.9), entry.largest), strict=True):
+            beyond = column == _TEXT_COLUMN_X[-1] or abs(value - entry.zero) > abs(entry.largest - entry.zero)
+            ax.text(column, row, size_text(entry, value), va="center", fontsize=9, color=MUTED if beyond else INK)
+    for column, words in zip(_TEXT_COLUMN_X, ("50 %\npower", "90 %\npower", "largest\nplausible"), strict=True):
+        ax.text(column, -0.65, words, va="bottom", fontsize=9, color=INK)

@@ -130,19 +130,41 @@ def draw(name: str, *inputs: Any, **options: Any) -> Figure:
 def _drawing(name: str) -> Callable[..., Figure]:
     """The drawing function of a figure; clips (`overlay`) have none, they are composed frame by frame."""
     from vinetrack.figures import (
-        candidate_figures,
         damping_figures,
-        ladder_figures,
-        learned_force_figure,
-        misfit_figures,
-        model_comparison,
-        overview,
         paper_figures,
-        pixel_places,
-        power_figures,
-        size_figures,
-        strip_figure,
-        trial_motion,
+    )
+    from vinetrack.figures import (
+        damping_figures as size_figures,
+    )
+    from vinetrack.figures import (
+        diagnosis_figures as candidate_figures,
+    )
+    from vinetrack.figures import (
+        diagnosis_figures as ladder_figures,
+    )
+    from vinetrack.figures import (
+        diagnosis_figures as learned_force_figure,
+    )
+    from vinetrack.figures import (
+        diagnosis_figures as misfit_figures,
+    )
+    from vinetrack.figures import (
+        motion_figures as model_comparison,
+    )
+    from vinetrack.figures import (
+        motion_figures as overview,
+    )
+    from vinetrack.figures import (
+        motion_figures as trial_motion,
+    )
+    from vinetrack.figures import (
+        overlay as pixel_places,
+    )
+    from vinetrack.figures import (
+        overlay as strip_figure,
+    )
+    from vinetrack.figures import (
+        prediction_figures as power_figures,
     )
 
     functions: dict[str, Callable[..., Figure]] = {

@@ -19,27 +19,281 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vinetrack.core.blas_threads import in_one_blas_thread
-from vinetrack.core.records import Track
+from vinetrack.core.records import Floats, Track
+from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.assemble import assemble
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
+from vinetrack.effects import EffectError
+from vinetrack.inference.assemble import assemble, trial_fit
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import Fit, TrialFit
-from vinetrack.inference.goodness_of_fit import POOR_FIT
-from vinetrack.inference.left_out import predict_trials, prepared_pairs
-from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch
-from vinetrack.inference.parameters import BetweenTerm, make_layout
+from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch, solve
+from vinetrack.inference.parameters import YIELD_PRESSURE, BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.prediction_band import with_bands
-from vinetrack.inference.prepared_trials import prepare
-from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
-from vinetrack.inference.starts import align, initial_trial_effects
-from vinetrack.inference.trace_errors import as_recorded, with_fitted_trace_errors
+from vinetrack.inference.sensitivity import (
+    DAMPING_DEVIATION,
+    N_TRIAL_EFFECTS,
+    ORIGIN,
+    PRESSURE,
+    RELEASE,
+    RELEASE_STEP_FRAMES,
+    Predictor,
+    align,
+    initial_trial_effects,
+)
+from vinetrack.inference.solving import (
+    as_recorded,
+    solve_again,
+    solve_from,
+    solve_from_scratch,
+    solve_onward,
+    with_fitted_trace_errors,
+)
+from vinetrack.inference.trial_effects import (
+    Indices,
+    parameters_of_trials,
+    subset_predictor,
+    subset_problem,
+    subset_state,
+)
+from vinetrack.inference.whitening import all_products, at_correlation
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
+
+
+# ------------------------------------------------------------------------------
+# Fits to a subset of the trials of a fit, starting from its solution.
+#
+# Leaving out a condition, or fitting one vine or pressure alone, uses the same model on fewer data: nothing is read,
+# prepared or compiled again. Parameters that apply to none of the remaining trials (B of a vine that is left out) are
+# dropped.
+
+
+def fit_subset(
+    fit: Fit,
+    keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_],
+    *,
+    held: Iterable[str] = (),
+    hold_spreads: bool = False,
+    hold_noise: bool = False,
+    most_iterations: int = MOST_ITERATIONS,
+) -> Fit:
+    """Fit the same model to some of the trials of a fit, starting from its solution."""
+    rows = _rows(fit, keep)
+    places = parameters_of_trials(fit.predictor.layout, rows)
+    predictor = subset_predictor(fit.predictor, rows, places)
+    state = subset_state(fit.state, rows, places)
+    problem = subset_problem(fit.solution.problem, predictor.layout, rows, places)
+    names = set(held)
+    free = [not names & {number.name, number.key} for number in predictor.layout.free]
+    problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
+    # The numbers of a fit include their change by smooth errors of position; its state does not.
+    reported = {number.name: number.value for number in fit.numbers}
+    theta_with_fixed = [
+        number.to_scaled(reported[number.name]) if not is_free and number.name in reported else theta
+        for number, is_free, theta in zip(predictor.layout.free, free, state.theta, strict=True)
+    ]
+    state = replace(state, theta=np.array(theta_with_fixed, dtype=float))
+    fixed_terms = _fixed_terms_of(fit, rows)
+    fixed_terms = FixedTerms(
+        state.spread if hold_spreads else fixed_terms.spread,
+        (state.rho, state.variance) if hold_noise else fixed_terms.noise,
+    )
+    try:
+        solution = solve(predictor, problem, state, fixed_terms, warm=True, most_iterations=most_iterations)
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated for these trials: {error}") from error
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": fixed_terms}, profile=False)
+
+
+def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
+    """Indices of the trials to keep, in the order of the fit."""
+    wanted = list(keep)
+    names = [trial.name for trial in fit.trials]
+    if wanted and all(isinstance(entry, (bool, np.bool_)) for entry in wanted):
+        if len(wanted) != len(names):
+            raise FitError(f"The mask has {len(wanted)} entries for {len(names)} trials.")
+        rows = np.flatnonzero(wanted)
+    else:
+        unknown = sorted(set(map(str, wanted)) - set(names))
+        if unknown:
+            raise FitError(f"The fit has no trial {', '.join(unknown)}.")
+        rows = np.array([i for i, name in enumerate(names) if name in set(wanted)], dtype=int)
+    if not rows.size:
+        raise FitError("No trial is left to fit: keep one at least.")
+    return rows
+
+
+def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
+    """The variance components that the user fixed, for these trials."""
+    fixed_terms: FixedTerms = fit.options.get("held", FixedTerms())
+    if fixed_terms.noise is None:
+        return fixed_terms
+    rho, variance = fixed_terms.noise
+    return replace(fixed_terms, noise=(rho, variance[rows]))
+
+
+# ------------------------------------------------------------------------------
+# Predictions of a fitted model for trials outside the fit: only their release and origin are fitted.
+
+# Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
+LEAST_EIGENVALUE = 1e-4
+
+MOST_STEPS = 20  # Maximum number of Gauss–Newton steps for release and origin (chosen)
+
+SETTLED_FRAMES = 1e-3  # Step of the release below which it has converged, frames (chosen)
+
+FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
+
+
+def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
+    """Predict trials with their own release and origin and zero deviations, see `vinetrack.inference.fit.predict`."""
+    return predict_prepared(fit, prepared_pairs(pairs), from_rest=from_rest)
+
+
+def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
+    """As `predict_trials`, for trials whose data are already prepared."""
+    rho = 0.0 if from_rest else fit.noise_correlation
+    variance = fit.noise_m**2 * (1 - rho**2)
+    predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
+    data = predictor.data
+    try:
+        trajectories = predictor.run(predictor.jobs(np.empty(0), trial_effects))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated: {error}") from error
+    sigma = np.zeros((len(data), N_TRIAL_EFFECTS))
+    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
+    return [
+        trial_fit(
+            trial_data,
+            trial_effects[i],
+            sigma[i],
+            trajectories[i].observed_position_m,
+            trajectories[i].lead_velocity_m_s,
+            rho,
+            variance,
+        )
+        for i, trial_data in enumerate(data)
+    ]
+
+
+def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
+    """Fit release and origin of trials to a fitted model. Returns predictor (of these trials, without free parameters),
+    trial_effects (release and origin; zero deviations), square (whitened cross products of release and origin). Shape
+    (n_trials, 4).
+    """
+    data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
+    predictor = Predictor(_without_free_parameters(fit, data), data, fit.predictor.host)
+    try:
+        trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
+        trial_effects, square = _fit_release_and_origin(
+            predictor, trial_effects, 0.0 if from_rest else fit.noise_correlation, from_rest
+        )
+    except SimulationError as error:
+        raise FitError(f"The model cannot be simulated: {error}") from error
+    return predictor, trial_effects, square
+
+
+def scaled_least_squares(design: Floats, residual: Floats, least: float) -> Floats:
+    """Least squares with columns scaled to unit length; directions that are hardly determined get zero. At constant
+    speed a later release and a higher origin are collinear. Shapes: design (n_points, n_columns); residual (n_points,)
+    → (n_columns,).
+    """
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(design / length, residual, rcond=least)[0] / length)
+
+
+def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
+    """Trials with enough frames at rest to determine where they started. Shape (n_trials,)."""
+    return np.array(
+        [trial_data.n_rest >= FEWEST_AT_REST or trial_data.imprecise_rest is not None for trial_data in data],
+        dtype=bool,
+    )
+
+
+def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
+    """Prepare the data of trials for a prediction."""
+    data, unusable = prepare(pairs, weighted=False)
+    for name, reason in unusable.items():
+        raise FitError(f"Trial {name}: {reason}.")
+    return data
+
+
+def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
+    """The trial with the fitted yield pressure of its vine, if the fit has one."""
+    stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
+    for number in fit.numbers:
+        if number.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated):
+            return replace(trial_data, trial=replace(trial_data.trial, yield_pressure_Pa=number.value))
+    return trial_data
+
+
+def _without_free_parameters(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
+    try:
+        base = np.array([fit.model.parameters_of(trial_data.trial) for trial_data in data])
+    except EffectError as error:
+        raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
+    base = base.reshape(len(data), len(fit.model.parameter_names))
+    return ParameterMap(fit.model, (), (), np.zeros((len(data), 0), dtype=int), base)
+
+
+def _fit_release_and_origin(
+    predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool
+) -> tuple[Floats, Floats]:
+    """Gauss–Newton steps in release and origin, of at most two frames; the trial effects and their information. Trials
+    that have converged are not simulated again.
+    """
+    data = predictor.data
+    frames = np.array([trial_data.frame_s for trial_data in data])
+    origin_fixed = rest_is_seen(data) & from_rest
+    trial_effects, square = trial_effects.copy(), np.zeros((len(data), 2, 2))
+    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    pressurised_in_recording = np.array([trial_data.pressurised_in_recording for trial_data in data], dtype=bool)
+    for i in np.flatnonzero(origin_fixed).tolist():
+        trial_effects[i, ORIGIN] = data[i].rest_origin_m
+    active = np.arange(len(data))
+    for _ in range(MOST_STEPS):
+        sums = _cross_products_of(predictor, trial_effects, active, rho)
+        square[active] = sums[:, :2, :2]
+        sums[origin_fixed[active], ORIGIN, :] = sums[origin_fixed[active], :, ORIGIN] = 0.0
+        sums[pressurised_in_recording[active], RELEASE, :] = sums[pressurised_in_recording[active], :, RELEASE] = 0.0
+        # At constant speed release and origin are collinear, which shows at a unit diagonal.
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
+        scale[origin_fixed[active], ORIGIN] = scale[pressurised_in_recording[active], RELEASE] = 0.0
+        scaled = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.pinv(scaled, rcond=LEAST_EIGENVALUE, hermitian=True) * scale[:, :, None] * scale[:, None, :]
+        step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
+        largest_step = 2 * frames[active]
+        step[:, RELEASE] = np.clip(step[:, RELEASE], -largest_step, largest_step)
+        trial_effects[active, :2] += step
+        active = active[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[active]]
+        if not active.size:
+            break
+    return trial_effects, square
+
+
+def _cross_products_of(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
+    """Whitened cross products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
+    jobs = predictor.jobs(np.empty(0), trial_effects)
+    differenced = [row for row in rows.tolist() if not predictor.release_is_shift[row]]
+    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in differenced}
+    trajectories = predictor.run(
+        [jobs[row] for row in rows]
+        + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in differenced]
+    )
+    shifted = dict(zip(differenced, trajectories[rows.size :], strict=True))
+    columns = []
+    for row, trajectory in zip(rows.tolist(), trajectories, strict=False):
+        sensitivity = -trajectory.lead_velocity_m_s
+        if row in shifted:
+            sensitivity = (shifted[row].observed_position_m - trajectory.observed_position_m) / steps[row]
+        residual = predictor.data[row].lead_position_m - trial_effects[row, ORIGIN] - trajectory.observed_position_m
+        columns.append(np.column_stack([sensitivity, np.ones_like(sensitivity), residual]))
+    return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)
+
 
 __all__ = ["FitError", "fit", "predict", "refit"]
 

@@ -12,7 +12,8 @@ likelihood compares hypotheses without crediting any of them with what a lens co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -20,23 +21,247 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.fit_problem import variance_floor
-from vinetrack.inference.gauss_newton import levenberg_marquardt_step
-from vinetrack.inference.intervals import LEAST_INFORMATION
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.marginal_likelihood import (
+    Marginal,
     deviance,
     estimate_between_trial_sd,
     estimate_noise,
+    levenberg_marquardt_step,
     marginal,
     normal_equations,
+    trial_effect_step,
 )
-from vinetrack.inference.mixed_effects import FitState, MixedProblem
-from vinetrack.inference.optimiser import CONVERGED_VARIANCES, FixedTerms, Solution, variance_change
-from vinetrack.inference.sensitivity import ORIGIN, Predictor
+from vinetrack.inference.mixed_effects import (
+    DEVIATION_COLUMNS,
+    FitState,
+    MixedProblem,
+    inverse_of_block,
+    trial_effects_eliminated,
+)
+from vinetrack.inference.optimiser import (
+    CONVERGED_VARIANCES,
+    FixedTerms,
+    Solution,
+    solve,
+    variance_change,
+    variance_floor,
+)
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
+
+
+# ------------------------------------------------------------------------------
+# Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
+#
+# The covariance is the inverse information of the linearised mixed model. As between-trial standard deviations are
+# estimated from a few trials, 95 % intervals use Student's t with Satterthwaite degrees of freedom (Giesbrecht & Burns,
+# Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the profile
+# likelihood: the values that a constrained fit does not reject.
+
+# Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined
+SINGULAR_EIGENVALUE = 1e-10
+
+LEAST_INFORMATION = 1e-6  # Information below which a parameter has no influence on the trajectories (chosen)
+
+NEAR_BOUND_SIGMAS = 3.5  # Standard errors from a bound within which the interval is a profile interval
+
+LOG_STEP = 0.1  # Step of derivatives in the logarithm of a positive number (chosen)
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Covariance of the free parameters, scaled, shape (n_free, n_free), infinite for undetermined ones. `degrees`,
+    shape (n_free,), are the degrees of freedom of the errors. `insensitive` marks parameters without influence on the
+    trajectories, `collinear` those of which only a combination with others is determined.
+    """
+
+    covariance: Floats
+    degrees: Floats
+    insensitive: np.ndarray
+    collinear: np.ndarray
+
+
+def first_parameters(precision_of_all: Precision, count: int) -> Precision:
+    """The precision of the first `count` parameters, the others integrated out."""
+    return Precision(
+        precision_of_all.covariance[:count, :count],
+        precision_of_all.degrees[:count],
+        precision_of_all.insensitive[:count],
+        precision_of_all.collinear[:count],
+    )
+
+
+def precision(solution: Solution) -> Precision:
+    """Covariance at the end of a fit, from the model of noise and between-trial variation."""
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    covariance, insensitive, collinear = _covariance(part, solution.problem, solution.state, solution.state.spread)
+    return Precision(covariance, degrees_of_freedom(solution), insensitive, collinear)
+
+
+def _covariance(
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
+) -> tuple[Floats, np.ndarray, np.ndarray]:
+    """Covariance of the free parameters, which of them are insensitive, and which are collinear."""
+    information = normal_equations(part, problem, state, spread)[0]
+    diagonal = np.diag(information)
+    insensitive = problem.free & ~(diagonal > LEAST_INFORMATION)
+    k = np.flatnonzero(problem.free & ~insensitive)
+    covariance = np.zeros_like(information)
+    collinear = np.zeros(diagonal.size, dtype=bool)
+    if k.size:
+        scale = 1 / np.sqrt(diagonal[k])
+        values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
+        singular = values < SINGULAR_EIGENVALUE
+        for column in np.flatnonzero(singular):
+            collinear[k] |= np.abs(vectors[:, column]) > 0.1
+        inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
+        covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
+    unknown = np.flatnonzero(insensitive | collinear)
+    covariance[unknown, unknown] = math.inf
+    return covariance, insensitive, collinear
+
+
+def degrees_of_freedom(solution: Solution) -> Floats:
+    """Satterthwaite degrees of freedom of every free parameter; infinite if no between-trial variance matters. Source:
+    Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted likelihood in
+    the logarithms of the between-trial standard deviations. Shape (n_free,).
+    """
+    problem, state = solution.problem, solution.state
+    active = [k for k in range(2) if solution.estimable[k] and state.spread[k] > 1e-4]
+    size = problem.prior_mean.size
+    if not active:
+        return np.full(size, math.inf)
+    part = marginal(solution.cross_products, problem, state)
+
+    def spread_at(shifts: Floats) -> tuple[float, float]:
+        spread = list(state.spread)
+        for k, shift in zip(active, shifts, strict=True):
+            spread[k] *= math.exp(shift)
+        return spread[0], spread[1]
+
+    steps = LOG_STEP * np.eye(len(active))
+    slopes = [
+        (
+            _intervals_variances(part, problem, state, spread_at(step))
+            - _intervals_variances(part, problem, state, spread_at(-step))
+        )
+        / (2 * LOG_STEP)
+        for step in steps
+    ]
+    curvature = _curvature(lambda shifts: 0.5 * deviance(part, problem, state, spread_at(shifts)), len(active))
+    values, vectors = np.linalg.eigh(curvature)
+    determined = values > 1e-3
+    spread_covariance = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
+    gradient = np.column_stack(slopes)
+    uncertainty = np.einsum("pi,ij,pj->p", gradient, spread_covariance, gradient)
+    variances = _intervals_variances(part, problem, state, state.spread)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = 2 * variances**2 / uncertainty
+    return np.where(uncertainty > 0, np.maximum(degrees, 2.0), math.inf)
+
+
+def _intervals_variances(part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]) -> Floats:
+    return np.nan_to_num(np.diag(_covariance(part, problem, state, spread)[0]), posinf=0.0)
+
+
+def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
+    """Second derivatives of a function of `size` variables at zero, by central differences."""
+    step, unit = LOG_STEP, LOG_STEP * np.eye(size)
+    centre = function(np.zeros(size))
+    matrix = np.empty((size, size))
+    for i in range(size):
+        matrix[i, i] = (function(unit[i]) - 2 * centre + function(-unit[i])) / step**2
+        for j in range(i):
+            both = function(unit[i] + unit[j]) + function(-unit[i] - unit[j])
+            across = function(unit[i] - unit[j]) + function(unit[j] - unit[i])
+            matrix[i, j] = matrix[j, i] = (both - across) / (4 * step**2)
+    return matrix
+
+
+def student(dof: Floats) -> Floats:
+    """Half width of a 95 % interval in standard errors."""
+    from scipy.stats import t
+
+    return np.asarray(t.ppf(0.975, np.minimum(dof, 1e6)))
+
+
+def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
+    """Parameters with a bound within `NEAR_BOUND_SIGMAS` standard errors. Shapes: sigma (n_free,) → (n_free,)."""
+    problem, theta = solution.problem, solution.state.theta
+    room = np.minimum(theta - problem.lower, problem.upper - theta)
+    return np.isfinite(sigma) & (room < NEAR_BOUND_SIGMAS * sigma)
+
+
+def profile_interval(
+    predictor: Predictor, solution: Solution, place: int, sigma: float, reach: float
+) -> tuple[float, float]:
+    """Profile-likelihood interval of one parameter: constrained fits whose −2 ln L lies within `reach`² of the best.
+    Between-trial standard deviations and noise stay those of the best fit, so that for a linear model this is the
+    interval ± `reach` · `sigma`. A side that meets a bound first ends there. Returns low, high : float: Scaled.
+    """
+    problem, state = solution.problem, solution.state
+    held = FixedTerms(state.spread, (state.rho, state.variance))
+    best = _deviance(solution)
+    ends = []
+    for side, bound in ((-1, problem.lower[place]), (1, problem.upper[place])):
+        value, evaluated = float(state.theta[place]), [(0.0, 0.0)]
+        distance = reach * sigma
+        for _ in range(6):
+            distance = min(distance, abs(bound - value))
+            if distance <= 1e-12:
+                break
+            rise = _deviance_increase(predictor, solution, held, place, value + side * distance, best)
+            evaluated.append((distance, math.copysign(math.sqrt(abs(rise)), rise)))
+            if abs(evaluated[-1][1] - reach) < 0.03 * reach or (
+                distance >= abs(bound - value) and evaluated[-1][1] < reach
+            ):
+                break
+            distance = _next_distance(evaluated, reach)
+        ends.append(value + side * min(distance, abs(bound - value)))
+    return ends[0], ends[1]
+
+
+def _deviance(solution: Solution) -> float:
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    return deviance(part, solution.problem, solution.state, solution.state.spread, restricted=False)
+
+
+def _deviance_increase(
+    predictor: Predictor, solution: Solution, held: FixedTerms, place: int, value: float, best: float
+) -> float:
+    """Increase of −2 ln L if one parameter is fixed at `value` and all others are fitted again."""
+    free = solution.problem.free.copy()
+    free[place] = False
+    theta = solution.state.theta.copy()
+    step = value - theta[place]
+    part = marginal(solution.cross_products, solution.problem, solution.state)
+    covariance = _covariance(part, solution.problem, solution.state, solution.state.spread)[0]
+    if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
+        direction = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
+        theta = np.clip(theta + direction * step, solution.problem.lower, solution.problem.upper)
+    theta[place] = value
+    problem = replace(solution.problem, free=free)
+    try:
+        constrained = solve(
+            predictor, problem, replace(solution.state, theta=theta), held, warm=True, most_iterations=8
+        )
+    except SimulationError:
+        return 1e6
+    return _deviance(constrained) - best
+
+
+def _next_distance(evaluated: list[tuple[float, float]], reach: float) -> float:
+    """Distance at which the root of the increase reaches its target, by a chord through the two nearest points."""
+    below = max((point for point in evaluated if point[1] <= reach), key=lambda point: point[0])
+    above = min((point for point in evaluated if point[1] > reach), key=lambda point: point[0], default=None)
+    if above is None:
+        return below[0] * float(np.clip(reach / max(below[1], 0.2), 1.2, 3.0))
+    return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])
+
 
 ORDERS = (1, 2, 3, 4)  # Legendre orders of the shapes
 
@@ -233,3 +458,191 @@ def with_smooth_errors(fit: Fit) -> Solution:
     """The solution of a fit, with the smooth errors of position among its parameters where there are any."""
     smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
     return smooth.solution if smooth else fit.solution
+
+
+# ------------------------------------------------------------------------------
+# Pooling of few trials that disagree: a between-trial variance of the shared parameters sets the weights of trials.
+#
+# A fit gives every trial a noise of its own, and some trials a deviation of B and pressure. Where trials differ in a
+# parameter that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the
+# smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights further.
+# So:
+#
+# 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too. 2. The parameters
+# θ_i
+# of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
+
+# Maximum number of steps, and the length of a step in standard errors at which they have converged (chosen)
+POOLING_MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05
+
+LARGEST_TAU2 = 1e6  # Largest τ², in variances of one trial by its noise (chosen)
+
+LONGEST_STEP = 3.0  # Longest step of a parameter, in units of √(its variance + the variance between trials) (chosen)
+
+# Least information of a trial on a direction that counts, relative to its largest (derived)
+LEAST_RELATIVE_INFORMATION = 1e-12
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Shared parameters with trials weighted by noise and disagreement, scaled. `solution` is the state at these
+    parameters, with the smooth errors of position as further ones.
+    """
+
+    solution: Solution
+    information: Floats
+    scores: Floats
+    covariance: Floats
+    between: Floats
+
+
+# Deviation of a trial's ln B, or relative one of its pressure, at which a step has left the region in which the model
+# is nearly linear (chosen)
+FARTHEST_DEVIATION = 3.0
+
+
+def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
+    """Estimate the shared parameters with trials weighted by noise and disagreement."""
+    if len(predictor.data) < 2:
+        return None
+    shapes = _shapes(predictor, solution)
+    count = shapes[0].shape[1]
+    problem = with_shapes(solution.problem, count) if count else solution.problem
+    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
+    columns: Sequence[Floats] = solution.columns
+    for _ in range(POOLING_MOST_STEPS):
+        extended = _with_shapes(columns, shapes, state.theta[shared:])
+        cross_products = predictor.products(extended)
+        rho, variance = estimate_noise(cross_products, problem, state, within=True)
+        state = replace(state, rho=rho, variance=np.maximum(variance, variance_floor(predictor.data)))
+        pooled = _with_weights(
+            replace(solution, state=state, problem=problem, cross_products=cross_products, columns=tuple(extended)),
+            shared,
+        )
+        step = pooled.covariance @ _gradient(pooled, problem, state)
+        scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
+        longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
+        errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
+        if float(np.max(np.abs(step) / errors, initial=0.0)) < CONVERGED_STEP_SIGMAS:
+            return pooled
+        step = step * min(1.0, LONGEST_STEP / longest)
+        state = _state_after_step(pooled.solution, state, step)
+        if np.max(np.abs(state.trial_effects[:, DEVIATION_COLUMNS])) > FARTHEST_DEVIATION:
+            return None
+        try:
+            columns = predictor.linearise(state.theta[:shared], state.trial_effects)
+        except SimulationError:
+            return None
+    return None
+
+
+def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
+    grown = [
+        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
+        for trial_data, trial_effects, columns in zip(
+            predictor.data, solution.state.trial_effects, solution.columns, strict=True
+        )
+    ]
+    return position_shapes(predictor, grown)
+
+
+def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:
+    return [
+        np.column_stack([block[:, :-1], shape, block[:, -1] - shape @ sizes])
+        for block, shape in zip(columns, shapes, strict=True)
+    ]
+
+
+def _gradient(pooled: Pooled, problem: MixedProblem, state: FitState) -> Floats:
+    return np.asarray(pooled.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
+
+
+def _state_after_step(solution: Solution, state: FitState, step: Floats) -> FitState:
+    """The state after a step, with the effects of the trials following to first order."""
+    problem = solution.problem
+    theta = np.clip(state.theta + step, problem.lower, problem.upper)
+    change = np.append(theta - state.theta, 0.0)[problem.index]
+    moved_products = solution.cross_products.copy()
+    # The residual after the step: r − X δ.
+    moved_products[..., -1] -= np.einsum("nsik,nk->nsi", solution.cross_products[..., N_TRIAL_EFFECTS:-1], change)
+    trial_effects = state.trial_effects + trial_effect_step(moved_products, problem, state)
+    return replace(state, theta=theta, trial_effects=trial_effects)
+
+
+def _with_weights(solution: Solution, shared: int) -> Pooled:
+    """The pooled fit at a state, with τ² at the maximum of its restricted likelihood."""
+    problem, state = solution.problem, solution.state
+    size = problem.prior_mean.size
+    information, scores = trial_information(solution)
+    total = information.sum(axis=0) + np.diag(problem.prior_precision)
+    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
+    estimated = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
+    root = _typical_root(inverse_of_block(total, estimated), information, shared)
+    values, vectors = np.linalg.eigh(information)
+    information_roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    # With J = H Hᵀ and Hᵀ R = U S Vᵀ, R the root of M, (J⁻¹ + τ²M)⁻¹ = H U (1 + τ²S²)⁻¹ Uᵀ Hᵀ for any τ²: J − J(…)J
+    # would lose all digits of a parameter on which trials disagree to cancellation.
+    rotation, singular_values, _ = np.linalg.svd(np.swapaxes(information_roots, 1, 2) @ root)
+    rotated_roots = information_roots @ rotation
+    determined = values > LEAST_RELATIVE_INFORMATION * values[:, -1:]
+    score_parts = np.where(determined, 1 / np.sqrt(np.where(determined, values, 1.0)), 0.0) * np.einsum(
+        "nij,ni->nj", vectors, scores
+    )
+    score_rest = scores - np.einsum("nij,nj->ni", information_roots, score_parts)
+    score_parts = np.einsum("nij,ni->nj", rotation, score_parts)
+    stacked = np.swapaxes(rotated_roots, 1, 2).reshape(-1, size)
+    prior = np.diag(problem.prior_precision)
+    offset = problem.prior_precision * (state.theta - problem.prior_mean) - score_rest.sum(axis=0)
+
+    def deviance(tau2: float) -> float:
+        shrinkage = 1 / (1 + tau2 * singular_values**2)
+        total_information = ((stacked * shrinkage.reshape(-1, 1)).T @ stacked + prior)[np.ix_(estimated, estimated)]
+        slope = ((shrinkage * score_parts).ravel() @ stacked - offset)[estimated]
+        scale = 1 / np.sqrt(np.diag(total_information))
+        scaled = total_information * scale[:, None] * scale
+        decrease = float((scale * slope) @ np.linalg.lstsq(scaled, scale * slope, rcond=1e-11)[0])
+        log_det = float(np.linalg.slogdet(total_information)[1]) - float(np.sum(np.log(shrinkage)))
+        return log_det - float(np.sum((1 - shrinkage) * score_parts**2)) - decrease
+
+    tau2 = _maximise_likelihood(deviance) if estimated.size else 0.0
+    shrinkage = 1 / (1 + tau2 * singular_values**2)
+    weight = (rotated_roots * shrinkage[:, None, :]) @ np.swapaxes(rotated_roots, 1, 2)
+    score = np.einsum("nij,nj->ni", rotated_roots, shrinkage * score_parts) + score_rest
+    covariance = inverse_of_block(weight.sum(axis=0) + prior, estimated)
+    return Pooled(solution, weight, score, covariance, tau2 * root @ root.T)
+
+
+def trial_information(solution: Solution) -> tuple[Floats, Floats]:
+    """Information and scores of each trial on the free parameters, its trial effects integrated out. Returns
+    information, scores. Shape (n_trials, n_free, n_free).
+    """
+    problem = solution.problem
+    size, p = problem.prior_mean.size, problem.index.shape[1]
+    blocks = trial_effects_eliminated(solution.cross_products, p, problem, solution.state)
+    information = np.zeros((len(blocks), size + 1, size + 1))
+    scores = np.zeros((len(blocks), size + 1))
+    for i, (block, places) in enumerate(zip(blocks, problem.index, strict=True)):
+        np.add.at(information[i], (places[:, None], places[None, :]), block[:p, :p])
+        np.add.at(scores[i], places, block[:p, p])
+    return information[:, :size, :size], scores[:, :size]
+
+
+def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:
+    """A root of M: the covariance of all trials times the number of trials that depend on a parameter."""
+    informative_trials = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
+    informative_trials[shared:] = 0.0
+    factor = np.sqrt(informative_trials)
+    values, vectors = np.linalg.eigh(covariance * factor[:, None] * factor)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _maximise_likelihood(deviance: Callable[[float], float]) -> float:
+    """The τ² of lowest deviance: 0, or the lowest of a grid, refined."""
+    from scipy.optimize import minimize_scalar
+
+    logs = np.linspace(math.log(1e-2), math.log(LARGEST_TAU2), 24)
+    levels = [deviance(math.exp(log)) for log in logs]
+    best = int(np.argmin(levels))
+    low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]
+    minimum = minimize_scalar(lambda log_tau2: deviance(math.exp(log_tau2)), bounds=(low, high), method="bounded")
+    return float(math.exp(minimum.x)) if minimum.fun < deviance(0.0) else 0.0

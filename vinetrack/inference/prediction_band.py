@@ -27,15 +27,12 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.intervals import student
 from vinetrack.inference.mixed_effects import FitState, inverse_of_block, trial_deviation_sd
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import ParameterMap, make_layout
-from vinetrack.inference.pooling import pool, trial_information
-from vinetrack.inference.position_errors import position_shapes
-from vinetrack.inference.robust_covariance import matrix_root
+from vinetrack.inference.position_errors import pool, position_shapes, student, trial_information
+from vinetrack.inference.robust_covariance import PRESSURE_ERROR_PA, matrix_root
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, ORIGIN, PRESSURE, Predictor
-from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
 
 # Part of the information on a parameter that must come from other trials to predict a trial from them (chosen)

@@ -2,26 +2,257 @@
 
 The inverse information is the covariance only if noise and between-trial variation are as modelled. The scatter of the
 scores of single trials gives a cluster-robust (sandwich) covariance (White, Econometrica 48, 817, 1980, with trials as
-clusters). Errors that trials share (`vinetrack.inference.systematics`) move parameters without any scatter. Both only
+clusters). Errors that trials share (systematics, below) move parameters without any scatter. Both only
 ever widen an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import TrialFit
-from vinetrack.inference.intervals import Precision
 from vinetrack.inference.mixed_effects import inverse_of_block, sum_matrix_blocks, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.pooling import Pooled, trial_information
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
-from vinetrack.inference.systematics import Systematics, systematics_of
+from vinetrack.inference.position_errors import Pooled, Precision, position_shapes, trial_information
+from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, PRESSURE, Predictor, position_change
 from vinetrack.inference.whitening import products
+
+# ------------------------------------------------------------------------------
+# Systematic errors of a campaign: payloads, set pressures, film mass, position errors of the camera, gauge noise.
+#
+# Most of them are shared by several trials and do not average out, so that the scatter of trials does not reveal them.
+# If
+# neglected, they look like a small effect as soon as pressures and B vary little between trials. The error that gauge
+# noise leaves in a recorded pressure belongs to a single trial and bends its whole motion.
+
+PAYLOAD_ERROR = 0.005  # Standard deviation of a payload's mass in addition to that of the sheet, relative
+
+PRESSURE_ERROR_PA = 30.0  # Standard deviation of a set pressure in addition to that of the sheet
+
+FILM_ERROR = 0.02  # Least standard deviation of the mass of a vine's film, relative (chosen)
+
+PAYLOAD_STEP = 1e-2  # Relative step of a payload's mass for its derivative (derived)
+
+# Largest number of half waves along the growth in the slow error of a tracker that all trials share (chosen)
+HALF_WAVES = 6
+
+START_FRACTION = 0.015  # Fraction of the growth over which a slow error that is larger at the start may decay (chosen)
+
+# Fractions of the growth before its end (measured)
+END_SHAPES = ((0.1, 2.0), (0.03, 4.0))
+
+
+@dataclass(frozen=True)
+class Systematics:
+    """Displacement of the positions of each trial by one standard deviation of each systematic error. An error of one
+    payload or of one set pressure affects its own trials alone, and there are as many as conditions: a trial has
+    columns only for those that affect it.
+    """
+
+    columns: list[Floats]
+    places: NDArray[np.int_]
+    count: int
+    estimated_m: list[Floats] | None = None
+
+    @classmethod
+    def none(cls, points: Sequence[int]) -> Systematics:
+        """No systematic errors."""
+        return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
+
+    def at_zero_errors(self, columns: Sequence[Floats]) -> list[Floats]:
+        """Columns of a fit with the residual, the last column, taken at zero errors instead of the estimated ones.
+        Shapes: columns (n_points, k).
+        """
+        if self.estimated_m is None:
+            return list(columns)
+        restored = [of_fit.copy() for of_fit in columns]
+        for of_fit, trial_estimate_m in zip(restored, self.estimated_m, strict=True):
+            of_fit[:, -1] += trial_estimate_m
+        return restored
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of each trial."""
+        return self.places.shape[1]
+
+
+def systematics_of(
+    predictor: Predictor,
+    solution: Solution,
+    trials: Sequence[TrialFit],
+    *,
+    positions: bool = True,
+    film: bool = False,
+) -> Systematics:
+    """All systematic errors of a fit."""
+    points = [trial.time_s.size for trial in trials]
+    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
+    dense = [_tracker_errors(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
+    recorded = recorded_pressures(predictor, solution)
+    parts = [
+        _payload_errors(predictor, solution, trials),
+        _set_pressure_errors(predictor, solution),
+        recorded,
+        *([film_errors(predictor, solution, trials)] if film else []),
+        *(_of_every_trial(columns) for columns in dense),
+    ]
+    columns = [np.empty((size, sum(part.n_columns for part in parts))) for size in points]
+    places = np.empty((len(points), sum(part.n_columns for part in parts)), dtype=int)
+    count, begin, total = 0, 0, sum(part.count for part in parts)
+    for part in parts:
+        own_columns = slice(begin, begin + part.n_columns)
+        places[:, own_columns] = np.where(part.places < part.count, count + part.places, total)
+        for column, errors in zip(columns, part.columns, strict=True):
+            column[:, own_columns] = errors
+        count, begin = count + part.count, begin + part.n_columns
+    return Systematics(columns, places, total, recorded.estimated_m)
+
+
+def _of_every_trial(columns: list[Floats]) -> Systematics:
+    """Errors that affect every trial."""
+    count = columns[0].shape[1]
+    return Systematics(columns, np.tile(np.arange(count), (len(columns), 1)), count)
+
+
+def _payload_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
+    """Relative error of each payload of the campaign. Trials with the same payload mass used the same body."""
+    no_errors = Systematics.none([trial.time_s.size for trial in trials])
+    loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
+    if not loaded:
+        return no_errors
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    try:
+        plain = predictor.run([jobs[i] for i in loaded])
+        heavier = predictor.run([jobs[i]._replace(payload_factor=1 + PAYLOAD_STEP) for i in loaded])
+    except SimulationError:
+        return no_errors
+    columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
+    for i, plain_trajectory, heavier_trajectory in zip(loaded, plain, heavier, strict=True):
+        columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(plain_trajectory, heavier_trajectory)
+    names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
+    return _one_per_group(columns, [names.get(i) for i in range(len(trials))])
+
+
+def film_errors(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
+    """Error of the film mass of each vine, `FILM_ERROR`."""
+    columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
+    with_film = [i for i, trial in enumerate(trials) if trial.trial.linear_density_kg_m > 0]
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    other = Predictor(predictor.layout, [_with_heavier_film(each) for each in predictor.data], predictor.host)
+    try:
+        plain, heavier = predictor.run(jobs), other.run(jobs)
+    except SimulationError:
+        with_film = []
+    for i in with_film:
+        columns[i][:, 0] = position_change(plain[i], heavier[i])
+    if not with_film:
+        return Systematics.none([trial.time_s.size for trial in trials])
+    return _one_per_group(columns, [trial.trial.vine if i in with_film else None for i, trial in enumerate(trials)])
+
+
+def _with_heavier_film(trial_data: FitTrial) -> FitTrial:
+    trial = trial_data.trial
+    return replace(trial_data, trial=replace(trial, film_density_kg_m3=(1 + FILM_ERROR) * trial.film_density_kg_m3))
+
+
+def _set_pressure_errors(predictor: Predictor, solution: Solution) -> Systematics:
+    """Error of the set pressure of each condition, shared by its replicates."""
+    data = [trial_data.trial for trial_data in predictor.data]
+    with_set_pressure = predictor.has_pressure_deviation & np.array(
+        [trial_data.trace is None for trial_data in predictor.data]
+    )
+    if not with_set_pressure.any():
+        return Systematics.none([len(sensitivities) for sensitivities in solution.columns])
+    columns = [np.zeros((len(sensitivities), 1)) for sensitivities in solution.columns]
+    for column, trial, sensitivities, applies in zip(columns, data, solution.columns, with_set_pressure, strict=True):
+        if applies:
+            column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
+    return _one_per_group(
+        columns, [trial.condition if applies else None for trial, applies in zip(data, with_set_pressure, strict=True)]
+    )
+
+
+def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
+    """Errors that gauge noise leaves in each recorded pressure, except that of its mean, which is part of the fit."""
+    data = predictor.data
+    counts = [
+        0
+        if each.trace_errors_Pa is None or (curves_only and not each.trace_is_curve)
+        else each.trace_errors_Pa.shape[1]
+        for each in data
+    ]
+    n_columns = max(counts)
+    no_errors = Systematics.none([trial_data.time_s.size for trial_data in data])
+    if not n_columns:
+        return no_errors
+    columns = [np.zeros((trial_data.time_s.size, n_columns)) for trial_data in data]
+    places = np.full((len(data), n_columns), sum(counts))
+    begins = np.cumsum([0, *counts])
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    try:
+        plain = predictor.run(jobs)
+        for k in range(n_columns):
+            rows = [i for i, count in enumerate(counts) if count > k]
+            other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
+            for i, perturbed in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
+                columns[i][:, k] = position_change(plain[i], perturbed)
+                places[i, k] = begins[i] + k
+    except SimulationError:
+        return no_errors
+    estimated_m = [np.zeros(trial_data.time_s.size) for trial_data in data]
+    for trial_estimate_m, column, trial_data in zip(estimated_m, columns, data, strict=True):
+        if trial_data.trace_error_sizes is not None:
+            trial_estimate_m += column[:, : trial_data.trace_error_sizes.size] @ trial_data.trace_error_sizes
+    return Systematics(columns, places, sum(counts), estimated_m)
+
+
+def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:
+    """A trial with its recorded pressure changed by one standard deviation of its k-th error, if it has that many."""
+    errors_Pa = trial_data.trace_errors_Pa
+    if trial_data.trace is None or errors_Pa is None or errors_Pa.shape[1] <= k:
+        return trial_data
+    clock_s, pressure_Pa = trial_data.trace
+    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa[:, k]))
+
+
+def _one_per_group(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:
+    """Errors that are shared by the trials of a group; a trial with the name None has none."""
+    places = {name: k for k, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
+    return Systematics(columns, np.array([[places.get(name, len(places))] for name in names]), len(places))
+
+
+def _tracker_errors(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
+    """Slow errors of positions from recordings, of the size that the tracks state; none for imported positions."""
+    stated = [trial_data.slow_m for trial_data in predictor.data]
+    if all(slow_m is None for slow_m in stated):
+        return [np.zeros((trial.time_s.size, 0)) for trial in trials]
+    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
+    # With extreme parameters no trial moves, and all growth fractions are zero.
+    largest_growth_m = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
+    return [_slow_shapes(growth_m / largest_growth_m, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
+
+
+def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
+    """One standard deviation of each slow error of a trial, shape (n_points, HALF_WAVES + 4), m. Waves along the growth
+    have the usual error of the trial each. What is stated beyond that, near a door or at low contrast, is one error at
+    the very start and one after it; two more grow towards the end.
+    """
+    if slow_m is None:
+        return np.zeros((part.size, HALF_WAVES + 2 + len(END_SHAPES)))
+    usual = np.minimum(slow_m, np.median(slow_m))
+    excess = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
+    waves = usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, HALF_WAVES + 1))
+    start = np.exp(-np.maximum(part, 0.0) / START_FRACTION)
+    ends = [times * usual * np.exp((part - np.max(part)) / fraction) for fraction, times in END_SHAPES]
+    return np.column_stack([waves, excess * start, excess * (1 - start), *ends])
+
 
 FEWEST_CLUSTERS = 8  # Trials from which the sandwich is better than the model of the noise (chosen)
 

@@ -8,23 +8,231 @@ them. All trajectories, perturbed and unperturbed, are simulated in one call.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-from vinetrack.dynamics.batch import Trace, lay_out, starts_of
-from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import ENDED, Trajectory, bends_of
-from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs, with_pressures
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.kernel import Batch, Trace, lay_out, starts_of
+from vinetrack.dynamics.model import Model, check_needs, trial_inputs, with_pressures
+from vinetrack.dynamics.simulate import (
+    ENDED,
+    SimulationError,
+    Trajectory,
+    bends_of,
+    check_completed,
+    simulate_many,
+    trajectories,
+)
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
-from vinetrack.inference.position_change import clip_at_end, position_change
-from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Motions, first_identical_trials
+from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.whitening import all_products
+
+# ------------------------------------------------------------------------------
+# Jobs of trajectories to simulate, as arrays: a fit needs a hundred at a time, thousands of times.
+
+OBSERVED = 3  # Column of `Motions.rows` with the position of the edge as the camera reports it (defined)
+
+
+class Job(NamedTuple):
+    """One trajectory to simulate: its trial, parameters, pressures and release, and a factor on its payload."""
+
+    trial: int
+    row: Floats
+    yield_pressure_Pa: float
+    pressure_deviation: float
+    release_s: float
+    payload_factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Trajectories to simulate, one entry of each array per job; `row` has shape (n_jobs, n_parameters), SI."""
+
+    trial: NDArray[np.int_]
+    row: Floats
+    yield_pressure_Pa: Floats
+    pressure_deviation: Floats
+    release_s: Floats
+    payload_factor: Floats
+
+    @classmethod
+    def of(cls, jobs: Sequence[Job]) -> Jobs:
+        """Combine single jobs."""
+        trials, rows, *values = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
+        others = [np.array(column, dtype=float) for column in values]
+        return cls(np.array(trials, dtype=int), np.array(rows).reshape(len(jobs), -1), *others)
+
+    def with_effect(self, values: Sequence[float]) -> Jobs:
+        """The same trajectories for a model with one more effect."""
+        return replace(self, row=np.hstack([self.row, np.tile(np.asarray(values, dtype=float), (len(self), 1))]))
+
+    def __len__(self) -> int:
+        return self.trial.size
+
+    def take(self, places: NDArray[np.int_]) -> Jobs:
+        """A copy of some of the jobs. Shapes: places (n_taken,)."""
+        trial, *numbers = self._columns
+        return Jobs(trial[places], *(values[places] for values in numbers))
+
+    def as_list(self) -> list[Job]:
+        """The jobs as a list."""
+        rows, *columns = self.row, *(values.tolist() for values in self._columns[2:])
+        return [Job(i, row, *numbers) for i, row, *numbers in zip(self.trial.tolist(), rows, *columns, strict=True)]
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Jobs]) -> Jobs:
+        """Concatenate several sets of jobs."""
+        trial, *numbers = (np.concatenate(values) for values in zip(*(part._columns for part in parts), strict=True))
+        return cls(trial, *numbers)
+
+    @property
+    def _columns(self) -> tuple[NDArray[Any], ...]:
+        return tuple(vars(self).values())
+
+    def distinct(self, identical_trials: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Indices of distinct jobs, and for each job its index among the distinct ones. Returns first, inverse. Shapes:
+        identical_trials (n_trials,) → (n_distinct,).
+        """
+        numbers = np.column_stack([identical_trials[self.trial].astype(float), *self._columns[1:]])
+        first: dict[bytes, int] = {}
+        trajectory_of = [first.setdefault(numbers[k].tobytes(), k) for k in range(len(numbers))]
+        return np.unique(trajectory_of, return_inverse=True)
+
+
+def first_identical_trials(
+    data: Sequence[FitTrial], inputs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
+) -> NDArray[np.int_]:
+    """For each trial the first one with the same settings and times. Shapes: inputs (n_trials, n_fields of
+    `TrialInputs`) → (n_trials,).
+    """
+    first: dict[tuple[object, ...], int] = {}
+    identical_trials = np.arange(len(data))
+    for i, trial_data in enumerate(data):
+        if trial_data.trace is None:
+            key = (inputs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
+            identical_trials[i] = first.setdefault(key, i)
+    return identical_trials
+
+
+class Average(NamedTuple):
+    """Weighted averages of positions over times around each point. `instants_s` are all times needed, increasing;
+    `place`, shape (n_points, n_weights), are the indices of those that each average uses; `weights` are the weights.
+    """
+
+    instants_s: Floats
+    place: NDArray[np.int_]
+    weights: Floats
+
+    @classmethod
+    def of(cls, time_s: Floats, offsets_s: Floats, weights: Floats) -> Average:
+        """Averages around points at these times. Shapes: time_s (n_points,); offsets_s, weights (n_weights,)."""
+        instants_s = np.add.outer(time_s, offsets_s)
+        order = np.argsort(instants_s, axis=None, kind="stable")
+        place = np.empty(order.size, dtype=int)
+        place[order] = np.arange(order.size)
+        return cls(instants_s.ravel()[order], place.reshape(instants_s.shape), weights)
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Simulated trajectories of jobs: `out` and `ends` as `Batch.run` returns them, one entry per distinct trajectory.
+    `ratios` are the travel ratios of their trials; `trajectory_of`, shape (n_jobs,), is the trajectory of each job.
+    """
+
+    batch: Batch
+    out: Floats
+    ends: Floats
+    ratios: list[float]
+    trajectory_of: NDArray[np.int_]
+
+    @classmethod
+    def of(cls, batch: Batch, trials: Sequence[Trial], trajectory_of: NDArray[np.int_]) -> Motions:
+        """Integrate a batch. Shapes: trajectory_of (n_jobs,)."""
+        out, ends = batch.run()
+        check_completed(ends, [trial.name for trial in trials])
+        return cls(batch, out, ends, [trial.travel_ratio for trial in trials], trajectory_of)
+
+    def averaged(self, averages: Sequence[Average]) -> Motions:
+        """The motions at the requested points, their reported positions averaged over the times around them."""
+        out, stamps, times = [], [], []
+        for (first, last), average in zip(itertools.pairwise(self.batch.starts), averages, strict=True):
+            middle = average.place[:, average.weights.size // 2]
+            rows = self.out[first:last]
+            averaged = rows[middle]
+            averaged[:, OBSERVED] = rows[average.place, OBSERVED] @ average.weights
+            out.append(averaged)
+            stamps.append(self.batch.stamps[first:last][middle])
+            times.append(self.batch.times[first:last][middle])
+        batch = replace(self.batch, stamps=np.concatenate(stamps), times=np.concatenate(times), starts=starts_of(times))
+        return replace(self, batch=batch, out=np.concatenate(out))
+
+    def rows(self, first: int, last: int) -> Floats:
+        """Rows of `out` of jobs `first` up to `last`, concatenated. Returns position, velocity and acceleration of the
+        tail, position of the edge as the camera reports it. Shape (n_times, 4).
+        """
+        starts, trajectory_of = self.batch.starts, self.trajectory_of[first:last]
+        if (
+            trajectory_of.size
+            and trajectory_of[-1] - trajectory_of[0] == trajectory_of.size - 1
+            and np.all(np.diff(trajectory_of) == 1)
+        ):
+            return self.out[starts[trajectory_of[0]] : starts[trajectory_of[-1] + 1]]
+        return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in trajectory_of])
+
+    def stamps(self, job: int) -> Floats:
+        """Times of a job since its release, s, on the camera's clock. Shape (n_times,)."""
+        return self.batch.stamps[
+            self.batch.starts[self.trajectory_of[job]] : self.batch.starts[self.trajectory_of[job] + 1]
+        ]
+
+    def trajectories(self) -> list[Trajectory]:
+        """One trajectory per job."""
+        distinct_trajectories = trajectories(self.batch, self.out, self.ends, self.ratios)
+        return [distinct_trajectories[k] for k in self.trajectory_of]
+
+
+# ------------------------------------------------------------------------------
+# Finite differences of the observed positions of a trial, taken correctly across the end of growth.
+
+# Time over which the perturbed trajectory is extrapolated beyond its end, in units of the delay that the perturbation
+# causes (derived)
+LONGEST_EXTRAPOLATION = 3.0
+
+
+def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
+    """Set the change of position after the end of growth: that of the end position, or 0 where only the time changes.
+    Shapes: change, over (n_points,).
+    """
+    change[over] = change[-1] if moved_ends else 0.0
+
+
+def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
+    """Change of the observed positions of a trial under a small perturbation, m, shape (n_points,). Growth ends at the
+    same position whenever it ends. Shape (n_points,).
+    """
+    change = np.asarray(moved.observed_position_m - plain.observed_position_m)
+    if plain.status == "ended":
+        clip_at_end(change, plain.time_s > plain.end_time_s, moved_ends=moved.status == "ended")
+    plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
+    early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
+    last = int(np.argmax(early)) - 1
+    if early.any() and last >= 0:
+        # A small perturbation ends growth earlier by displacement over speed. Where the unperturbed motion takes much
+        # longer than that, the two motions differ in kind (one stops before the end), and nothing is extrapolated.
+        speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
+        reach_s = plain.time_s[last] + LONGEST_EXTRAPOLATION * abs(float(change[last])) / speed_m_s
+        early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
+        if early.any():
+            faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
+            change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
+    return change
+
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 N_TRIAL_EFFECTS = 4  # Trial effects of each trial: release, s; origin, m; relative deviation of pressure (defined)
@@ -329,3 +537,184 @@ def _adapted_step(response: float, previous: float) -> float:
     if not response > 0:
         return previous
     return float(np.clip(TARGET_RESPONSE / response, SMALLEST_STEP, LARGEST_STEP))
+
+
+# ------------------------------------------------------------------------------
+# Starting values of a fit: release and origin from the frames at rest, B and n from a coarse grid search.
+
+EXPONENTS = (0.15, 0.37, 0.65, 1.0)  # Exponents of the grid (chosen)
+
+# Factors of the grid, relative to the B that would balance the drive at the observed speed (chosen)
+DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
+
+POINTS_USED = 60  # Points of each trial that the grid search uses (chosen)
+
+
+def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
+    """Release and origin of every trial from its frames at rest; zero deviations. Shape (n_trials, 4)."""
+    trial_effects = np.zeros((len(data), N_TRIAL_EFFECTS))
+    for i, trial_data in enumerate(data):
+        if trial_data.n_rest > 0:
+            trial_effects[i, RELEASE] = trial_data.time_s[trial_data.n_rest - 1]
+            trial_effects[i, ORIGIN] = np.mean(trial_data.lead_position_m[: max(trial_data.n_rest - 1, 1)])
+        elif trial_data.imprecise_rest is not None:
+            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = (
+                trial_data.imprecise_rest.release_s,
+                trial_data.imprecise_rest.origin_m,
+            )
+        else:
+            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = trial_data.time_s[0], trial_data.lead_position_m[0]
+        if trial_data.pressurised_in_recording:
+            assert trial_data.trace is not None
+            trial_effects[i, RELEASE] = min(trial_data.time_s[0], trial_data.trace[0][0])
+    return trial_effects
+
+
+def candidates(
+    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor
+) -> list[tuple[float, Floats, Floats]]:
+    """Starting values, best first: misfit, scaled parameters and trial effects. For each exponent and each further
+    starting value, every vine takes the B with the least misfit of its trials; the release of each trial is scanned at
+    the same time.
+    """
+    trial_effects = initial_trial_effects(data)
+    start_values = [
+        sorted({number.start, *number.further_starts}) if number.further_starts else [number.start]
+        for number in layout.free
+    ]
+    combined = list(itertools.islice(itertools.product(*start_values), 12))
+    starts_found: list[tuple[Floats, Floats]] = []
+    for values in combined:
+        theta = np.array([number.to_scaled(value) for value, number in zip(values, layout.free, strict=True)])
+        starts = _scan_damping(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
+        starts_found += [(start, trial_effects) for start in starts]
+    scored = []
+    for theta, initial in starts_found:
+        try:
+            releases, misfit = align(data, predictor, theta, initial)
+        except SimulationError:
+            continue
+        scored.append((float(np.sum(misfit)), theta, releases))
+    return sorted(scored, key=lambda scored_start: scored_start[0])
+
+
+def one_trial_per_condition(data: Sequence[FitTrial]) -> list[int]:
+    """Indices of one trial of every condition, the one with the most points."""
+    best: dict[str, int] = {}
+    for i, trial_data in enumerate(data):
+        condition = trial_data.trial.condition
+        if condition not in best or trial_data.time_s.size > data[best[condition]].time_s.size:
+            best[condition] = i
+    return sorted(best.values())
+
+
+def _scan_damping(
+    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
+) -> list[Floats]:
+    """For each exponent the best B of every vine."""
+    speed = np.array([middle_speed(trial_data) for trial_data in data])
+    drive = np.array([_driving_force_N(trial_data) for trial_data in data])
+    free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
+    key = layout.keys.index(DAMPING)
+    damping_index = layout.index[:, key]
+    starts = []
+    for n in EXPONENTS if free_n else (_fixed_exponent(layout),):
+        values = theta.copy()
+        values[free_n] = [layout.free[k].to_scaled(n) for k in free_n]
+        guess = {
+            k: float(np.exp(np.mean(np.log(drive[damping_index == k]) - n * np.log(speed[damping_index == k]))))
+            for k in np.unique(damping_index)
+        }
+        best: dict[int, tuple[float, float]] = {}
+        for factor in DAMPING_FACTORS:
+            for k, B in guess.items():
+                free = layout.free[k]
+                values[k] = free.to_scaled(float(np.clip(factor * B, free.lower, free.upper)))
+            try:
+                _, misfit = align(data, predictor, values, trial_effects)
+            except SimulationError:
+                continue
+            for k in guess:
+                score = float(np.sum(misfit[damping_index == k]))
+                if k not in best or score < best[k][0]:
+                    best[k] = (score, float(values[k]))
+        values = values.copy()
+        for k, (_, B) in best.items():
+            values[k] = B
+        starts.append(values)
+    return starts
+
+
+def _fixed_exponent(layout: ParameterMap) -> float:
+    names = layout.model.parameter_names
+    return float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
+
+
+def middle_speed(trial_data: FitTrial) -> float:
+    """Mean speed of the tail from 40 to 85 % of the observed growth. Returns above 0."""
+    y = trial_data.lead_position_m - trial_data.lead_position_m[: max(trial_data.n_rest, 1)].mean()
+    total = float(np.max(y))
+    low, high = (int(np.argmax(y >= part * total)) for part in (0.4, 0.85))
+    high = max(high, low + 1) if low + 1 < y.size else low
+    elapsed = trial_data.time_s[high] - trial_data.time_s[low] or trial_data.frame_s
+    return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
+
+
+def _driving_force_N(trial_data: FitTrial) -> float:
+    """Force on the tip above the yield force, N, from the recorded pressure where there is one."""
+    trial = trial_data.trial
+    pressure_Pa = float(np.median(trial_data.trace[1])) if trial_data.trace is not None else trial.pressure_Pa
+    over_Pa = pressure_Pa - np.nan_to_num(trial.yield_pressure_Pa)
+    return max(float(over_Pa) * trial.area_m2, 1e-3 * abs(pressure_Pa) * trial.area_m2, 1e-9)
+
+
+def align(
+    data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
+) -> tuple[Floats, Floats]:
+    """Best release and origin of each trial at given parameters, by a scan, and the logarithm of its relative misfit.
+    One trajectory per trial is simulated, at a subset of its frames, and shifted in time by interpolation. Returns
+    trial_effects, misfit (ln of the root mean square relative to the travel). Shapes: theta (n_free,); trial_effects
+    (n_trials, 4) → (n_trials, 4).
+    """
+    subsets = [_thinned(trial_data) for trial_data in data]
+    jobs = predictor.jobs(theta, trial_effects)
+    durations = [
+        trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
+        for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
+    ]
+    grids = [np.linspace(0.0, duration, 4 * POINTS_USED) for duration in durations]
+    trajectories = simulate_many(
+        predictor.layout.model,
+        [trial_data.trial for trial_data in data],
+        grids,
+        traces=[
+            None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
+            for trial_data, job in zip(data, jobs, strict=True)
+        ],
+        parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
+        host=predictor.host,
+    )
+    best, misfit = trial_effects.copy(), np.zeros(len(data))
+    for i, (trial_data, (time_s, y)) in enumerate(zip(data, subsets, strict=True)):
+        if trial_data.pressurised_in_recording:
+            shifts = np.zeros(1)
+        elif trial_data.shows_rest:
+            shifts = trial_data.frame_s * np.arange(-6, 3.01, 0.5)
+        else:
+            shifts = -np.geomspace(0.25 * trial_data.frame_s, durations[i], 30)
+        since = time_s[None, :] - trial_effects[i, RELEASE] - shifts[:, None]
+        predicted = np.interp(since, grids[i], trajectories[i].observed_position_m)
+        residual_m = y[None, :] - predicted
+        origin = residual_m.mean(axis=1)
+        square = np.mean((residual_m - origin[:, None]) ** 2, axis=1)
+        k = int(np.argmin(square))
+        best[i, RELEASE], best[i, ORIGIN] = trial_effects[i, RELEASE] + shifts[k], origin[k]
+        misfit[i] = 0.5 * np.log(square[k] / np.ptp(y) ** 2 + 1e-8)
+    return best, misfit
+
+
+def _thinned(trial_data: FitTrial) -> tuple[Floats, Floats]:
+    """At most sixty points, most of them in motion."""
+    begin = 0 if trial_data.pressurised_in_recording else max(trial_data.n_rest - 5, 0)
+    take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_USED).astype(int))
+    return trial_data.time_s[take], trial_data.lead_position_m[take]

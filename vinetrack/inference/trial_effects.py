@@ -12,23 +12,145 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.gauss_newton import trial_effect_step
+from vinetrack.inference.marginal_likelihood import trial_effect_step
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_penalty, trial_effect_prior
-from vinetrack.inference.part_of_trials import parameters_of_trials, subset_predictor, subset_problem, subset_state
-from vinetrack.inference.release_kernels import products_at_releases
+from vinetrack.inference.parameters import ParameterMap
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     N_TRIAL_EFFECTS,
     ORIGIN,
     PRESSURE,
     RELEASE,
+    Job,
     Predictor,
 )
-from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import at_correlation, whiten
+
+# ------------------------------------------------------------------------------
+# Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take
+# cross products.
+#
+# A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was
+# three
+# quarters of the time of a fit that continues from another.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def products_at_releases(
+    time_s: Floats,
+    position_m: Floats,
+    first: NDArray[np.bool_],
+    relative_sd: Floats,
+    releases_s: Floats,
+    grid_s: Floats,
+    curves: Floats,
+    rho: float,
+) -> Floats:
+    """Whitened cross products of the columns and residual of a trial for each candidate release. Equivalent to
+    `whitening.whiten` and a matrix product for each release. Curves are interpolated linearly, and constant beyond the
+    ends of the grid. Returns the last column is the residual. Shapes: time_s, position_m, first, relative_sd
+    (n_points,); releases_s (n_releases,); grid_s (n_grid,); curves (n_columns, n_grid) → (n_releases, n_columns,
+    n_columns).
+    """
+    count, size, last = len(curves), len(time_s), len(grid_s) - 1
+    begins = math.sqrt(1 - rho**2)
+    plain, white = np.empty((count, size)), np.empty((count, size))
+    products = np.empty((len(releases_s), count, count))
+    for r in range(len(releases_s)):
+        j = 0
+        for i in range(size):
+            since_s = min(max(time_s[i] - releases_s[r], 0.0), grid_s[last])
+            while j < last - 1 and grid_s[j + 1] <= since_s:
+                j += 1
+            part = (since_s - grid_s[j]) / (grid_s[j + 1] - grid_s[j])
+            for c in range(count):
+                plain[c, i] = curves[c, j] + part * (curves[c, j + 1] - curves[c, j])
+            plain[count - 1, i] = position_m[i] - plain[count - 1, i]
+        for c in range(count):
+            before = 0.0
+            for i in range(size):
+                value = plain[c, i] / relative_sd[i]
+                white[c, i] = begins * value if first[i] else value - rho * before
+                before = value
+        products[r] = np.dot(white, white.T)
+    return products
+
+
+# ------------------------------------------------------------------------------
+# Restriction of a fit to a subset of its trials: free parameters, predictor, state and problem.
+
+Indices = NDArray[np.int_]
+
+
+def parameters_of_trials(layout: ParameterMap, rows: Indices) -> Indices:
+    """Indices of the free parameters that apply to some of these trials, in order."""
+    applicable = np.unique(layout.index[rows])
+    return np.asarray(applicable[applicable >= 0])
+
+
+def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
+    """The layout of these trials and parameters; names, scales and priors are unchanged."""
+    new_index = np.full(len(layout.free) + 1, -1)
+    new_index[places] = np.arange(places.size)
+    index = new_index[layout.index[rows]]
+    columns = np.flatnonzero((index >= 0).any(axis=0))
+    return replace(
+        layout,
+        free=tuple(layout.free[place] for place in places),
+        keys=tuple(layout.keys[column] for column in columns),
+        index=index[:, columns].astype(int),
+        base=layout.base[rows],
+        between=tuple(
+            replace(term, groups=tuple(term.groups[row] for row in rows), regressor=term.regressor[rows])
+            for term in layout.between
+        ),
+    )
+
+
+def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
+    """A predictor of these trials, with the finite-difference steps of the other."""
+    layout = _subset_layout(predictor.layout, rows, places)
+    smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
+    smaller.pressure_step = predictor.pressure_step[rows].copy()
+    smaller.steps = np.array([predictor.steps[predictor.layout.keys.index(key)] for key in layout.keys])
+    return smaller
+
+
+def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
+    """The state of these trials and parameters."""
+    return replace(
+        state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
+    )
+
+
+def subset_problem(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
+    """The problem of these trials and parameters."""
+
+    def numbers(values: Floats) -> Floats:
+        return values[places]
+
+    return replace(
+        problem,
+        index=layout.index,
+        has_deviation=problem.has_deviation[rows],
+        gauge_error=problem.gauge_error[rows],
+        release_origin_mean=problem.release_origin_mean[rows],
+        release_origin_precision=problem.release_origin_precision[rows],
+        prior_mean=numbers(problem.prior_mean),
+        prior_precision=numbers(problem.prior_precision),
+        lower=numbers(problem.lower),
+        upper=numbers(problem.upper),
+        free=problem.free[places],
+        points=problem.points[rows],
+        stretches=problem.stretches[rows],
+        random=None if problem.random is None else problem.random[places],
+    )
+
 
 LARGEST_DEVIATION_STEP = 0.3  # Largest step of a trial's deviations of pressure and ln B (chosen)
 

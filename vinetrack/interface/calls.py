@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from vinetrack.diagnosis.compare import Comparison
-from vinetrack.diagnosis.compare import compare as compare_pairs
 from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
+from vinetrack.diagnosis.ladder import Comparison
+from vinetrack.diagnosis.ladder import compare as compare_pairs
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
@@ -18,8 +18,8 @@ from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
+from vinetrack.interface.data_frames import Source, TrialSource, read_source
 from vinetrack.interface.loaded import LoadedResults
-from vinetrack.interface.sources import Source, TrialSource, read_source
 
 
 def fit(model: Model, source: Source, **options: Any) -> Fit:
@@ -111,7 +111,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
         tracks, or pairs of trial and track.
     *effects : names, or `name=size` in the unit of the parameter; all by default.
     **options
-        Options of `vinetrack.pipeline.power_campaigns.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
+        Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
         `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed`, `answers` for complete
         diagnoses of simulated campaigns; `calibrate`, the number of simulated null campaigns for calibrating the tests
         of a verdict; `reach`, the probability with which further trials shall detect `name=size`.
@@ -134,8 +134,7 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     >>> round(power["leak"].probability_at(1.0), 2)
     1.0
     """
-    from vinetrack.pipeline.power_campaigns import PowerRequest
-    from vinetrack.pipeline.power_stage import power_of_target
+    from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
     if isinstance(source, LoadedResults):
         source = source.folder
@@ -154,7 +153,7 @@ def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) 
     ----------
     fitted : a fit; or any source of trials, to which the model of the experiment (else the base model) is first fitted.
     source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
-    options : options of `vinetrack.diagnosis.compare.compare`, such as `final_at_fraction` and `tracks`.
+    options : options of `vinetrack.diagnosis.ladder.compare`, such as `final_at_fraction` and `tracks`.
 
     Returns
     -------

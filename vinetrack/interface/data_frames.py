@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import Table
-from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.other_units import in_sheet_units
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
-from vinetrack.experiment.schema import COLUMNS
-from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.experiment.provenance import PROVENANCE
+from vinetrack.experiment.schema import COLUMNS, with_names
+from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.experiment.sheet import check_pressures, check_wall, make_trial, read_row
-
-if TYPE_CHECKING:
-    import pandas as pd
+from vinetrack.inference.fit_data import Pairs
+from vinetrack.interface.loaded import LoadedResults
 
 POSITION_COLUMNS = ("lead_position_m", "position_m")
 ERROR_COLUMNS = ("lead_position_sigma_m", "lead_position_systematic_m")
@@ -98,14 +98,14 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
         row = read_row(table, i, settings)
         required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
         for name in required:
-            if name not in row.values and all(problem.column != name for problem in row.problems):  # noqa: PD011
+            if name not in row.values and all(problem.column != name for problem in row.problems):
                 row.add("is missing", name, allowed=COLUMNS[name].allowed, remedy="give it as a column of the frame")
         check_wall(row)
         check_pressures(row)
         problems += [replace(problem, file="the frame", line=0) for problem in row.problems]
         if not row.failed:
             # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
-            row.values["track"] = row.name  # noqa: PD011
+            row.values["track"] = row.name
             trials.append(replace(make_trial(row, Path(), settings), track=None))
     if any(problem.severity == "error" for problem in problems):
         raise ExperimentError(problems)
@@ -127,3 +127,48 @@ def _track(part: pd.DataFrame, position: str) -> Track:
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
         lead_position_systematic_m=systematic_m,
     )
+
+
+# ------------------------------------------------------------------------------
+# Trials with their tracks from any source: a results folder, an experiment, a frame of tracks, or pairs.
+
+# Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track
+Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """Trials with their tracks, their experiment, and the reasons why trials were left out. `experiment` is None for a
+    frame and for pairs; `kinematics` are those of a results folder, by name of trial.
+    """
+
+    pairs: list[tuple[Trial, Track]]
+    experiment: Experiment | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    kinematics: Mapping[str, Kinematics] = field(default_factory=dict)
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """Tracks by name of trial."""
+        return {trial.name: track for trial, track in self.pairs}
+
+
+def read_source(source: Source) -> TrialSource:
+    """Read trials and tracks from any source."""
+    from vinetrack.inference.fit_data import pairs_of
+    from vinetrack.pipeline.effects_stage import read_source_experiment
+    from vinetrack.pipeline.model_stage import measured_trials
+    from vinetrack.results.folder_layout import Results
+
+    if isinstance(source, LoadedResults):
+        source = source.folder
+    if isinstance(source, pd.DataFrame):
+        return TrialSource(tracks_from_frame(source))
+    if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
+        experiment = read_source_experiment(Path(source))
+        pairs, kinematics = measured_trials(experiment, Results(Path(source)))
+        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
+    if isinstance(source, (str, Path)):
+        source = read_experiment(source)
+    pairs, left_out = pairs_of(source)
+    return TrialSource(pairs, source if isinstance(source, Experiment) else None, left_out)

@@ -13,9 +13,7 @@ from vinetrack.core.notebook import html_table, plot
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.inference.fit_summary import FitSummary
-from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored_diagnosis import read_diagnosis
-from vinetrack.results.stored_fit import read_fit
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +43,7 @@ class LoadedResults:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment that the results were made from; raises a ResultsError if it has moved."""
-        from vinetrack.pipeline.source_experiment import read_source_experiment
+        from vinetrack.pipeline.effects_stage import read_source_experiment
 
         return read_source_experiment(self.folder)
 
@@ -112,7 +110,7 @@ class LoadedResults:
     def _model(self, names: tuple[str, ...], values: Mapping[str, Any]) -> Model:
         from vinetrack.effects import catalogue
         from vinetrack.interface.calls import named_model
-        from vinetrack.interface.sources import TrialSource
+        from vinetrack.interface.data_frames import TrialSource
 
         user_effects: Mapping[str, Any] = {}
         if not set(names) <= set(catalogue()):

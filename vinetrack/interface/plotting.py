@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.diagnosis.compare import Comparison
+from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures.registry import draw
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
-    from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
+    from vinetrack.pipeline.diagnosis_stage import DiagnosisTables
 
 MODEL_FIGURES = ("model_comparison", "model_residuals")
 
@@ -47,7 +47,7 @@ def _draw_figure(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
 
 
 def _comparison_inputs(shown: Comparison) -> dict[str, tuple[Any, ...]]:
-    from vinetrack.pipeline.figures_stage import label_conditions
+    from vinetrack.pipeline.report_stage import label_conditions
 
     table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
     return {name: (table, dict(shown.trajectories)) for name in MODEL_FIGURES}
@@ -56,7 +56,7 @@ def _comparison_inputs(shown: Comparison) -> dict[str, tuple[Any, ...]]:
 def _condition_labels(trials: list[Trial]) -> Any:
     import pandas as pd
 
-    from vinetrack.pipeline.figures_stage import describe_conditions
+    from vinetrack.pipeline.report_stage import describe_conditions
 
     rows = pd.DataFrame(
         {
@@ -71,7 +71,7 @@ def _condition_labels(trials: list[Trial]) -> Any:
 
 def _diagnosis_inputs(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
     """Return the data of the figures of a diagnosis; one read from a file has no trajectories."""
-    from vinetrack.pipeline.figures_stage import figure_inputs
+    from vinetrack.pipeline.report_stage import figure_inputs
 
     return figure_inputs(_tables_in_memory(shown)) if shown.rounds else {}
 
@@ -81,7 +81,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 
     from vinetrack.diagnosis.drift import drift_groups
     from vinetrack.diagnosis.ladder import in_sample
-    from vinetrack.pipeline.diagnosis_tables import CURVE_COLUMNS, assemble_tables
+    from vinetrack.pipeline.diagnosis_stage import CURVE_COLUMNS, assemble_tables
 
     nothing = pd.DataFrame()
     if not shown.fits:
@@ -111,7 +111,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
-    from vinetrack.pipeline.figures_stage import campaign_inputs, draw_trial
+    from vinetrack.pipeline.report_stage import campaign_inputs, draw_trial
 
     trials: tuple[Trial, ...] = ()
     try:

@@ -9,11 +9,158 @@ velocity and acceleration always come from the same fit.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import numpy as np
 
 from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
-from vinetrack.kinematics.windows import WindowFits, fit_all_windows
 from vinetrack.tracks.position_noise import track_noise
+
+# ------------------------------------------------------------------------------
+# Local polynomials fitted to all windows of one width along a track at once.
+#
+# For even spacing the fit is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows with a gap or uneven
+# spacing are fitted individually by least squares of the same order.
+
+EVEN_TOLERANCE = 0.01  # Spacings within this fraction of their median count as even (chosen)
+
+MISFIT_TERMS = 4  # Orthogonal polynomials of the next higher orders that are tested in the residuals (chosen)
+
+
+@dataclass(frozen=True)
+class WindowFits:
+    """Polynomials fitted to all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
+    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,).
+    """
+
+    width: int
+    coefficients: Floats
+    middle_s: Floats
+    half_s: Floats
+    even_covariance: Floats
+    odd: Bools
+    odd_covariance: Floats | None
+    misfit: Floats
+    misfit_terms: int
+
+    def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
+        """Evaluate the polynomials of given windows at given times. Returns position, velocity, acceleration, shape (3,
+        k), SI; standard error of the velocity for noise of 1 m, shape (k,),: 1/s. Shapes: time_s, window (k,).
+        """
+        half = self.half_s[window]
+        u = (time_s - self.middle_s[window]) / half
+        value, slope, curve = _rows(u, self.coefficients.shape[0])
+        c = self.coefficients[:, window]
+        values = np.array([(c * value).sum(axis=0), (c * slope).sum(axis=0) / half, (c * curve).sum(axis=0) / half**2])
+        variance = np.einsum("ik,ij,jk->k", slope, self.even_covariance, slope)
+        if self.odd_covariance is not None:
+            variance_there = np.einsum("ik,ijk,jk->k", slope, self.odd_covariance[:, :, window], slope)
+            variance = np.where(self.odd[window], variance_there, variance)
+        return values, np.sqrt(np.maximum(variance, 0.0)) / half
+
+    def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
+        """Evaluate the velocity at every point, from the window in which the point has a given position. Returns number
+        of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,). Shapes: time_s
+        (n,).
+        """
+        n, m = time_s.size, self.coefficients.shape[1]
+        offset = _window_offset(self.width, side)
+        window = np.clip(np.arange(n) - offset, 0, m - 1)
+        velocity, gain = np.empty(n), np.empty(n)
+        u = 2 * offset / (self.width - 1) - 1
+        slope = _rows(np.array([u]), self.coefficients.shape[0])[1][:, 0]
+        regular = slice(offset, offset + m)
+        velocity[regular] = slope @ self.coefficients / self.half_s
+        gain[regular] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
+        irregular = np.ones(n, dtype=bool)
+        irregular[regular] = self.odd
+        points = np.flatnonzero(irregular)
+        values, gain[points] = self.at(time_s[points], window[points])
+        velocity[points] = values[1]
+        return window, velocity, gain
+
+
+def _window_offset(width: int, side: float) -> int:
+    """Number of points of a window before the one at `side`."""
+    return round((1 + side) / 2 * (width - 1))
+
+
+def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:
+    """Fit a polynomial to every window of `width` consecutive points. Shapes: time_s, position_m (n,)."""
+    m = time_s.size - width + 1
+    last = np.arange(m) + width - 1
+    middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
+    weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
+    odd = _uneven_windows(time_s, width)
+    odd_covariance = None
+    if odd.any():
+        take = np.flatnonzero(odd)[:, None] + np.arange(width)
+        u = (time_s[take] - middle[odd, None]) / half[odd, None]
+        uneven_weights, uneven_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
+        odd_covariance = np.zeros((order + 1, order + 1, m))
+        odd_covariance[:, :, odd] = uneven_covariance.transpose(1, 2, 0)
+    misfit = np.sum(results[order + 1 :] ** 2, axis=0)
+    return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
+
+
+def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
+    """Powers of u and their first and second derivatives, each (terms, k)."""
+    k = np.arange(terms)[:, None]
+    value = u**k
+    slope: Floats = np.zeros_like(value)
+    curve: Floats = np.zeros_like(value)
+    slope[1:] = k[1:] * value[:-1]
+    curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
+    return value, slope, curve
+
+
+def _uneven_windows(time_s: Floats, width: int) -> Bools:
+    """Mask of windows that contain a spacing different from the median, shape (n − width + 1,)."""
+    spacing = np.diff(time_s)
+    is_uneven = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE
+    count = np.concatenate([[0], np.cumsum(is_uneven)])
+    return count[width - 1 :] > count[: count.size - width + 1]
+
+
+def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
+    """Weights with the misfits scaled to unit variance, and the covariance of the coefficients, under AR(1) noise."""
+    coefficients, extra = weights[:, : order + 1], weights[:, order + 1 :]
+    covariance = correlated(coefficients, rho) @ coefficients.transpose(0, 2, 1)
+    spread = np.sqrt(np.sum(correlated(extra, rho) * extra, axis=2, keepdims=True))
+    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
+
+
+@lru_cache(maxsize=64)
+def _even_design(width: int, order: int) -> tuple[Floats, int]:
+    """The design shared by all evenly spaced windows of a width."""
+    return _solve_design(np.linspace(-1, 1, width)[None, :], order)
+
+
+def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
+    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
+    terms = min(MISFIT_TERMS, u.shape[1] - order - 1)
+    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
+    q = q.transpose(0, 2, 1)
+    inside = q[:, : order + 1]
+    coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
+    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
+
+
+def correlated(weights: Floats, rho: float) -> Floats:
+    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis. w·(R·w) is the
+    variance of Σ w_i e_i for noise e of variance 1. Shapes: weights (…, n) → (…, n).
+    """
+    from scipy.signal import lfilter
+
+    if rho == 0 or weights.size == 0:
+        return weights
+    before = lfilter([1.0], [1.0, -rho], weights, axis=-1)
+    after = lfilter([1.0], [1.0, -rho], weights[..., ::-1], axis=-1)[..., ::-1]
+    return before + after - weights
+
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)  # Widths of windows, in points (chosen)
 

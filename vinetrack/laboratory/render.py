@@ -11,18 +11,829 @@ body that moves as a whole, the same holds for its foremost point.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.laboratory import shading, textures
-from vinetrack.laboratory.scene import Scene, Tube
-from vinetrack.laboratory.scene_motion import Motion, SceneMotion
-from vinetrack.laboratory.scene_objects import BallLayer, DoorLayer, PathMaps, TubeLayer
+from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
 from vinetrack.laboratory.targets import lay_target, plane_seen
+
+# ------------------------------------------------------------------------------
+# Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film,
+# tail, ball.
+#
+# All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that changing
+# one surface does not change the others.
+
+OVERSAMPLING = 4  # Sub-pixels per pixel for drawing lines (derived)
+
+
+def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
+    """Periodic Gaussian noise with mean 0 and standard deviation 1, smoothed over `sigma_y`, `sigma_x` px."""
+    white = np.fft.rfft2(rng.standard_normal(shape))
+    fy = np.fft.fftfreq(shape[0])[:, None]
+    fx = np.fft.rfftfreq(shape[1])[None, :]
+    white *= np.exp(-2 * np.pi**2 * ((fy * sigma_y) ** 2 + (fx * sigma_x) ** 2))
+    white[0, 0] = 0
+    field = np.fft.irfft2(white, s=shape)
+    return (field / field.std()).astype(np.float32)
+
+
+def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, int]) -> tuple[Image, Image]:
+    """Coordinates along the path and across it (px) of each canvas pixel, each of shape `shape`."""
+    yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
+    ux, uy = scene.direction
+    return (dx * ux + dy * uy).astype(np.float32), (dy * ux - dx * uy).astype(np.float32)
+
+
+def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
+    """The wall in the background: a gradient along the path, a pool of light, soft blotches and grain."""
+    look = scene.backdrop
+    shape = (along.shape[0], along.shape[1])
+    span = max(float(along.max()), 1.0)
+    ramp = look.brightness + look.gradient * (np.clip(along / span, 0, 1) - 0.5)
+    blotches = 0.6 * _smooth_noise(rng, shape, 45, 45) + 0.45 * _smooth_noise(rng, shape, 9, 14)
+    grain = 0.35 * _smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * _smooth_noise(rng, shape, 0.8, 6)
+    yy, xx = np.mgrid[: shape[0], : shape[1]]
+    lit = np.exp(-(((xx / shape[1] - 0.45) / 0.65) ** 2) - ((yy / shape[0] - 0.35) / 0.9) ** 2)
+    pool = 1 + 2.5 * look.texture * (lit - 0.6)
+    return (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
+
+
+def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]) -> Image:
+    """Lay `patch` over `canvas` through the affine `matrix` (patch to canvas) where `mask` is 1."""
+    import cv2
+
+    size = (canvas.shape[1], canvas.shape[0])
+    weight = cv2.warpAffine(mask, matrix, size, flags=cv2.INTER_LINEAR)
+    laid = cv2.warpAffine(patch * mask, matrix, size, flags=cv2.INTER_LINEAR)
+    return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
+
+
+def _axis_matrix(
+    scene: Scene, corner: tuple[int, int], along_px: float, across_px: float, turned: bool = False
+) -> NDArray[np.float64]:
+    """Affine map of a patch drawn along the path to the canvas; its top left is at (along_px, across_px)."""
+    ux, uy = scene.direction
+    x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
+    y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
+    if turned:
+        return np.array([[-ux, uy, x0], [-uy, -ux, y0]])
+    return np.array([[ux, -uy, x0], [uy, ux, y0]])
+
+
+def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
+    """Paint a steel ruler, shape (width_px, length_px): tick k mm is centred k·px_per_mm from the first column."""
+    import cv2
+
+    k = OVERSAMPLING
+    big = np.full((width_px * k, length_px * k), 0.62, dtype=np.float32)
+    ink = np.zeros(big.shape, dtype=np.uint8)
+    finest_mm = next((step for step in (1, 2, 5, 10) if step * px_per_mm >= 2.2), 10)
+    for mm in range(0, int(length_px / px_per_mm), finest_mm):
+        height = 0.45 if mm % 10 == 0 else (0.34 if mm % 5 == 0 else 0.22)
+        # Sub-pixel j covers [(j − k/2 − 0.5)/k, …]: pixel 0 is centred on 0, its sub-pixels straddle it.
+        middle = (mm * px_per_mm + 0.5) * k
+        thick = 0.75 * k
+        lo, hi = round(middle - thick / 2), round(middle + thick / 2)
+        big[: int(height * width_px * k), max(lo, 0) : max(hi, 0)] = 0.10
+        if mm % 10 == 0 and mm:
+            place = (int(middle - 3.5 * k * (1 if mm < 100 else 2)), int(0.83 * width_px * k))
+            cv2.putText(ink, str(mm // 10), place, cv2.FONT_HERSHEY_SIMPLEX, 0.30 * k, 255, max(k - 2, 1))
+    big[ink > 127] = 0.13
+    fine = cv2.resize(big, (length_px, width_px), interpolation=cv2.INTER_AREA)
+    brushed = 1 + 0.03 * _smooth_noise(rng, (width_px, length_px), 0.6, 60)
+    glare = 1 + 0.25 * np.sin(np.linspace(0, 5.0, length_px) + rng.uniform(0, 6))[None, :] ** 4
+    return (fine * brushed * glare).astype(np.float32)
+
+
+def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -> Image:
+    """Paint the block from which the tube grows: dark anodised aluminium with a knurled clamp ring and screws."""
+    import cv2
+
+    height, width = int(2.9 * radius_px), reach_px
+    across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
+    patch = 0.10 + 0.10 * np.exp(-(((across + 0.6) / 0.16) ** 2)) + np.zeros((1, width), dtype=np.float32)
+    patch *= 1 + 0.06 * _smooth_noise(rng, (height, width), 0.7, 25)
+    patch[[0, 1, -2, -1], :] = 0.26
+    ring = max(int(0.5 * radius_px), 5)
+    round_light = 0.16 + 0.42 * np.exp(-(((across + 0.45) / 0.22) ** 2)) + 0.12 * np.exp(-(((across - 0.6) / 0.2) ** 2))
+    knurls = 1 + 0.25 * np.sign(np.sin(np.arcsin(across.clip(-0.99, 0.99)) * 34))
+    patch[:, width - ring :] = round_light * knurls * np.linspace(0.75, 1.1, ring)
+    patch[:, width - ring - 3 : width - ring] = 0.03
+    for back in (1.0, 2.6):
+        for side in (0.17, 0.83):
+            centre = (int(width - ring - back * radius_px), int(side * height))
+            cv2.circle(patch, centre, max(int(0.17 * radius_px), 2), 0.34, -1)
+            cv2.circle(patch, centre, max(int(0.09 * radius_px), 1), 0.02, -1)
+    return patch.astype(np.float32)
+
+
+def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
+    """Add out-of-focus objects on the wall: an aluminium profile with its slot, a hose, a label."""
+    import cv2
+
+    height, width = canvas.shape
+    level = scene.backdrop.brightness
+    things = canvas.copy()
+    post = int(rng.uniform(0.55, 0.8) * width)
+    cv2.rectangle(things, (post, -5), (post + 30, height + 5), 1.5 * level, -1)
+    cv2.rectangle(things, (post + 4, -5), (post + 7, height + 5), 1.9 * level, -1)
+    cv2.rectangle(things, (post + 12, -5), (post + 19, height + 5), 0.4 * level, -1)
+    turns = np.linspace(-0.05, 1.05, 90)
+    start, end = rng.uniform(-0.1, 0.25) * width, rng.uniform(0.35, 0.6) * width
+    hose_x = start + (end - start) * turns
+    hose_y = height * (1.06 - 0.2 * np.sin(np.pi * turns.clip(0, 1)) + 0.3 * (np.abs(turns - 0.5) > 0.5))
+    hose = np.stack([hose_x, hose_y], axis=-1).astype(np.int32)
+    cv2.polylines(things, [hose], isClosed=False, color=0.3 * level, thickness=9)
+    cv2.polylines(things, [hose - [0, 2]], isClosed=False, color=0.9 * level, thickness=2)
+    left, top = int(0.86 * width), int(0.12 * height)
+    cv2.rectangle(things, (left, top), (left + 62, top + 34), min(2.2 * level, 0.9), -1)
+    for line in range(4):
+        stop = left + 8 + int(rng.uniform(20, 46))
+        cv2.line(things, (left + 8, top + 7 + 7 * line), (stop, top + 7 + 7 * line), 0.6 * level, 2)
+    return np.asarray(cv2.GaussianBlur(things, (0, 0), 2.4), dtype=np.float32)
+
+
+def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
+    """Paint the static scene, blurred by the optics."""
+    import cv2
+
+    along, _ = _along_and_across(scene, shape, corner)
+    canvas = _wall_paper(scene, rng, along)
+    if scene.backdrop.clutter:
+        canvas = _clutter(canvas, scene, rng)
+    radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
+    if scene.backdrop.ruler:
+        length, width = int(along.max()) + 40, 34
+        patch = _ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
+        matrix = _axis_matrix(scene, corner, 0.0, round(1.9 * radius + 14))
+        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+    if scene.backdrop.launcher:
+        patch = _launcher_patch(radius, rng, 400)
+        matrix = _axis_matrix(scene, corner, -399.0, -patch.shape[0] / 2)
+        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+    return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
+
+
+def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, creases in all directions. A
+    crease is a bright flank beside a dark one; most are short and within 60° of the tube's axis.
+    """
+    import cv2
+
+    rows, columns = shape
+    lines = np.zeros((2 * rows, 2 * columns), dtype=np.float32)
+    for _ in range(max(columns // 3, 8)):
+        slant, length = rng.normal(0, 0.7), rng.gamma(2.0, 14.0)
+        across, along = rng.uniform(0, 2 * rows), rng.uniform(0, 2 * columns)
+        bend = rng.normal(0, 4)
+        turn = np.array([[math.cos(slant), math.sin(slant)], [-math.sin(slant), math.cos(slant)]])
+        curve = np.array([[-length, 0], [-length / 3, bend], [length / 3, bend], [length, 0]]) @ turn + [along, across]
+        cv2.polylines(lines, [curve.astype(np.int32)], isClosed=False, color=float(rng.standard_t(3)), thickness=1)
+    creases = cv2.resize(cv2.GaussianBlur(lines, (0, 0), 1.9), (columns, rows), interpolation=cv2.INTER_AREA)
+    flanks = creases - np.roll(creases, 2, axis=0)
+    folds = 0.8 * _smooth_noise(rng, shape, 3.5, 60) + 0.5 * _smooth_noise(rng, shape, 2.0, 18)
+    folds += 0.45 * _smooth_noise(rng, shape, 9, 9) + 0.15 * _smooth_noise(rng, shape, 0.9, 1.5)
+    relief = folds + 0.3 * creases / max(float(creases.std()), 1e-6) + 0.45 * flanks / max(float(flanks.std()), 1e-6)
+    return np.asarray((relief - relief.mean()) / relief.std(), dtype=np.float32)
+
+
+def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px: int) -> tuple[Image, Image]:
+    """Paint the everted wall at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px). Row `i` lies
+    `i − (rows − 1)/2` px off the axis. Towards the limb the line of sight crosses more film: the transmission is (1 −
+    opacity) to the power of 1/√(1 − (v/R)²), kept finite. Returns transmission, glow.
+    """
+    half = math.ceil(radius_px) + 7
+    shape = (2 * half + 1, length_px)
+    v = (np.arange(shape[0]) - half)[:, None] / radius_px
+    depth = 1 / np.sqrt(np.clip(1 - v**2, 0, 1) + 0.04)
+    wrinkles = tube.texture * _film_relief(rng, shape)
+    clear = np.clip(1 - tube.opacity * (1 + wrinkles), 0.0, 1.0) if tube.opacity < 1 else np.zeros(shape)
+    transmission = clear**depth
+    light = 0.86 - 0.16 * v + 0.08 * np.cos(2.6 * v) if tube.texture else 1.0
+    glow = (1 - transmission) * tube.brightness * light * (1 + 1.3 * wrinkles)
+    for place, width, strength in ((-0.55, 0.075, 1.4), (0.34, 0.05, 0.6), (-0.05, 0.03, 0.3)):
+        wander = place + 0.03 * _smooth_noise(rng, (4, length_px), 1, 60)[:1]
+        broken = np.clip(0.35 + 0.6 * _smooth_noise(rng, (4, length_px), 1, 7)[:1], 0, 1.6)
+        glow = glow + tube.specular * strength * broken * np.exp(-(((v - wander) / width) ** 2))
+    return transmission.astype(np.float32), glow.astype(np.float32)
+
+
+def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
+    """Return the relative stretch of distances from the axis along the everted wall, whose sides ripple. Shape
+    (length_px,).
+    """
+    ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
+    return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
+
+
+def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
+    """Return running sums along the tail's texture, which is periodic with mean 0; shape (rows, period_px + 1). The
+    mean over any stretch, as in motion blur, is then the difference of two entries over the length. Shape (rows,
+    period_px + 1).
+    """
+    rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
+    shape = (rows, period_px)
+    texture = 0.7 * _smooth_noise(rng, shape, 1.4, 9) + 0.7 * _smooth_noise(rng, shape, 3.0, 2.5)
+    texture -= texture.mean(axis=1, keepdims=True)
+    sums = np.zeros((rows, period_px + 1))
+    np.cumsum(texture, axis=1, dtype=float, out=sums[:, 1:])
+    return sums.astype(np.float32)
+
+
+def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Image:
+    """Paint a sphere lit from the upper left, with texture and two highlights; square of side 2·(ceil(radius)+4)+1."""
+    half = math.ceil(radius_px) + 4
+    grid = np.arange(-half, half + 1) / radius_px
+    r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)
+    facing = np.clip(0.55 * np.sqrt(1 - r2) - 0.35 * grid[:, None] - 0.25 * grid[None, :], 0, None)
+    marks = _smooth_noise(rng, r2.shape, 2.2, 2.2) + 0.5 * _smooth_noise(rng, r2.shape, 6, 6)
+    surface = ball.brightness * (0.45 + 0.9 * facing) * (1 + ball.texture * marks)
+    for gy, gx, width in ((-0.25, 0.05, 0.07), (-0.2, -0.12, 0.05)):
+        surface = surface + ball.specular * np.exp(
+            -((grid[:, None] - gy) ** 2 + (grid[None, :] - gx) ** 2) / (2 * width**2)
+        )
+    return surface.clip(0, 2).astype(np.float32)
+
+
+# ------------------------------------------------------------------------------
+# Compiled loops of the renderer: tube, ball and sensor, one pass each over the pixels that it touches.
+
+Whole = NDArray[np.int64]
+
+NORMAL_BITS = 12  # Bits of a random number per normal deviate (chosen)
+TAIL_TAPER_PX = 30.0  # Length over which the end of the tail, a crumpled bunch of film, fades out (chosen)
+
+
+@njit(cache=True)
+def _ramp(z: float) -> float:
+    """Integral of the normal distribution function Φ from −∞ to z: zΦ(z) + φ(z)."""
+    if z > 8:
+        return z
+    if z < -8:
+        return 0.0
+    return 0.5 * z * (1 + math.erf(z / math.sqrt(2.0))) + math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+
+
+@njit(cache=True)
+def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px: float, n: int) -> Image:
+    """Return the fraction of the exposure during which a blurred edge covers a point, shape (len(sigmas_px), n). Column
+    i is the point `first_px + i·step_px` ahead of the edge's reference position. `path_px` are positions of the edge
+    relative to that reference at equal time steps. Shapes: path_px (n_pieces + 1,) → (n_sigmas, n).
+    """
+    table = np.empty((sigmas_px.size, n), dtype=np.float32)
+    pieces = path_px.size - 1
+    for j in range(sigmas_px.size):
+        sigma = sigmas_px[j]
+        for i in range(n):
+            e = first_px + i * step_px
+            total = 0.0
+            before = _ramp((path_px[0] - e) / sigma)
+            for k in range(pieces):
+                after = _ramp((path_px[k + 1] - e) / sigma)
+                length = (path_px[k + 1] - path_px[k]) / sigma
+                if abs(length) > 1e-3:
+                    total += (after - before) / length
+                else:
+                    middle = (0.5 * (path_px[k + 1] + path_px[k]) - e) / sigma
+                    total += 0.5 * (1 + math.erf(middle / math.sqrt(2.0)))
+                before = after
+            table[j, i] = total / pieces
+    return table
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
+    """Sample the backdrop, displaced by (shift_x, shift_y) px, at every pixel of the camera; bilinear, into `out`.
+    Shapes: canvas (canvas_height, canvas_width); map_x, map_y, out (height, width).
+    """
+    rows, columns = canvas.shape
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            fx = min(max(map_x[y, x] - shift_x, 0.0), columns - 1.001)
+            fy = min(max(map_y[y, x] - shift_y, 0.0), rows - 1.001)
+            ix, iy = int(fx), int(fy)
+            ax, ay = np.float32(fx - ix), np.float32(fy - iy)
+            top = canvas[iy, ix] + ax * (canvas[iy, ix + 1] - canvas[iy, ix])
+            bottom = canvas[iy + 1, ix] + ax * (canvas[iy + 1, ix + 1] - canvas[iy + 1, ix])
+            out[y, x] = top + ay * (bottom - top)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def shade_tube(
+    out: Image, along: Image, across: Image, first_x: Whole, last_x: Whole, shift_along: float, shift_across: float,
+    tip_px: float, sway: float, sway_length: float, table: Image, table_first: float, table_step: float, fold_row: int,
+    setback: Floats, slope_row: Whole, side: Image, core: Image, per_px: int, transmission: Image, glow: Image,
+    girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
+    tail_level: float, tail_contrast: float, fold_glow: float, ghost: float, ghost_across: float,
+) -> None:  # fmt: skip
+    """Draw the tube over `out`, in place. For each pixel: the mirror image is added, the tail is laid over the
+    backdrop, then the film over both, in proportion to the coverage by the moving edge. Shapes: out, along, across
+    (height, width); first_x, last_x (height,).
+    """
+    half_profile = (setback.size - 1) // 2
+    reach = (half_profile - 1) / per_px
+    half_rows = (transmission.shape[0] - 1) // 2
+    half_tail = (tail.shape[0] - 1) // 2
+    period = tail.shape[1] - 1
+    columns = transmission.shape[1]
+    n = table.shape[1]
+    for y in range(out.shape[0]):
+        for x in range(first_x[y], last_x[y]):
+            u = along[y, x] - shift_along
+            v = across[y, x] - shift_across
+            grown = min(max(u / sway_length, 0.0), 1.5)
+            v -= sway * grown * grown
+            if ghost > 0 and abs(v - ghost_across) < reach:
+                i = int((v - ghost_across) * per_px + half_profile + 0.5)
+                place = (u + setback[i] - tip_px - table_first) / table_step
+                reflected = table[slope_row[i], min(max(int(place), 0), n - 1)] if u > 0 else 0.0
+                out[y, x] += ghost * reflected * side[i]
+            if u < -1:
+                continue
+            v *= girth[min(int(u) + 1, columns - 1)]
+            if abs(v) >= reach:
+                continue
+            i = int(v * per_px + half_profile)
+            fraction = np.float32(v * per_px + half_profile - i)
+            setback_here = setback[i] + fraction * (setback[i + 1] - setback[i])
+            side_here = side[i] + fraction * (side[i + 1] - side[i])
+            place = (u + setback_here - tip_px - table_first) / table_step
+            if place >= n - 1:
+                continue
+            if place <= 0:
+                coverage, fold = np.float32(1.0), np.float32(0.0)
+            else:
+                k = int(place)
+                part = np.float32(place - k)
+                row = slope_row[i]
+                coverage = table[row, k] + part * (table[row, k + 1] - table[row, k])
+                fold = table[fold_row, k] + part * (table[fold_row, k + 1] - table[fold_row, k])
+            coverage *= side_here * min(max(u + 0.5, 0.0), 1.0)
+            backdrop = out[y, x]
+            if core[i] > 0 and u > tail_end:
+                a, b = (u - tail_to) % period, (u - tail_from) % period
+                if b < a:
+                    b += period
+                tail_row = int(v + half_tail + 0.5)
+                ia = int(a)
+                low = tail[tail_row, ia] + (a - ia) * (tail[tail_row, ia + 1] - tail[tail_row, ia])
+                c = b - period if b >= period else b
+                ic = int(c)
+                high = tail[tail_row, ic] + (c - ic) * (tail[tail_row, ic + 1] - tail[tail_row, ic])
+                weight = tail_opacity * core[i] * min((u - tail_end) / TAIL_TAPER_PX, 1.0)
+                backdrop += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - backdrop)
+            fu, fv = min(max(u, 0.0), columns - 1.001), v + half_rows
+            iu, iv = int(fu), int(fv)
+            au, av = np.float32(fu - iu), np.float32(fv - iv)
+            t0 = transmission[iv, iu] + au * (transmission[iv, iu + 1] - transmission[iv, iu])
+            t1 = transmission[iv + 1, iu] + au * (transmission[iv + 1, iu + 1] - transmission[iv + 1, iu])
+            g0 = glow[iv, iu] + au * (glow[iv, iu + 1] - glow[iv, iu])
+            g1 = glow[iv + 1, iu] + au * (glow[iv + 1, iu + 1] - glow[iv + 1, iu])
+            film = backdrop * (t0 + av * (t1 - t0)) + g0 + av * (g1 - g0) + fold_glow * fold
+            out[y, x] += coverage * (film - out[y, x])
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def shade_ball(
+    out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
+    radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
+) -> None:  # fmt: skip
+    """Draw a ball over `out` within `box`, averaged over its positions `path_px` during the exposure. Shapes: out,
+    along, across (height, width); path_px (n_pieces,).
+    """
+    half = (surface.shape[0] - 1) // 2
+    for y in range(box[1], box[3]):
+        for x in range(box[0], box[2]):
+            v = across[y, x] - shift_across
+            if abs(v) >= half - 1:
+                continue
+            coverage_sum = 0.0
+            light_sum = 0.0
+            place = along[y, x] - shift_along
+            for k in range(path_px.size):
+                u = place - path_px[k]
+                inside = (radius_px - math.sqrt(u * u + v * v)) / sigma_px
+                if inside < -3.5 or place < min_along or abs(u) >= half - 1:
+                    continue
+                coverage = 1.0 if inside > 3.5 else 0.5 * (1 + math.erf(inside * 0.7071067811865476))
+                fu, fv = u + half, v + half
+                iu, iv = int(fu), int(fv)
+                au, av = fu - iu, fv - iv
+                s0 = surface[iv, iu] + au * (surface[iv, iu + 1] - surface[iv, iu])
+                s1 = surface[iv + 1, iu] + au * (surface[iv + 1, iu + 1] - surface[iv + 1, iu])
+                coverage_sum += coverage
+                light_sum += coverage * (s0 + av * (s1 - s0))
+            out[y, x] += np.float32((light_sum - coverage_sum * out[y, x]) / path_px.size)
+
+
+@njit(cache=True)
+def _mixed(z: np.uint64) -> np.uint64:
+    """Splitmix64's finaliser (Steele et al. 2014): neighbouring seeds give unrelated streams."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def expose(
+    light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
+    normals: Image, tone: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
+) -> None:  # fmt: skip
+    """Convert radiance to grey levels with shot and read noise, into `out`. Level = low + span · tone(signal); the
+    noise of a signal s has standard deviation √(s·well + read²)/well. Shapes: light, gain, out (height, width); normals
+    (2^NORMAL_BITS,).
+    """
+    rows, columns = out.shape
+    mask = np.uint64((1 << NORMAL_BITS) - 1)
+    steps = tone.size - 1
+    per_well = np.float32(1.0 / full_well_e) if full_well_e > 0 else np.float32(0.0)
+    read2 = np.float32((read_noise_e * per_well) ** 2)
+    linear = steps < 2
+    lamp32 = np.float32(lamp)
+    for y in range(rows):
+        state = _mixed(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + _mixed(np.uint64(frame * 65536 + y + 1)))
+        bits = np.uint64(0)
+        for x in range(columns):
+            signal = max(light[y, x] * gain[y, x] * lamp32, np.float32(0.0))
+            if full_well_e > 0:
+                if x % 4 == 0:
+                    state ^= state << np.uint64(13)
+                    state ^= state >> np.uint64(7)
+                    state ^= state << np.uint64(17)
+                    bits = state
+                deviate = normals[np.int64(bits & mask)]
+                bits >>= np.uint64(16)
+                signal += deviate * np.sqrt(signal * per_well + read2)
+            signal = min(max(signal, np.float32(0.0)), np.float32(1.0))
+            if not linear:
+                place = signal * steps
+                k = min(int(place), steps - 1)
+                signal = tone[k] + (place - k) * (tone[k + 1] - tone[k])
+            out[y, x] = np.int64(low + span * signal + 0.5)
+
+
+# ------------------------------------------------------------------------------
+# Motion of a scene over time: tip, end of the tail, sway of the tube, shake of the camera, door; and the lamps.
+#
+# All positions are in plane pixels (see `camera`), all times in seconds from the start of the first exposure.
+
+Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]  # Lead position in metres against time in seconds
+
+FASTEST_PAYLOAD_M_S = 150.0  # Largest speed of a payload that leaves the vine (chosen)
+
+RELEASE_TRAVEL_M = 1e-5  # Travel from which a vine counts as released (chosen)
+
+EVENT_STEPS = 10  # Steps per frame of the search for the release and the exit of the tail (chosen)
+
+
+def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
+    """Return a motion as a function; samples are interpolated by monotone cubics (PCHIP) and constant outside. Returns
+    function from times, s, to positions, m. Shapes: motion (n,).
+    """
+    if callable(motion):
+        return motion
+    from scipy.interpolate import PchipInterpolator
+
+    time_s, lead_position_m = (np.asarray(part, dtype=float) for part in motion)
+    cubic = PchipInterpolator(time_s, lead_position_m)
+
+    def position_m(at_s: Floats) -> Floats:
+        return np.asarray(cubic(np.clip(at_s, time_s[0], time_s[-1])))
+
+    return position_m
+
+
+class SceneMotion:
+    """Positions of everything that moves in a scene whose tip, or body, follows a given motion."""
+
+    def __init__(
+        self, scene: Scene, motion: Motion, *, n_frames: int, capture_fps: float, exposure_s: float, seed: int
+    ) -> None:
+        self.scene, self.capture_fps, self.exposure_s = scene, capture_fps, exposure_s
+        self._position_m = motion_function(motion)
+        grid_s = np.arange(0, (n_frames + 1) * EVENT_STEPS) / (EVENT_STEPS * capture_fps)
+        lead_m = np.asarray(self._position_m(grid_s), dtype=float)
+        moving = np.flatnonzero(lead_m > lead_m[0] + RELEASE_TRAVEL_M)
+        self.release_s = float(grid_s[moving[0]]) if moving.size else math.inf
+        self._exit_s, self._exit_px_s = self._find_exit(grid_s, lead_m)
+        rng = np.random.default_rng([seed, 1])
+        amplitude = rng.normal(size=(2, 6))
+        self._amplitude = amplitude / np.sqrt((amplitude**2).sum(axis=1, keepdims=True) / 2)
+        self._phase = rng.uniform(0, 2 * np.pi, (2, 6))
+        self._hertz = rng.uniform(4, 55, 6)
+        self._lamp_phase = float(rng.uniform(0, 2 * np.pi))
+
+    def _find_exit(self, grid_s: Floats, lead_m: Floats) -> tuple[float, float]:
+        """Time at which the end of the tail leaves the tip, and its speed there (px/s), twice that of the tip."""
+        if not isinstance(self.scene.subject, Tube):
+            return math.inf, 0.0
+        out = np.flatnonzero(lead_m >= self.scene.subject.length_m - 1e-4)
+        if not out.size or out[0] < 2:
+            return math.inf, 0.0
+        k = out[0]
+        lead_speed_m_s = (lead_m[k - 1] - lead_m[k - 2]) / (grid_s[k - 1] - grid_s[k - 2])
+        return float(grid_s[k]), min(2 * lead_speed_m_s, FASTEST_PAYLOAD_M_S) / self.scene.camera.m_per_px
+
+    def mid_exposure_s(self, frame: int | NDArray[np.int_]) -> Floats:
+        """Return the middle of the exposure of frames."""
+        return np.asarray(np.asarray(frame) / self.capture_fps + self.exposure_s / 2)
+
+    def lead_px(self, time_s: Floats | float) -> Floats:
+        """Return the distance of the foremost point from the path's start."""
+        lead_m = np.asarray(self._position_m(np.asarray(time_s, dtype=float)), dtype=float)
+        return np.asarray((self.scene.start_m + lead_m) / self.scene.camera.m_per_px)
+
+    def tail_end_px(self, time_s: Floats | float) -> Floats:
+        """Return the position of the tail's end and payload: 2y − L, and at constant speed after the exit."""
+        assert isinstance(self.scene.subject, Tube)
+        scale = self.scene.camera.m_per_px
+        end = (self.scene.subject.length_m + self.scene.start_m) / scale
+        riding = 2 * self.lead_px(time_s) - end
+        if not math.isfinite(self._exit_s):
+            return np.asarray(riding)
+        flying = end + self._exit_px_s * (np.asarray(time_s) - self._exit_s)
+        return np.asarray(np.where(np.asarray(time_s) < self._exit_s, riding, flying))
+
+    @property
+    def sway_length_px(self) -> float:
+        """Growth at which the sway is `sway_px`; sway grows with the square of the distance, as for a cantilever."""
+        subject = self.scene.subject
+        return subject.length_m / self.scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
+
+    def sway_px(self, time_s: float) -> float:
+        """Return the lateral displacement of the tube at `sway_length_px`, which starts smoothly at the release."""
+        subject = self.scene.subject
+        if not isinstance(subject, Tube) or not subject.wobble_px:
+            return 0.0
+        since = max(time_s - self.release_s, 0.0)
+        return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
+
+    def shake_px(self, time_s: float) -> tuple[float, float]:
+        """Return the displacement of the picture (x, y): six sinusoids of joint rms 1, and a damped kick at release.
+        Returns plane pixels along x and y.
+        """
+        if not self.scene.shake_px:
+            return 0.0, 0.0
+        sway = (self._amplitude * np.sin(2 * np.pi * self._hertz * time_s + self._phase)).sum(axis=1)
+        since = time_s - self.release_s
+        if since > 0:
+            sway = sway + self._amplitude[:, 0] * math.exp(-since / 0.04) * math.sin(2 * math.pi * 38 * since)
+        return float(self.scene.shake_px * sway[0]), float(self.scene.shake_px * sway[1])
+
+    def lamp(self, frame: int) -> float:
+        """Return the brightness of the lamps averaged over the exposure T: the sine at its middle times sinc(fT)."""
+        light = self.scene.light
+        phase = 2 * math.pi * light.flicker_Hz * float(self.mid_exposure_s(frame)) + self._lamp_phase
+        return 1 + light.flicker * float(np.sinc(light.flicker_Hz * self.exposure_s)) * math.sin(phase)
+
+    def door_angle_rad(self, time_s: float) -> float:
+        """Return the angle of the door: 0 closed, then constant acceleration, then a small rebound from its stop."""
+        door = self.scene.door
+        if door is None or not math.isfinite(self.release_s):
+            return 0.0
+        opened = (time_s - self.release_s + door.lead_s) / door.swing_s
+        if opened <= 0:
+            return 0.0
+        if opened < 1:
+            return math.radians(door.open_deg) * opened**2
+        after = opened - 1
+        return math.radians(door.open_deg - 12 * math.exp(-after / 1.5) * abs(math.sin(2.2 * after)))
+
+    def tip_plane_px(self, time_s: Floats) -> Floats:
+        """Return the tip of the tube or body in plane pixels, with sway and shake. Shapes: time_s (n,) → (n, 2)."""
+        along = self.lead_px(time_s)
+        across = np.array([self.sway_px(float(t)) for t in time_s]) * np.clip(along / self.sway_length_px, 0, 1.5) ** 2
+        shake = np.array([self.shake_px(float(t)) for t in time_s]).reshape(-1, 2)
+        ux, uy = self.scene.direction
+        plane = (
+            np.array(self.scene.origin) + along[:, None] * np.array([ux, uy]) + across[:, None] * np.array([-uy, ux])
+        )
+        return np.asarray(plane + shake)
+
+
+# ------------------------------------------------------------------------------
+# Moving objects in front of the backdrop: tube, ball and door, each composited over the light of a frame.
+
+EXPOSURE_PIECES = 4  # Straight pieces that approximate the path of the tip over an exposure (derived)
+TABLE_STEP_PX = 1 / 16  # Steps of the table of covers along the path (chosen)
+
+PROFILE_PER_PX = 16  # Entries per pixel of the profiles across (chosen)
+
+# How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)
+SLOPES = np.linspace(1.0, 4.0, 7)
+TAIL_PERIOD_PX = 4096  # Period of the texture of the tail (chosen)
+
+BALL_STEP_PX = 0.7  # Distance of the centres over which a moving ball is averaged (chosen)
+
+
+class PathMaps:
+    """Plane coordinates of every pixel, along the growth axis and across it: each float32 of the picture's shape."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.plane_x, self.plane_y = scene.camera.plane_maps()
+        ux, uy = (np.float32(part) for part in scene.direction)
+        dx, dy = self.plane_x - np.float32(scene.origin[0]), self.plane_y - np.float32(scene.origin[1])
+        self.along: Image = (dx * ux + dy * uy).astype(np.float32)
+        self.across: Image = (dy * ux - dx * uy).astype(np.float32)
+
+    def rows_within(self, touched: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First and one-past-last column of each row that `touched` marks; equal where it marks none. Returns two
+        arrays, shape (height,). Shapes: touched (height, width).
+        """
+        any_in_row = touched.any(axis=1)
+        last = touched.shape[1] - touched[:, ::-1].argmax(axis=1)
+        return np.where(any_in_row, touched.argmax(axis=1), 0), np.where(any_in_row, last, 0)
+
+
+class TubeLayer:
+    """Composites the everting tube with its payload over a frame."""
+
+    def __init__(self, scene_motion: SceneMotion, maps: PathMaps, rng: np.random.Generator) -> None:
+        scene = scene_motion.scene
+        assert isinstance(scene.subject, Tube)
+        self._motion, self._maps, self._tube, self._psf_px = scene_motion, maps, scene.subject, scene.psf_px
+        self._radius_px = radius = scene.subject.diameter_m / 2 / scene.camera.m_per_px
+        length = max(math.ceil(float(maps.along.max())) + 8, 64)
+        self._wall = film_wall(self._tube, rng, radius, length)
+        self._girth = film_girth(self._tube, rng, length)
+        self._tail = tail_sums(self._tube, rng, radius, TAIL_PERIOD_PX)
+        self._profiles = tip_profiles(self._tube, radius, self._psf_px)
+        self._ghost_across = 1.35 * radius
+        shake = 4 * scene.shake_px
+        reach = radius + 8 + 2.3 * abs(self._tube.wobble_px) + shake
+        touched = np.abs(maps.across) < reach
+        if self._tube.reflection:
+            touched |= np.abs(maps.across - self._ghost_across) < reach
+        self._first_x, self._last_x = maps.rows_within(touched & (maps.along > -4 - shake))
+        self._payload: BallLayer | None = None
+        if self._tube.payload_diameter_m:
+            metal = Ball(
+                diameter_m=self._tube.payload_diameter_m,
+                brightness=2 * self._tube.payload_brightness,
+                texture=0.1,
+                specular=0.25,
+            )
+            self._payload = BallLayer(scene_motion, maps, rng, metal, scene_motion.tail_end_px, emerges_at_px=0.0)
+
+    def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
+        """Lay the tube as exposed in one frame over a picture, in place. Shapes: light (height, width)."""
+        if self._payload is not None:
+            self._payload.lay(light, frame, shift)
+        scene_motion, tube = self._motion, self._tube
+        middle_s = float(scene_motion.mid_exposure_s(frame))
+        part = np.linspace(0, 1, EXPOSURE_PIECES + 1)
+        path = scene_motion.lead_px(frame / scene_motion.capture_fps + scene_motion.exposure_s * part)
+        tip = float(scene_motion.lead_px(middle_s))
+        table, first = self._edge_table(path - tip)
+        setback, slope_row, side, core = self._profiles
+        tail_from, tail_to = 2 * float(path[0]), 2 * float(path[-1])
+        # Averaged over one pixel at least, so that the tail's texture is as soft at rest as in motion.
+        slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
+        shade_tube(
+            light, self._maps.along, self._maps.across, self._first_x, self._last_x, *shift, tip,
+            scene_motion.sway_px(middle_s), scene_motion.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
+            setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
+            tail_to + slack,
+            float(scene_motion.tail_end_px(middle_s)), tube.tail_opacity, tube.brightness, tube.tail_texture,
+            tube.tip_glow, 0.25 * tube.reflection * tube.brightness, self._ghost_across,
+        )  # fmt: skip
+
+    def _edge_table(self, path_px: Floats) -> tuple[Image, float]:
+        """Coverage for each of SLOPES and, in the last row, the glow of the fold, against distance from the tip."""
+        sigma = self._psf_px
+        fold_px, fold_sigma = 0.28 * self._radius_px, 0.07 * self._radius_px + sigma
+        reach = 4.5 * max(sigma * SLOPES[-1], fold_sigma)
+        first, last = float(path_px.min()) - fold_px - reach, float(path_px.max()) + reach
+        n = math.ceil((last - first) / TABLE_STEP_PX) + 2
+        edges = coverage_table(path_px, sigma * SLOPES, first, TABLE_STEP_PX, n)
+        width = np.array([fold_sigma])
+        front = coverage_table(path_px, width, first, TABLE_STEP_PX, n)
+        back = coverage_table(path_px - fold_px, width, first, TABLE_STEP_PX, n)
+        return np.concatenate([edges, front - back]), first
+
+
+def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, NDArray[np.int64], Image, Image]:
+    """Profiles over the distance v from the axis, PROFILE_PER_PX a pixel: setback, slope row, side and core. Returns
+    setback, slope row, side, core, each of shape (n_entries,).
+    """
+    from scipy.special import ndtr
+
+    half = math.ceil((radius_px + 5) * PROFILE_PER_PX)
+    v = np.abs(np.arange(-half, half + 1)) / PROFILE_PER_PX
+    corner = max(tube.tip_roundness * radius_px, 1e-6)
+    into = np.clip((v - radius_px + corner) / corner, 0, 0.985)
+    cosine = np.sqrt(1 - into**2)
+    slope_row = np.searchsorted(SLOPES, np.clip(1 / cosine, 1, SLOPES[-1]) - 1e-9).astype(np.int64)
+    side = ndtr((radius_px - v) / psf_px)
+    core_px = tube.tail_width * radius_px
+    core = ndtr((core_px - 1 - v) / 1.2) * np.sqrt(np.clip(1.15 - (v / max(core_px, 1e-6)) ** 2, 0.1, 1))
+    core[v > core_px + 1] = 0
+    return corner * (1 - cosine), slope_row, side.astype(np.float32), core.astype(np.float32)
+
+
+class BallLayer:
+    """Composites a ball whose centre follows `centre_px` over a frame; it is visible from `emerges_at_px` on."""
+
+    def __init__(
+        self,
+        scene_motion: SceneMotion,
+        maps: PathMaps,
+        rng: np.random.Generator,
+        ball: Ball,
+        centre_px: Callable[[Floats], Floats],
+        emerges_at_px: float = -1e9,
+    ) -> None:
+        self._motion, self._maps, self._centre_px, self._from_px = scene_motion, maps, centre_px, emerges_at_px
+        self._radius_px = ball.diameter_m / 2 / scene_motion.scene.camera.m_per_px
+        self._surface = ball_surface(ball, rng, max(self._radius_px, 2.0))
+
+    def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
+        """Lay the ball over a picture, in place, averaged over centres at most BALL_STEP_PX apart. Shapes: light
+        (height, width).
+        """
+        scene_motion = self._motion
+        begin_s, span_s = frame / scene_motion.capture_fps, scene_motion.exposure_s
+        ends = self._centre_px(begin_s + np.array([0, span_s]))
+        pieces = int(min(max(math.ceil(abs(ends[1] - ends[0]) / BALL_STEP_PX), 3), 80))
+        path = self._centre_px(begin_s + span_s * (np.arange(pieces) + 0.5) / pieces)
+        box = self._box(path, max(abs(part) for part in shift), (light.shape[0], light.shape[1]))
+        if box[2] > box[0] and box[3] > box[1]:
+            shade_ball(
+                light, self._maps.along, self._maps.across, *shift, path, self._radius_px, scene_motion.scene.psf_px,
+                self._surface, box, self._from_px,
+            )  # fmt: skip
+
+    def _box(self, path: Floats, shake: float, shape: tuple[int, int]) -> NDArray[np.int64]:
+        """Columns and rows (x0, y0, x1, y1) that the ball can touch."""
+        scene = self._motion.scene
+        reach = 1.15 * (self._radius_px + 6) + 1.5 * shake
+        ends = np.array([path.min(), path.max()])[:, None] * np.array(scene.direction) + np.array(scene.origin)
+        corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * reach
+        seen = scene.camera.picture_from_plane(ends[:, None, :] + corners).reshape(-1, 2)
+        (x0, y0), (x1, y1) = np.floor(seen.min(axis=0)), np.ceil(seen.max(axis=0))
+        limits = [max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])]
+        return np.array(limits).astype(np.int64)
+
+
+class DoorLayer:
+    """Composites the door over a frame: a plate hinged beside the resting tip that swings out of the path."""
+
+    def __init__(self, scene_motion: SceneMotion, door: Door) -> None:
+        scene = scene_motion.scene
+        scale = scene.camera.m_per_px
+        self._motion, self._door = scene_motion, door
+        self._length, self._half = door.length_m / scale, door.thickness_m / scale / 2
+        radius = scene.subject.diameter_m / 2 / scale
+        self._hinge = np.array([float(scene_motion.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
+
+    def lay(self, light: Image, frame: int, shake: tuple[float, float]) -> None:
+        """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure. Shapes:
+        light (height, width).
+        """
+        times_s = frame / self._motion.capture_fps + self._motion.exposure_s * np.array([0.1, 0.5, 0.9])
+        angles = [self._motion.door_angle_rad(float(t)) for t in times_s]
+        arm = np.array([[-1, -4], [1, -4], [1, self._length], [-1, self._length]]) * [self._half, 1]
+        knuckle = np.array([[-2, -7], [2, -7], [2, 5], [-2, 5]]) * [self._half, 1]
+        lit = np.array([[0.3, -4], [1, -4], [1, self._length], [0.3, self._length]]) * [self._half, 1]
+        self._paint(light, arm, angles, shake, self._door.brightness)
+        self._paint(light, lit, angles, shake, 1.35 * self._door.brightness)
+        self._paint(light, knuckle, [0.0], shake, 0.12)
+
+    def _paint(
+        self, light: Image, outline: Floats, angles: list[float], shake: tuple[float, float], brightness: float
+    ) -> None:
+        """Fill the outline, turned by each of `angles` about the hinge, each with its share of the exposure."""
+        import cv2
+
+        scene = self._motion.scene
+        ux, uy = scene.direction
+        axes = np.array([[ux, uy], [-uy, ux]])
+        turned = []
+        for angle in angles:
+            turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+            turned.append(scene.camera.picture_from_plane((outline @ turn + self._hinge) @ axes + scene.origin + shake))
+        every = np.concatenate(turned)
+        low = np.clip(np.floor(every.min(axis=0)).astype(int) - 4, 0, None)
+        high = np.clip(np.ceil(every.max(axis=0)).astype(int) + 5, None, [light.shape[1], light.shape[0]])
+        if (high <= low).any():
+            return
+        cover = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.float32)
+        for corners in turned:
+            layer = np.zeros(cover.shape, dtype=np.uint8)
+            cv2.fillConvexPoly(layer, np.round((corners - low) * 16).astype(np.int32), 255, cv2.LINE_AA, shift=4)
+            cover += layer / np.float32(255 * len(turned))
+        cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), scene.psf_px), dtype=np.float32)
+        region = light[low[1] : high[1], low[0] : high[0]]
+        region += cover * (np.float32(brightness) - region)
+
 
 Image = NDArray[np.float32]
 
@@ -103,7 +914,7 @@ class FrameRenderer:
         x0, y0 = (math.floor(part.min()) - margin for part in (maps.plane_x, maps.plane_y))
         x1, y1 = (math.ceil(part.max()) + margin for part in (maps.plane_x, maps.plane_y))
         rng = np.random.default_rng([self.seed, 0])
-        self._canvas = textures.backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
+        self._canvas = backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
         self._canvas_x, self._canvas_y = maps.plane_x - np.float32(x0), maps.plane_y - np.float32(y0)
         target, psf_px = self.scene.target, self.scene.psf_px
         if target is not None and self.scene.shake_px:
@@ -111,7 +922,7 @@ class FrameRenderer:
             offset_px = np.stack([across, down], axis=-1) - np.array(self.scene.camera.centre_px)
             self._canvas = lay_target(self._canvas, target, offset_px * self.scene.camera.m_per_px, psf_px)
         self._still = np.empty(maps.plane_x.shape, dtype=np.float32)
-        shading.sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self._still)
+        sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self._still)
         if target is not None and not self.scene.shake_px:
             self._still = lay_target(self._still, target, plane_seen(self.scene.camera), psf_px)
 
@@ -127,7 +938,7 @@ class FrameRenderer:
         spread = rng.standard_normal((height, width)) + 0.5 * rng.standard_normal((1, width))
         falloff = 1 - self.scene.light.vignetting * radius2
         self._gain = (falloff * (1 + sensor.fixed_pattern * spread)).astype(np.float32)
-        cells = 1 << shading.NORMAL_BITS
+        cells = 1 << NORMAL_BITS
         quantiles = ndtri((np.arange(cells) + 0.5) / cells)
         self._normals = (quantiles / quantiles.std()).astype(np.float32)
         steps = 1 if sensor.gamma == 1 else TONE_STEPS
@@ -138,7 +949,7 @@ class FrameRenderer:
         shake = self.scene_motion.shake_px(float(self.scene_motion.mid_exposure_s(frame)))
         light = self._still.copy()
         if shake != (0.0, 0.0):
-            shading.sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, *shake, light)
+            sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, *shake, light)
         if self._door is not None:
             self._door.lay(light, frame, shake)
         ux, uy = self.scene.direction
@@ -163,7 +974,7 @@ class FrameRenderer:
         out = np.empty(light.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
         well_e = sensor.full_well_e if sensor.noise else 0.0
         full = float(2**sensor.bit_depth - 1 if span is None else span)
-        shading.expose(
+        expose(
             light, self._gain, self.scene_motion.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
             self._normals, self._tone, low, full, out,
         )  # fmt: skip

@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_csv, write_json, write_text
-from vinetrack.dynamics.force_terms import pressure_along
+from vinetrack.core.units import BASE_EFFECTS
+from vinetrack.dynamics.audit import pressure_along
 from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.tracks.position_noise import ar1_noise

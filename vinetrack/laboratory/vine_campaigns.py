@@ -14,8 +14,8 @@ import numpy as np
 
 from vinetrack.core import published
 from vinetrack.core.records import Trial
-from vinetrack.experiment.naming import with_names
-from vinetrack.planning.scaling_priors import damping_prior
+from vinetrack.experiment.schema import with_names
+from vinetrack.planning.predictive_inputs import damping_prior
 
 CAPTURE_FPS = published.CAPTURE_FPS
 PAPER_B = published.DAMPING_B

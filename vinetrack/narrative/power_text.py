@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import number
-from vinetrack.core.units import display_unit
-from vinetrack.narrative.verdict_summary import joined, listed_names, spaced_name
+import numpy as np
+
+from vinetrack.core.units import display_unit, number
+from vinetrack.effects import Effect, remedy, told_apart
+from vinetrack.experiment.schema import COLUMNS, LIMITED
+from vinetrack.inference.fit_result import Fit
+from vinetrack.narrative.verdict_text import joined, listed_names, spaced_name
+from vinetrack.planning.discriminating_design import NEW_VINE, Condition
 
 if TYPE_CHECKING:
+    from vinetrack.diagnosis.further_trials import InformativeTrials
+    from vinetrack.diagnosis.null_calibration import CalibratedTest, NullCalibration
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
+
 
 LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
 
@@ -177,8 +185,6 @@ def power_lines(power: Power) -> list[str]:
     if power.numbers:
         lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
     if power.calibration is not None:
-        from vinetrack.narrative.calibration_text import calibration_lines
-
         lines += ["", *calibration_lines(power.calibration)]
     for plan in power.further:
         lines += ["", *further_lines(plan)]
@@ -288,3 +294,239 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 
 # Columns of the rig that a further trial may change, as printed
 COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
+
+
+# ------------------------------------------------------------------------------
+# Thresholds of a verdict calibrated for one design by simulated null campaigns: a table and sentences.
+
+
+def calibration_lines(calibration: NullCalibration) -> list[str]:
+    """Return nominal and Monte-Carlo p-values of each test for this design, and whether the calls change."""
+    from vinetrack.core.terminal import table
+
+    count = calibration.campaigns
+    rows = []
+    for test in calibration.tests:
+        low, high = test.exceeding.interval
+        least, most = test.by_tail[1:]
+        tail = "–" if math.isnan(least) else f"{_chance(least)} to {_chance(most)}"
+        rows.append(
+            (
+                test.name, _chance(test.level), _chance(test.observed), f"{test.exceeding.count} of {count}",
+                _chance(test.monte_carlo), f"{_chance(low)} to {_chance(high)}", tail, _is_called(test),
+            )
+        )  # fmt: skip
+    head = ("test", "level", "p", "as extreme", "Monte-Carlo p", "95 %", "fitted tail", "called")
+    low, high = calibration.alarms.interval
+    lines = [
+        f"{count} campaigns of this design, simulated with {' + '.join(calibration.model)}, fitted and tested alike:",
+        *(f"  {line}" for line in table(rows, head, align="<>>>>>><")),
+        f"At the nominal levels, {calibration.alarms.count} of them raise a false alarm (95 % interval {percent(low)} "
+        "to "
+        f"{percent(high)}).",
+    ]
+    unresolved = [test for test in calibration.tests if not test.resolves and math.isnan(test.by_tail[0])]
+    lines.append(_verdict_of(calibration))
+    if unresolved:
+        needed = math.ceil(1 / min(test.level for test in unresolved)) - 1
+        names = listed_names([test.name for test in unresolved])
+        lines.append(f"Too few campaigns to resolve the level of {names}: that takes {needed}.")
+    if calibration.failed:
+        lines.append(f"{calibration.failed} campaigns could not be fitted and are not counted.")
+    return lines
+
+
+def _verdict_of(calibration: NullCalibration) -> str:
+    """Whether calibration changes what the nominal levels call missing."""
+    now = calibration.still_called
+    if calibration.was_called:
+        if now is None:
+            return "Something was called missing or at fault; these campaigns are too few to confirm or to revoke it."
+        if now:
+            return "Something was called missing or at fault; by the null distribution of this design it still is."
+        return (
+            "Something was called missing or at fault; by the null distribution of this design it no longer would be."
+        )
+    if now:
+        return "Nothing was called missing; by the null distribution of this design something would be."
+    return "Nothing was called missing, and by the null distribution of this design nothing would be."
+
+
+def _is_called(test: CalibratedTest) -> str:
+    """Whether a test is significant at its nominal level, and whether it is by the null distribution."""
+    words = {True: "yes", False: "no", None: "not known"}
+    return f"{words[test.is_called]}, calibrated {words[test.still_called]}"
+
+
+def _chance(chance: float) -> str:
+    """A probability in per cent, two digits; small ones as a power of ten."""
+    if math.isnan(chance):
+        return "–"
+    return percent(chance) if chance >= 1e-5 or chance == 0 else f"{chance:.0e}"
+
+
+# ------------------------------------------------------------------------------
+# The next experiment in sentences: trials to make, hypotheses that they separate, and what to measure instead.
+
+_MUCH_MORE = 1.5  # Ratio from which the larger of two expected significances is stated beside the smaller (chosen)
+
+_WITH_TRACE = (
+    "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
+    " measured, and only the other hypothesis can explain a remaining misfit."
+)
+
+
+def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
+    """Return the effects that only the first model has, and those that only the second has. Returns only_first,
+    only_second : list of Effect.
+    """
+    return (
+        [effect for effect in first.model if effect.name not in second.model],
+        [effect for effect in second.model if effect.name not in first.model],
+    )
+
+
+def only_measurement(tied: Sequence[Fit]) -> bool:
+    """Return whether the hypotheses differ only in faults of the measurement."""
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
+    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
+
+
+def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
+    """Return what to measure in order to exclude one of each pair of hypotheses, as the files of their effects state.
+    Where a fault of the measurement is among them, a calibration decides, and only the calibration is returned.
+    """
+    sentences: list[str] = []
+    effects: dict[str, Effect] = {}
+    for pair in pairs:
+        only_first, only_second = effects_between(*pair)
+        if any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second) and _WITH_TRACE not in sentences:
+            sentences.append(_WITH_TRACE)
+        effects.update({effect.name: effect for effect in [*only_first, *only_second]})
+    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
+    for effect in measured or effects.values():
+        words = " ".join(filter(None, ("" if measured else told_apart(effect), remedy(effect))))
+        if words:
+            sentences.append(f"{effect.name}: {words[0].lower()}{words[1:]}")
+    return " ".join(sentences)
+
+
+def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
+    """Return the trials to make, as a list within a sentence."""
+    return "; ".join(_trial_in_words(trial) for trial in trials)
+
+
+def _trial_in_words(trial: Mapping[str, Any]) -> str:
+    count = trial["replicates"]
+    words = f"{count} {'trial' if count == 1 else 'trials'} at {trial['pressure_kPa']:.3g} kPa"
+    if trial["payload_g"]:
+        words += f" with {trial['payload_g']:.3g} g"
+    size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
+    words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
+    changed = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in trial["changed"]]
+    return f"{words}, {' and '.join(changed)}" if changed else words
+
+
+def separation_text(
+    if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
+) -> str:
+    """Return the expected significance with which the trials separate each pair of hypotheses."""
+    parts = []
+    for pair, by_truth in if_true.items():
+        least, most = sorted(by_truth, key=by_truth.__getitem__)
+        is_much_larger = by_truth[most] > _MUCH_MORE * max(by_truth[least], 1.0)
+        notes = [f"{by_truth[most]:.2g} σ if {most} is true"] if is_much_larger else []
+        mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
+        if math.isfinite(mean):
+            notes.append(f"simulated: {mean:.2g}" + (f" ± {max(sd, 0.1):.1g} σ" if math.isfinite(sd) else " σ"))
+        remark = f" ({'; '.join(notes)})" if notes else ""
+        parts.append(f"{pair.replace(' | ', ' from ')} by {by_truth[least]:.2g} σ{remark}")
+    return ", ".join(parts)
+
+
+def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
+    """Return the trials of a design as entries of `next_experiment`, one for each condition."""
+    return tuple(
+        _entry(every[index], int(count))
+        for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    )
+
+
+def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
+    trial = condition.trial
+    settings = {name: COLUMNS[name].of_trial(trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
+    return {
+        **{name: float(f"{value:.6g}") for name, value in settings.items()},
+        "replicates": replicates,
+        "vine": trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }
+
+
+def advice_text(
+    trials: Sequence[Mapping[str, Any]],
+    promise: str,
+    left: Sequence[str],
+    advice: str,
+    *,
+    worth_it: bool,
+    least: float,
+) -> str:
+    """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
+    if not worth_it:
+        return (
+            f"No trials within `limits` separate the tied hypotheses by {least:g} σ; the best would separate"
+            f" {promise}. {advice}".rstrip()
+        )
+    text = f"Make {trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
+    if any(trial["new_vine"] for trial in trials):
+        text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
+    if left:
+        pairs = joined([pair.replace(" | ", " from ") for pair in left])
+        text += f" They will not separate {pairs}. {advice}"
+    elif advice:
+        text += f" A measurement would decide as well: {advice}"
+    return text.rstrip()
+
+
+# ------------------------------------------------------------------------------
+# Trials recommended for a campaign that goes on, in words.
+
+MOST_SIZES = 3  # Effects whose detectable sizes are stated beside recommended trials, at most (chosen)
+
+LEAST_STATED_GAIN = 1.1  # Factor by which a detectable size must fall to be stated (chosen)
+
+
+def informative_text(plan: InformativeTrials, named: str = "", rival: str = "") -> str:
+    """Return recommended trials in words, and the detectable sizes that they lower most."""
+    purpose = "These trials are expected to reveal most of what could be missing"
+    if named:
+        purpose = f"These trials tell most about {spaced_name(named)}"
+        purpose += f" apart from {spaced_name(rival)}" if rival else ""
+    before = {entry.effect: entry for entry in plan.now.effects}
+    gains = [
+        (before[entry.effect], entry, _gain(before[entry.effect], entry))
+        for entry in plan.then.effects
+        if entry.effect in before and (entry.effect == named or not named) and _is_plausible(entry)
+    ]
+    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > LEAST_STATED_GAIN][:MOST_SIZES]
+    lower = [
+        f"{spaced_name(then.effect)} from {then.symbol or 'size'} = {size_text(now, now.size_at(0.9))} to "
+        f"{size_text(then, then.size_at(0.9))}"
+        for now, then, _ in gains
+    ]
+    sizes = f" They lower the size that is detected with 90 % power: {joined(lower)}." if lower else ""
+    return f"Make {trials_in_words(plan.trials)}. {purpose}.{sizes}"
+
+
+def _gain(now: EffectPower, then: EffectPower) -> float:
+    """Factor by which the size detected with 90 % power falls; 0 where either is unknown."""
+    sizes = [abs(entry.size_at(0.9) - entry.zero) for entry in (now, then)]
+    return sizes[0] / sizes[1] if math.isfinite(sizes[0]) and sizes[1] > 0 else 0.0
+
+
+def _is_plausible(entry: EffectPower) -> bool:
+    """Whether the size detected with 90 % power is no larger than the largest plausible one."""
+    return abs(entry.size_at(0.9) - entry.zero) <= abs(entry.largest - entry.zero)

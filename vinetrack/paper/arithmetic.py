@@ -7,18 +7,275 @@ that the printed B imply, the work of the weight, the injector, the hoop stress 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import t as student
 
+from vinetrack import effects
 from vinetrack.core import published
-from vinetrack.core.constants import AMBIENT_PRESSURE_PA, GRAVITY_M_S2
-from vinetrack.core.units import convert
-from vinetrack.kinematics.scaling import regress
-from vinetrack.paper.rows import COMPUTED, PaperRow
-from vinetrack.planning.scaling_priors import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
+from vinetrack.core.published import SOURCE
+from vinetrack.core.records import Trial
+from vinetrack.core.units import AMBIENT_PRESSURE_PA, GRAVITY_M_S2, convert
+from vinetrack.dynamics.model import Model, base_model
+from vinetrack.dynamics.simulate import Trajectory, simulate
+from vinetrack.kinematics.damping import regress
+from vinetrack.kinematics.summary import lead_velocity_at
+from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
+
+# ------------------------------------------------------------------------------
+# One row of the table that compares published numbers with ours, and the meaning of its marks.
+
+COMPUTED = "computed"
+SIMULATED = "simulated from printed parameters"
+MEASURED = "measured"
+NOT_CHECKABLE = "not checkable"
+
+UNANSWERED = "the trials of this experiment do not tell"
+
+MARKS = {
+    COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
+    "where the two differ",
+    SIMULATED: "found in virtual trials that were grown from the printed B and n: agreement checks the analysis, not "
+    "the paper",
+    MEASURED: "found in trials that were filmed",
+    NOT_CHECKABLE: "rests on something that is not printed: a setting, a scatter, or a B that had to be guessed",
+}
+
+PAPER_COLUMNS = (
+    "row",
+    "where",
+    "quantity",
+    "setting",
+    "unit",
+    "published",
+    "as_printed",
+    "ours",
+    "ours_low_95",
+    "ours_high_95",
+    "mark",
+    "how",
+    "beside",
+)
+
+PREFERRED = "both_axes"  # The fit of the damping law that supplies our numbers
+
+nan = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperRow:
+    """A published number or statement and ours, in `unit`. `row` identifies it in programs; `where` and `as_printed`
+    say where and how it is printed; `published` is NaN where that is not a number. `low` and `high` are the 95 %
+    interval of ours.
+    """
+
+    row: str
+    where: str
+    quantity: str
+    mark: str
+    how: str
+    setting: str = ""
+    unit: str = "1"
+    published: float = nan
+    as_printed: str = ""
+    ours: float = nan
+    low: float = nan
+    high: float = nan
+    beside: str = ""
+
+
+def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
+    """Return the rows as a table with the columns `PAPER_COLUMNS` of `paper.csv`."""
+    entries = []
+    for row in map(_as_answered, rows):
+        entry = asdict(row)
+        entry["ours_low_95"], entry["ours_high_95"] = entry.pop("low"), entry.pop("high")
+        entry["as_printed"] = row.as_printed or (f"{row.published:g}" if math.isfinite(row.published) else "")
+        entries.append(entry)
+        if row.mark not in MARKS:
+            raise ValueError(f"row {row.row} has the mark {row.mark!r}")
+    table = pd.DataFrame(entries, columns=list(PAPER_COLUMNS))
+    twice = table.loc[table["row"].duplicated(), "row"].tolist()
+    if twice:
+        raise ValueError(f"rows stand twice: {', '.join(twice)}")
+    return table
+
+
+def _as_answered(row: PaperRow) -> PaperRow:
+    """The row; where trials should have given a number and did not, `how` says so."""
+    if row.mark not in (SIMULATED, MEASURED) or math.isfinite(row.ours):
+        return row
+    return replace(row, how=UNANSWERED)
+
+
+def number(value: Any) -> float:
+    """Return a number read from JSON, NaN for null."""
+    return nan if value is None else float(value)
+
+
+def bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
+    """Return an interval read from JSON, NaN for null. Returns low, high."""
+    low, high = pair or (None, None)
+    return number(low), number(high)
+
+
+# ------------------------------------------------------------------------------
+# Departures from the paper's assumptions, simulated for its own trials: differences of the motions from Eq. (2).
+#
+# The departures are a chamber that is not refilled, from slow (isothermal) to fast (adiabatic), a tail that cannot
+# carry
+# compression, and both. They bound the effect of such a departure, with the printed B, n and P_y, and do not explain
+# what
+# was measured: neither the rate at which the regulator refills nor the lengths of the vines are printed, and a payload
+# that has fallen to the tip rests there without pushing it.
+
+# Fraction of the length up to which positions are compared (chosen)
+WITHIN = 0.95
+
+LASTS_S = 60.0  # Duration of the simulated motions, s; the slowest, at 7 kPa, takes 7 s by Eq. (2) (chosen)
+
+
+@dataclass(frozen=True)
+class Departure:
+    """A departure from Eq. (2): `gamma` of a chamber that is not refilled (None: refilled), and a slack tail."""
+
+    name: str
+    words: str
+    gamma: float | None = None
+    slack: bool = False
+
+    def model(self, B: float) -> Model:
+        """Return Eq. (2) with the printed n and this departure."""
+        model = base_model()
+        if self.gamma is not None:
+            model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
+        return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
+
+    def trial(self, trial: Trial) -> Trial:
+        """Return the trial, whose tail may go slack if the departure says so."""
+        return replace(trial, tail_slack="free" if self.slack else "taut")
+
+
+NONE = Departure("eq2", "Eq. (2)")
+DEPARTURES = (
+    Departure("depletion_slow", "chamber not refilled, isothermal", gamma=1.0),
+    Departure("depletion_fast", "chamber not refilled, adiabatic", gamma=1.4),
+    Departure("slack", "tail that cannot push", slack=True),
+    Departure("depletion_slow_slack", "both, isothermal", gamma=1.0, slack=True),
+    Departure("depletion_fast_slack", "both, adiabatic", gamma=1.4, slack=True),
+)
+
+DEPARTURE_COLUMNS = (
+    "figure",
+    "pressure_kPa",
+    "departure",
+    "rms_position_m",
+    "rms_final_lead_velocity_m_s",
+    "slack_from_s",
+)
+MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
+
+
+def paper_trial(
+    diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
+) -> Trial:
+    """Return a trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa."""
+    return Trial(
+        name=f"{diameter_mm:g} mm × {thickness_um:g} µm at {pressure_kPa:g} kPa",
+        capture_fps=published.CAPTURE_FPS,
+        diameter_m=diameter_mm / 1e3,
+        thickness_m=thickness_um / 1e6,
+        length_m=length_mm / 1e3,
+        pressure_Pa=1e3 * pressure_kPa,
+        yield_pressure_Pa=1e3 * published.YIELD_PRESSURE_KPA,
+        payload_kg=payload_g / 1e3,
+        chamber_m3=published.CHAMBER_L / 1e3,
+    )
+
+
+def position_trials() -> list[Trial]:
+    """Return the trials of the paper's Fig. 4: the 24 mm × 200 µm vine, as long as the longest, with its payload."""
+    size = (published.DIAMETER_MM[4], published.THICKNESS_UM[4], published.LONGEST_VINE_MM)
+    return [paper_trial(*size, pressure_kPa, published.PAYLOAD_G) for pressure_kPa in published.POSITION_RMS_CM]
+
+
+def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
+    """Compute the differences of each departure from Eq. (2), columns `DEPARTURE_COLUMNS`."""
+    rows: list[tuple[object, ...]] = []
+    for trial in position_trials():
+        plain = follow(trial, NONE, published.DAMPING_B[4])
+        for departure in DEPARTURES:
+            moved = follow(trial, departure, published.DAMPING_B[4])
+            rms_m = position_rms_m(plain, moved, trial)
+            rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
+    for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
+        for departure in DEPARTURES:
+            off = [_speed_change_m_s(pressure_kPa, payload_g, departure) for payload_g in payloads_g]
+            rms_m_s = math.sqrt(float(np.mean(np.square(off)))) if off else math.nan
+            rows.append(("Fig. 5", float(pressure_kPa), departure.name, math.nan, rms_m_s, math.nan))
+    return pd.DataFrame(rows, columns=list(DEPARTURE_COLUMNS))
+
+
+def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
+    """Simulate the motion at the camera's frames, until it ends or for `LASTS_S`."""
+    time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
+    return simulate(departure.model(B), departure.trial(trial), time_s)
+
+
+def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
+    """Return the root mean square difference of two positions from release until Eq. (2) has grown to 95 %."""
+    stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
+    return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
+
+
+def _speed_trial(pressure_kPa: float, payload_g: float) -> tuple[Trial, float]:
+    """A trial of the paper's Fig. 5 and its B, which is not printed and taken as proportional to the wall."""
+    wall_um = published.FINAL_SPEED_THICKNESS_UM
+    B = published.DAMPING_B[4] * wall_um / published.THICKNESS_UM[4]
+    return paper_trial(published.DIAMETER_MM[4], wall_um, published.LONGEST_VINE_MM, pressure_kPa, payload_g), B
+
+
+def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departure) -> float:
+    """Change of the leading edge's speed at the paper's 12 cm against Eq. (2)."""
+    trial, B = _speed_trial(pressure_kPa, payload_g)
+    at_m = published.FINAL_SPEED_AT_MM / 1e3
+    speeds = []
+    for assumed in (departure, NONE):
+        moved = follow(trial, assumed, B)
+        speeds.append(lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, at_m))
+    return speeds[0] - speeds[1] if math.isfinite(speeds[0]) else -speeds[1]
+
+
+def motion_table(instants: int = 200) -> pd.DataFrame:
+    """Simulate the motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`."""
+    parts = []
+    for trial in position_trials():
+        for departure in (NONE, *DEPARTURES):
+            moved = follow(trial, departure, published.DAMPING_B[4])
+            end_s = moved.end_time_s if math.isfinite(moved.end_time_s) else LASTS_S
+            time_s = np.linspace(0, end_s, instants)
+            position_m = np.interp(time_s, moved.time_s, moved.lead_position_m)
+            columns = (trial.pressure_Pa / 1e3, departure.name, time_s, position_m)
+            parts.append(pd.DataFrame(dict(zip(MOTION_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True)
+
+
+def pressure_table(instants: int = 60) -> pd.DataFrame:
+    """Compute the remaining gauge pressure along the growth of Fig. 4's vine."""
+    rows = []
+    for trial in position_trials():
+        for departure in DEPARTURES[:2]:
+            for y in np.linspace(0, trial.length_m, instants):
+                change = area_m2(1e3 * trial.diameter_m) * float(y) / trial.chamber_m3
+                left = gauge_left(trial.pressure_Pa, change, departure.gamma or 1.0)
+                rows.append((trial.pressure_Pa / 1e3, departure.name, float(y), left))
+    return pd.DataFrame(rows, columns=["pressure_kPa", "departure", "lead_position_m", "gauge_left"])
+
 
 GAMMAS = {"slow": 1.0, "fast": 1.4}  # Isothermal and adiabatic: the chamber's gas lies between them
 

@@ -15,7 +15,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_csv
 from vinetrack.narrative.campaign_text import campaign_lines, simulation_lines
 from vinetrack.pipeline.design_stage import read_list, read_range
-from vinetrack.pipeline.prediction_inputs import (
+from vinetrack.pipeline.predict_stage import (
     PredictionRequest,
     check_figure,
     inputs_of,
@@ -219,7 +219,7 @@ def _film_sheet(shown: Candidates, design: Plan, wanted: CampaignRequest) -> pd.
 
 
 def _picture(shown: Candidates, design: Plan, longest_s: float) -> Figure:
-    from vinetrack.figures.design_figures import draw_campaign
+    from vinetrack.figures.prediction_figures import draw_campaign
     from vinetrack.planning.campaign_design import trials_of
     from vinetrack.planning.campaign_information import final_lead_speeds
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.experiment.schema import option
-from vinetrack.pipeline.prediction_inputs import (
+from vinetrack.pipeline.predict_stage import (
     PredictionRequest,
     check_figure,
     describe_trial,
@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vinetrack.core.records import Trial
-    from vinetrack.planning.fastest_vine import Choice, Room
+    from vinetrack.planning.fastest_vine import Chamber, Choice, Room
     from vinetrack.planning.predictive_inputs import PredictiveInputs
-    from vinetrack.planning.reservoir_design import Chamber
 
 MAX_FILMS = 12  # Largest number of films (chosen)
 
@@ -54,8 +53,7 @@ def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
 
 def _cell(column: str, text: str, name: str = "") -> float:
     """Read one number of a column; return it in SI."""
-    from vinetrack.experiment.cells import CellError, read_cell
-    from vinetrack.experiment.schema import COLUMNS
+    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
 
     try:
         value = read_cell(COLUMNS[column], text.strip())
@@ -143,8 +141,8 @@ def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
 
 def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     from vinetrack.core.terminal import table
-    from vinetrack.planning.design_checks import design_checks
-    from vinetrack.planning.scaling_priors import hoop_stress_Pa
+    from vinetrack.planning.prediction import design_checks
+    from vinetrack.planning.predictive_inputs import hoop_stress_Pa
 
     best = choices[0].prediction
     yield (
@@ -189,7 +187,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
 
 
 def _vine_picture(choices: Sequence[Choice]) -> Figure:
-    from vinetrack.figures.design_figures import FilmChoice, draw_choice
+    from vinetrack.figures.prediction_figures import FilmChoice, draw_choice
 
     films = [
         FilmChoice(
@@ -244,7 +242,7 @@ def design_reservoir(
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
     from vinetrack.core.terminal import table
-    from vinetrack.planning.reservoir_design import GAMMAS, chambers, swept_m3
+    from vinetrack.planning.fastest_vine import GAMMAS, chambers, swept_m3
 
     description = (
         describe_trial(trial)
@@ -268,7 +266,7 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
 
 
 def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
-    from vinetrack.planning.reservoir_design import GAMMAS
+    from vinetrack.planning.fastest_vine import GAMMAS
 
     losses = [f"{100 * share:.1f}" for share in chamber.losses.values()]
     speeds = (
@@ -280,9 +278,9 @@ def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) 
 
 
 def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
-    from vinetrack.dynamics.host import host_for
-    from vinetrack.planning.design_checks import final_m_s
-    from vinetrack.planning.reservoir_design import final_with
+    from vinetrack.dynamics.model import host_for
+    from vinetrack.planning.fastest_vine import final_with
+    from vinetrack.planning.prediction import final_m_s
 
     if math.isinf(volume_m3):
         return final_m_s(inputs, inputs.model, host_for(inputs.model), at_fraction)
@@ -290,7 +288,7 @@ def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction
 
 
 def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
-    from vinetrack.planning.reservoir_design import GAMMAS, supplied_chamber
+    from vinetrack.planning.fastest_vine import GAMMAS, supplied_chamber
 
     volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
     needed = ", ".join(f"{format_volume(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
@@ -300,8 +298,8 @@ def _supplied_lines(inputs: PredictiveInputs, loss: float, supply_s: float) -> l
 def _reservoir_picture(trial: Trial, loss: float) -> Figure:
     import numpy as np
 
-    from vinetrack.figures.design_figures import GasLawLoss, draw_reservoir
-    from vinetrack.planning.reservoir_design import GAMMAS, chambers, gauge_loss, swept_m3
+    from vinetrack.figures.prediction_figures import GasLawLoss, draw_reservoir
+    from vinetrack.planning.fastest_vine import GAMMAS, chambers, gauge_loss, swept_m3
 
     swept = swept_m3(trial)
     volumes = swept * np.geomspace(3.0, 300.0, 200)

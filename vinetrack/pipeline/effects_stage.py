@@ -2,15 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.experiment.folder import Experiment
+from vinetrack.pipeline.model_stage import measured_trials
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_json
 
 if TYPE_CHECKING:
     from vinetrack.effects import Effect
+
+
+# ------------------------------------------------------------------------------
+# The experiment that a results folder was made from, and saving a model to its `experiment.yaml`.
+
+
+def read_source_experiment(folder: Path, experiment: Path | None = None) -> Experiment:
+    """Read the experiment that a results folder was made from, as stated by its `provenance.json`."""
+    from vinetrack.experiment.folder import read_experiment
+
+    results = Results(folder)
+    if not folder.is_dir():
+        raise ResultsError(f"{folder} is not a folder: give the results folder of a run, such as results/NAME")
+    if not results.provenance.exists():
+        raise ResultsError(
+            f"{folder} is not a results folder, because it has no {results.provenance.name}: run vinetrack run or "
+            "snakemake first"
+        )
+    path = experiment or Path(str(read_json(results.provenance)["experiment"]))
+    if not path.is_dir():
+        raise ResultsError(
+            f"{folder} was made from {path}, which does not exist any more: give its new path with --experiment PATH"
+        )
+    return read_experiment(path)
+
+
+SETTINGS = "experiment.yaml"
+BOM = b"\xef\xbb\xbf"
+
+
+def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
+    """Set `model:` in `experiment.yaml`, atomically; return the path of the settings. A byte-order mark and the line
+    ends of the file are kept; other encodings are converted to UTF-8.
+    """
+    from vinetrack.core.tables import read_text, write_bytes
+    from vinetrack.core.yaml_document import with_list
+    from vinetrack.experiment.settings import read_experiment_settings
+
+    path = folder / SETTINGS
+    before = path.read_bytes() if path.exists() else b""
+    text = read_text(path) if before else ""
+    listed = list(read_experiment_settings(path).effects) if before and files else []
+    new = [name for name in files if name not in listed]
+    if new:
+        text = with_list(text, "effects", [*listed, *new], path.name)
+    text = with_list(text, "model", names, path.name)
+    if b"\r\n" in before:
+        text = text.replace("\n", "\r\n")
+    write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))
+    return path
+
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -53,9 +107,8 @@ def model_problems(experiment: Path) -> list[Problem]:
     """Find problems of the effects that an experiment names in `model`, `candidates` or `effects`. Returns nothing for
     the base model, nor if the experiment cannot be read, which `check_experiment` reports.
     """
-    from vinetrack.core.constants import BASE_EFFECTS
-    from vinetrack.dynamics.model import make_model
-    from vinetrack.dynamics.trial_inputs import check_needs
+    from vinetrack.core.units import BASE_EFFECTS
+    from vinetrack.dynamics.model import check_needs, make_model
     from vinetrack.effects import EffectError, find_effect
     from vinetrack.experiment.folder import read_experiment
 
@@ -85,7 +138,7 @@ def model_problems(experiment: Path) -> list[Problem]:
 def _write_picture(effect: Effect, path: Path) -> None:
     """Draw the influence of an effect on the reference vine; the suffix of the file names the format."""
     from vinetrack.core.tables import write_bytes
-    from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
+    from vinetrack.dynamics.simulate import effect_motion, reference_words, size_words
     from vinetrack.figures.prediction_figures import draw_effect
     from vinetrack.figures.style import render
 
@@ -120,3 +173,69 @@ def effects_content(name: str | None, experiment: Path | None) -> list[dict[str,
         }
         for effect in effects
     ]
+
+
+# ------------------------------------------------------------------------------
+# Proposed effects: a force law or table that improves the model, written as an effect file of the user's own.
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class WrittenProposal:
+    """Lines for the terminal, and the effect files written, the law first."""
+
+    lines: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
+    """Write the force law that explains a misfit which no effect of the catalogue explains, or else a learned table."""
+    from vinetrack.core.tables import write_text
+    from vinetrack.diagnosis.propose import effect_text, propose, table_text
+    from vinetrack.diagnosis.result import UNEXPLAINED
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.effects import own_effects, remember
+
+    results = Results(folder)
+    diagnosis = read_diagnosis(results)
+    if diagnosis is None:
+        raise ResultsError(f"{folder}: it has no diagnosis; run vinetrack diagnose {folder}")
+    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
+        raise ResultsError(
+            f"{folder}: its verdict is `{diagnosis.final_verdict}`. A new law is proposed only for a misfit that no"
+            " effect of the catalogue explains (`unexplained`); `vinetrack diagnose` prints the diagnosis."
+        )
+    user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
+    pairs, _ = measured_trials(experiment, results)
+    proposal = propose(model, pairs, report)
+    learned = (diagnosis.missing_force or {}).get("learned") or {}
+    lines = [*([learned["sentence"]] if learned else []), *proposal.sentences()]
+    origin = (
+        f"From {len(proposal.before.trials)} trials of {experiment.name}. RMS error in left-out conditions:"
+        f" {' + '.join(model.names)} {1e3 * proposal.rms_left_out_m:.2f} mm; with this"
+    )
+    files = []
+    if proposal.tied:
+        best = proposal.tied[0]
+        remark = f"{origin} law {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
+        files.append((best.effect.path.name, effect_text(best.law, remark)))
+    if proposal.table is not None:
+        table = proposal.table
+        remark = f"{origin} table, which was learned from all of them, {1e3 * table.rms_left_out_m:.2f} mm."
+        files.append((table.effect.path.name, table_text(table.learned, remark)))
+    paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
+    if to is not None and paths:
+        paths[0] = to
+    for path in paths:
+        if path.exists():
+            raise ResultsError(f"{path} exists already: move it away, or give another file with --to.")
+    for path, (_, text) in zip(paths, files, strict=True):
+        write_text(path, text)
+        remember(path)
+        lines.append(f"Written to {path}. Read it, then fit it with `vinetrack add {path} {folder}`.")
+    if files:
+        settings = experiment.folder / "experiment.yaml"
+        lines.append(f"To test it in the diagnosis, list it under `effects:` in {settings}.")
+    return WrittenProposal(tuple(lines), tuple(paths))

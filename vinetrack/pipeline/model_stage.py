@@ -17,13 +17,12 @@ import numpy as np
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored_fit import read_fit
+from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.compare import Comparison
+    from vinetrack.diagnosis.ladder import Comparison
     from vinetrack.dynamics.audit import Audit
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
@@ -37,12 +36,11 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     `audit.csv` and `payload_model.csv`, the modelled final speed against payload. Returns `fit.json` as written;
     `refused` is None or the reason.
     """
-    from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
+    from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS
     from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-    from vinetrack.inference.fit_summary import FitSummary
-    from vinetrack.inference.model_check import CHECK_COLUMNS
-    from vinetrack.inference.summary_of_fit import summary_of
+    from vinetrack.inference.fit_result import CHECK_COLUMNS
+    from vinetrack.inference.fit_summary import FitSummary, summary_of
     from vinetrack.results.folder_layout import empty_table
 
     results = Results(folder)
@@ -141,8 +139,7 @@ def _fit_and_compare(
     kinematics: dict[str, Kinematics],
     settings: RunSettings,
 ) -> tuple[Fit, Comparison]:
-    from vinetrack.diagnosis.compare import compare
-    from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+    from vinetrack.diagnosis.ladder import candidates_of, compare, initial_fit
     from vinetrack.pipeline.tracks_stage import model_of
 
     model = model_of(experiment)
@@ -156,7 +153,7 @@ def _fit_and_compare(
 def _damping_check(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
     """Return the table `model_check.csv`, and the reason if it is empty."""
     from vinetrack.inference.fit_data import FitError
-    from vinetrack.inference.model_check import CHECK_COLUMNS, check_damping
+    from vinetrack.inference.fit_result import CHECK_COLUMNS, check_damping
     from vinetrack.results.folder_layout import empty_table
 
     method = "log_log" if damping["both_axes"].get("refused") else "both_axes"

@@ -2,35 +2,431 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vinetrack.core.blas_threads import in_one_blas_thread
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.diagnosis.campaign_power import design_of_fit
-from vinetrack.diagnosis.null_calibration import NullCalibration, calibrate, p_values_of
-from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, SimulatedRates, sheet_cells
-from vinetrack.diagnosis.simulated_power import rates_of
+from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.diagnosis.campaign_power import (
+    CampaignDesign,
+    SimulatedDiagnosis,
+    design_of_fit,
+    design_power,
+    fit_power,
+    rates_of,
+    simulated_diagnosis,
+)
+from vinetrack.diagnosis.null_calibration import (
+    TESTS,
+    CampaignPValues,
+    NullCalibration,
+    calibrate,
+    null_p_values,
+    p_values_of,
+)
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
-from vinetrack.pipeline.power_campaigns import (
-    MeasuredTrials,
-    PowerCampaign,
-    PowerRequest,
-    campaign_in_memory,
-    campaign_of_target,
-    measured_campaign,
-    trials_of_target,
-)
-from vinetrack.pipeline.simulated_answers import Simulation, simulate_answers, simulate_null_tests, size_key
+from vinetrack.experiment.settings import ExperimentSettings, Limits
+from vinetrack.experiment.sheet import expected_systematic_m
+from vinetrack.pipeline.tracks_stage import map_unordered
+from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
+    from vinetrack.core.records import Track, Trial
     from vinetrack.diagnosis.stopping import CampaignLook
+    from vinetrack.effects import Effect
+    from vinetrack.experiment.planned import PlannedTrials
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
+
+
+# ------------------------------------------------------------------------------
+# Simulation of campaigns in one or several processes, with each answer stored in a file when it is ready.
+#
+# When a simulation is resumed, only missing answers are simulated; stored answers of other designs are ignored.
+
+Task = tuple[CampaignDesign, str, float, int]
+ANSWER_COLUMNS = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
+P_VALUE_COLUMNS = ("design", "seed", *TESTS, "failed")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Settings of a simulation: number of campaigns, first seed, number of processes, and file of answers."""
+
+    campaigns: int
+    first_seed: int
+    jobs: int
+    path: Path
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the campaigns."""
+        return range(self.first_seed, self.first_seed + self.campaigns)
+
+
+def simulate_answers(
+    design: CampaignDesign, wanted: Sequence[tuple[str, float]], simulation: Simulation
+) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
+    """Simulate campaigns and diagnose each completely. Returns answers by effect, `size_key` of the size, and seed."""
+    from vinetrack.core.terminal import Progress, progress
+
+    mark = fingerprint(design)
+    kept = {(a.effect, size_key(a.value), a.seed): a for a in stored_answers(simulation.path, mark)}
+    tasks: list[Task] = [
+        (design, effect, value, seed)
+        for seed in simulation.seeds
+        for effect, value in wanted
+        if (effect, size_key(value), seed) not in kept
+    ]
+    total = len(wanted) * simulation.campaigns
+    bar: Progress[None]
+    with progress(total, "simulating", unit="campaign") as bar:
+        bar.advance(total - len(tasks))
+        for answer in map_unordered(_diagnose_task, tasks, simulation.jobs):
+            _append_row(simulation.path, ANSWER_COLUMNS, _row(mark, answer))
+            kept[answer.effect, size_key(answer.value), answer.seed] = answer
+            bar.advance()
+    return kept
+
+
+def simulate_null_tests(design: CampaignDesign, simulation: Simulation) -> list[CampaignPValues]:
+    """Apply every test to simulated null campaigns."""
+    from vinetrack.core.terminal import Progress, progress
+
+    mark = fingerprint(design)
+    kept = {campaign.seed: campaign for campaign in _stored_p_values(simulation.path, mark)}
+    tasks = [(design, seed) for seed in simulation.seeds if seed not in kept]
+    bar: Progress[None]
+    with progress(simulation.campaigns, "calibrating", unit="campaign") as bar:
+        bar.advance(simulation.campaigns - len(tasks))
+        for campaign in map_unordered(_test_task, tasks, simulation.jobs):
+            values = [f"{campaign.p_values[name]:.6g}" if campaign.p_values else "" for name in TESTS]
+            _append_row(simulation.path, P_VALUE_COLUMNS, [mark, campaign.seed, *values, campaign.failed])
+            kept[campaign.seed] = campaign
+            bar.advance()
+    return [kept[seed] for seed in simulation.seeds]
+
+
+def size_key(value: float) -> str:
+    """Return the text of a size in the file of answers."""
+    return "" if math.isnan(value) else f"{value:.9g}"
+
+
+def _diagnose_task(task: Task) -> SimulatedDiagnosis:
+    return simulated_diagnosis(*task)
+
+
+def _test_task(task: tuple[CampaignDesign, int]) -> CampaignPValues:
+    return null_p_values(*task)
+
+
+def fingerprint(design: CampaignDesign) -> str:
+    """Return a short hash of everything that simulated campaigns depend on."""
+    parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
+    around = (
+        design.spreads,
+        design.slow_error_m,
+        design.has_trace,
+        design.candidates,
+        sorted(design.other_values.items()),
+    )
+    return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
+
+
+def stored_answers(path: Path, mark: str) -> list[SimulatedDiagnosis]:
+    """Return the stored answers of a design."""
+    return [
+        SimulatedDiagnosis(
+            effect=row["effect"],
+            value=float(row["value"] or "nan"),
+            seed=int(row["seed"]),
+            verdict=row["verdict"],
+            answer_set=tuple(row["answer_set"].split("|")) if row["answer_set"] else (),
+            effects=tuple(row["effects"].split("|")) if row["effects"] else (),
+            seconds=float(row["seconds"] or "nan"),
+            failed=row["failed"],
+        )
+        for row in _stored_rows(path, mark)
+    ]
+
+
+def _stored_p_values(path: Path, mark: str) -> list[CampaignPValues]:
+    """Chances that an earlier run has kept about this design."""
+    return [
+        CampaignPValues(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
+        for row in _stored_rows(path, mark)
+    ]
+
+
+def _stored_rows(path: Path, mark: str) -> list[dict[str, str]]:
+    """Return the complete rows of a design; none if there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        return [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
+
+
+def _row(mark: str, answer: SimulatedDiagnosis) -> list[object]:
+    seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
+    return [
+        mark, answer.effect, size_key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
+        "|".join(answer.effects), seconds, answer.failed,
+    ]  # fmt: skip
+
+
+def _append_row(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
+    """Append a row to the file; write the header first if the file is new."""
+    new = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        if new:
+            writer.writerow(columns)
+        writer.writerow(row)
+
+
+# ------------------------------------------------------------------------------
+# Measured or planned trials whose power is asked: design, noise and scatter of the campaign, by linear theory.
+
+DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)
+
+
+@dataclass(frozen=True)
+class PowerRequest:
+    """Options of the command; NaN and None for those not given. Between-trial standard deviations are relative.
+    `effects` are names, or `name=size` in the unit of the parameter; `simulate` is the number of campaigns simulated
+    with each.
+    """
+
+    target: Path
+    effects: tuple[str, ...] = ()
+    noise_mm: float = math.nan
+    noise_correlation: float = math.nan
+    spread_P: float = math.nan
+    spread_B: float = math.nan
+    capture_fps: float = math.nan
+    systematic_mm: float = math.nan
+    B: float = math.nan
+    n: float = math.nan
+    simulate: int = 0
+    jobs: int = 1
+    first_seed: int = 1
+    answers: Path | None = None
+    reach: float = math.nan
+    calibrate: int = 0
+    experiment: Path | None = None
+
+
+@dataclass(frozen=True)
+class PowerCampaign:
+    """The power of a campaign by linear theory, its design for simulations, and constraints on further trials."""
+
+    power: Power
+    design: CampaignDesign
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class MeasuredTrials:
+    """Measured trials; `names` are the effects of the model, `added` those of them that a diagnosis added."""
+
+    pairs: Sequence[tuple[Trial, Track]]
+    names: tuple[str, ...]
+    added: tuple[str, ...] = ()
+    user_effects: Mapping[str, Effect] = field(default_factory=dict)
+    candidates: Sequence[str] | None = None
+    limits: Limits = field(default_factory=Limits)
+
+
+def campaign_of_target(request: PowerRequest) -> PowerCampaign:
+    """Return the campaign of the measured trials of the target; without any, that of the planned trials."""
+    from vinetrack.experiment.planned import planned_sheet
+
+    measured = trials_of_target(request)
+    if measured is not None:
+        return measured_campaign(request, measured)
+    return _planned_campaign(request, planned_sheet(request.target, every_row=True))
+
+
+def trials_of_target(request: PowerRequest) -> MeasuredTrials | None:
+    """Read the trials of a results folder or of an experiment with tracks."""
+    from vinetrack.effects import own_effects
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.inference.fit_data import pairs_of
+
+    if (request.target / PROVENANCE).exists():
+        return _trials_of_results(request)
+    if not request.target.is_dir():
+        return None
+    try:
+        read = read_experiment(request.target)
+    except ExperimentError:
+        return None  # recordings that do not exist yet: a plan
+    if all(trial.track is None for trial in read.trials):
+        return None
+    settings = read.settings
+    user_effects = dict(own_effects([read.folder / path for path in settings.effects]))
+    pairs, _ = pairs_of(read)
+    return MeasuredTrials(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
+
+
+def campaign_in_memory(request: PowerRequest, given: Fit | Pairs) -> PowerCampaign:
+    """Return the campaign of a fit, or of trials in memory with the base model."""
+    from vinetrack.inference.fit_result import Fit
+
+    if isinstance(given, Fit):
+        return PowerCampaign(fit_power(given), design_of_fit(given))
+    return measured_campaign(request, MeasuredTrials(list(given), BASE_EFFECTS))
+
+
+def _trials_of_results(request: PowerRequest) -> MeasuredTrials:
+    from vinetrack.diagnosis.result import ADEQUATE
+    from vinetrack.effects import own_effects
+    from vinetrack.pipeline.effects_stage import read_source_experiment
+    from vinetrack.pipeline.model_stage import measured_trials
+    from vinetrack.results.folder_layout import Results, read_diagnosis
+
+    results = Results(request.target)
+    experiment = read_source_experiment(request.target, request.experiment)
+    settings = experiment.settings
+    diagnosis = read_diagnosis(results)
+    accepted = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+    added = tuple(name for name in accepted if name not in settings.model)
+    user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
+    pairs = measured_trials(experiment, results)[0]
+    return MeasuredTrials(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
+
+
+def measured_campaign(request: PowerRequest, measured: MeasuredTrials) -> PowerCampaign:
+    """Return the campaign of measured trials, with noise and scatter from the options, else from a fit."""
+    from vinetrack.diagnosis.ladder import candidates_of
+    from vinetrack.dynamics.model import host_for, make_model
+    from vinetrack.inference.fit import fit
+
+    pairs, candidates = measured.pairs, measured.candidates
+    model = make_model(measured.names, measured.user_effects)
+    host = host_for(model, candidates_of(model, candidates, measured.user_effects))
+    first = fit(model, pairs, host=host, profile=False, thorough=False)
+    stated = _stated_noise(request, first.noise_m, first.noise_correlation)
+    spreads = _stated_spreads(request, (float(first.state.spread[0]), float(first.state.spread[1])))
+    inputs: list[PowerInput] = []
+    if stated is not None or spreads is not None:
+        first = fit(model, pairs, spreads=spreads, noise=stated, host=host, profile=False, thorough=False)
+        inputs = _input_rows(
+            first.noise_m, first.noise_correlation, tuple(first.state.spread),
+            ("stated" if stated else "fit", "stated" if spreads else "fit"),
+        )  # fmt: skip
+    return PowerCampaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
+
+
+def _stated_noise(request: PowerRequest, noise_m: float, correlation: float) -> tuple[float, float] | None:
+    if math.isnan(request.noise_mm) and math.isnan(request.noise_correlation):
+        return None
+    return (
+        noise_m if math.isnan(request.noise_mm) else request.noise_mm / 1e3,
+        correlation if math.isnan(request.noise_correlation) else request.noise_correlation,
+    )
+
+
+def _stated_spreads(request: PowerRequest, otherwise: tuple[float, float]) -> tuple[float, float] | None:
+    if math.isnan(request.spread_P) and math.isnan(request.spread_B):
+        return None
+    return (
+        otherwise[0] if math.isnan(request.spread_P) else request.spread_P,
+        otherwise[1] if math.isnan(request.spread_B) else request.spread_B,
+    )
+
+
+def _input_rows(
+    noise_m: float, correlation: float, spreads: Sequence[float], origins: tuple[str, str]
+) -> list[PowerInput]:
+    return [
+        PowerInput("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
+        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", origins[1]),
+        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", origins[1]),
+    ]
+
+
+def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCampaign:
+    """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
+    from vinetrack.effects import own_effects
+    from vinetrack.inference.parameters import DAMPING, EXPONENT
+    from vinetrack.planning.input_sources import StatedValues, predictive_inputs
+
+    folder, settings = planned.folder or Path(), planned.settings
+    user_effects = dict(own_effects([folder / path for path in settings.effects]))
+    stated = StatedValues(B=request.B, n=request.n, model=settings.model, user_effects=user_effects)
+    by_vine = {}
+    for trial in planned.trials:
+        if trial.vine not in by_vine:
+            by_vine[trial.vine] = predictive_inputs(trial, stated)
+    vine_inputs = list(by_vine.values())
+    first = vine_inputs[0]
+    noise = _stated_noise(request, DEFAULT_NOISE_MM / 1e3, 0.0)
+    noise_m, correlation = noise or (DEFAULT_NOISE_MM / 1e3, 0.0)
+    spreads = _stated_spreads(request, first.spreads)
+    systematic_m, systematic_origin = _planned_systematic(request, settings)
+    trials = tuple(
+        replace(_with_yield(trial, by_vine[trial.vine].trial), position_systematic_m=systematic_m)
+        for trial in planned.trials
+    )
+    filmed_fps = [request.capture_fps if math.isfinite(request.capture_fps) else trial.capture_fps for trial in trials]
+    cameras = tuple(
+        FilmingPlan(fps if math.isfinite(fps) else DEFAULT_CAPTURE_FPS, noise_m, correlation) for fps in filmed_fps
+    )
+    origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
+    inputs = [
+        *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
+        PowerInput("systematic error of positions", f"{1e3 * systematic_m:.3g} mm", systematic_origin),
+        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(request, trials)),
+        *(
+            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
+            for vine, of_vine in by_vine.items()
+            for symbol, key in (("B", DAMPING), ("n", EXPONENT))
+        ),
+    ]  # fmt: skip
+    design = CampaignDesign(
+        model=joint_model(vine_inputs),
+        trials=trials,
+        cameras=cameras,
+        spreads=spreads or first.spreads,
+        slow_error_m=(math.nan,) * len(trials),
+        has_trace=(False,) * len(trials),
+        candidates=settings.candidates,
+    )
+    return PowerCampaign(design_power(design, inputs), design, settings.limits)
+
+
+def _planned_systematic(request: PowerRequest, settings: ExperimentSettings) -> tuple[float, str]:
+    """Return the systematic error of positions of planned trials, m, and where it comes from."""
+    if math.isfinite(request.systematic_mm):
+        return request.systematic_mm / 1e3, "stated"
+    systematic_m = expected_systematic_m(settings)
+    if settings.position_systematic_mm is not None:
+        return systematic_m, "experiment.yaml"
+    return systematic_m, "guess: positions by a scale, lens uncorrected" if systematic_m else "lens known from a target"
+
+
+def _fps_origin(request: PowerRequest, trials: Sequence[Trial]) -> str:
+    if math.isfinite(request.capture_fps):
+        return "stated"
+    return "sheet" if all(math.isfinite(trial.capture_fps) for trial in trials) else "guess"
+
+
+def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
+    """Return the trial with the assumed yield pressure of its vine and the default error, if it states none."""
+    from vinetrack.experiment.sheet import YIELD_SIGMA_KPA
+
+    if math.isfinite(trial.yield_pressure_Pa):
+        return trial
+    default_Pa = 1e3 * YIELD_SIGMA_KPA
+    return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=default_Pa)
 
 
 @in_one_blas_thread
@@ -73,8 +469,8 @@ def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[
 def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook) -> str:
     """Recommend the further trials of a campaign that goes on, in words; blank where none can be recommended."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.diagnosis.informative_trials import confirming_trials, exploratory_trials
-    from vinetrack.narrative.further_text import informative_text
+    from vinetrack.diagnosis.further_trials import confirming_trials, exploratory_trials
+    from vinetrack.narrative.power_text import informative_text
 
     request = PowerRequest(target=target, experiment=experiment)
     measured = trials_of_target(request)
@@ -158,10 +554,9 @@ def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator
 def _null_calibration(request: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
     """Calibrate the tests of the first model of measured trials with simulated null campaigns of the same design."""
     from vinetrack.diagnosis.candidates import testable
-    from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
+    from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
     from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
-    from vinetrack.dynamics.host import host_for
-    from vinetrack.dynamics.model import make_model
+    from vinetrack.dynamics.model import host_for, make_model
     from vinetrack.inference.fit_result import Fit
 
     candidates: Sequence[str] | None = None

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.files import is_disk_full
-from vinetrack.core.numbers import number
-from vinetrack.core.tables import write_bytes, write_json
+from vinetrack.core.tables import is_disk_full, write_bytes, write_json
+from vinetrack.core.units import number
 from vinetrack.pipeline.tracks_stage import TRIAL_NOT_ANALYSED, analyse, failed_row, write_empty
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
-    from vinetrack.video.measure import Measurement
+    from vinetrack.video.survey import Measurement
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     """Measure and analyse a recording; return the reason of a failure and a traceback, as `analyse` does."""
     from vinetrack.tracks.importers import TrackError, attach_pressure, read_pressure_trace
     from vinetrack.video.frames import RecordingError
-    from vinetrack.video.measure import measure_recording
+    from vinetrack.video.survey import measure_recording
 
     measurement = None
     try:
@@ -98,7 +97,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
 def _contradictions(trial: Trial, measurement: Measurement) -> list[Problem]:
     """Return the measured sizes and exposures that contradict the sheet, as warnings."""
     from vinetrack.video.frames import RecordingError
-    from vinetrack.video.recording_facts import exposure_problems, size_problems, tracked_facts
+    from vinetrack.video.survey import exposure_problems, size_problems, tracked_facts
 
     problems = size_problems(trial, tracked_facts(trial, measurement))
     problems += exposure_problems(trial, measurement.tracking)
@@ -133,7 +132,7 @@ def _calibration_and_axis(measurement: Measurement, image: str | None) -> dict[s
 def _draw_strip_figure(
     trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings
 ) -> None:
-    from vinetrack.figures.strip_figure import draw_strip
+    from vinetrack.figures.overlay import draw_strip
     from vinetrack.figures.style import blank, render
 
     if measurement is None:

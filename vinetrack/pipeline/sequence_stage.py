@@ -70,11 +70,10 @@ def _diagnose_target(target: Path, experiment: Path | None) -> tuple[Diagnosis, 
     from vinetrack.diagnosis.diagnose import diagnose
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
+    from vinetrack.pipeline.effects_stage import read_source_experiment
     from vinetrack.pipeline.model_stage import measured_trials
-    from vinetrack.pipeline.run_folders import find_experiment
-    from vinetrack.pipeline.source_experiment import read_source_experiment
-    from vinetrack.results.folder_layout import Results, ResultsError
-    from vinetrack.results.stored_diagnosis import read_diagnosis
+    from vinetrack.pipeline.workflow import find_experiment
+    from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
     if (target / PROVENANCE).exists():
         read = read_source_experiment(target, experiment)

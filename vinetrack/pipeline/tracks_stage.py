@@ -6,18 +6,23 @@ A trial that fails writes its reason and never stops the others.
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import os
+import sys
+import threading
 import traceback
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.records import Kinematics, Track, Trial, Window
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.pipeline.pool import map_trials
+from vinetrack.core.terminal import progress
 from vinetrack.results.folder_layout import (
     COUNT_COLUMNS,
     KINEMATICS_COLUMNS,
@@ -30,6 +35,7 @@ from vinetrack.results.folder_layout import (
     Results,
     empty_table,
     read_json,
+    read_result,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +43,68 @@ if TYPE_CHECKING:
 
     from vinetrack.dynamics.model import Model
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.experiment.settings import RunSettings
+    from vinetrack.experiment.settings import DampingSettings, RunSettings
+
+
+# ------------------------------------------------------------------------------
+# Applying a function to many trials in several processes, with a progress bar.
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+MIN_ITEMS_FOR_POOL = 8  # Fewest items for which a second process is started (chosen)
+
+
+def map_trials(
+    function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int, label: str
+) -> Iterator[Answer]:
+    """Yield `function(item)` for every item, in order, with a progress bar on a terminal. `function` and items are sent
+    to other processes and must be picklable.
+    """
+    if n_workers < 2 or len(items) < MIN_ITEMS_FOR_POOL:
+        yield from progress(map(function, items), label, total=len(items))
+        return
+    chunk = max(len(items) // (8 * n_workers), 1)
+    with _pool(n_workers) as pool:
+        yield from progress(pool.map(function, items, chunksize=chunk), label, total=len(items))
+
+
+def map_unordered(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
+    """Yield `function(item)` of every item as soon as it is ready, in any order. `function` and items are sent to other
+    processes and must be picklable.
+    """
+    if n_workers < 2 or len(items) < 2:
+        yield from map(function, items)
+        return
+    with _pool(n_workers) as pool:
+        futures = [pool.submit(function, argument) for argument in items]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _pool(n_workers: int) -> ProcessPoolExecutor:
+    """Return a pool of processes, forked on Linux, where they are ready at once, and spawned elsewhere."""
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
+    context = multiprocessing.get_context(method)
+    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent process ends, even if the parent is killed. A worker waits for its next argument
+    on a pipe that the other workers hold open as well: after a killed run all of them would wait forever and keep their
+    memory.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with the parent", daemon=True).start()
+
 
 log = logging.getLogger(__name__)
 
@@ -110,8 +177,8 @@ def analyse(
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
     """Gather the results of all trials in `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`."""
-    from vinetrack.kinematics.conditions import condition_table
     from vinetrack.kinematics.damping import mark_left_out
+    from vinetrack.kinematics.summary import condition_table
 
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
@@ -134,7 +201,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
 def _askew_as_failed(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return, as failed trials, those whose axis is askew to that of most other trials with the same growth angle."""
-    from vinetrack.video.axis_agreement import askew_trials, slope_deg
+    from vinetrack.video.axis import askew_trials, slope_deg
 
     failed: dict[str, dict[str, Any]] = {}
     if experiment.settings.axis is not None:
@@ -226,3 +293,24 @@ def _window_row(trial: str, window: Window) -> dict[str, Any]:
     low, high = window.drift_95
     row = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
     return row | {"trial": trial, "points": window.n_points, "drift_95_low": low, "drift_95_high": high}
+
+
+# ------------------------------------------------------------------------------
+# Fit of the damping law and of its scaling with the size of the vine.
+
+
+def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
+    """Fit the damping law to `damping_points.csv`; write `damping.json` and `scaling.json`. Returns `damping.json` as
+    written.
+    """
+    results = Results(folder)
+    points = read_result(results.points)
+
+    from vinetrack.kinematics.damping import fit_laws, fit_scaling, fit_trends
+
+    damping = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
+    write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))
+    write_json(results.damping, damping)
+    for method, fit in damping.items():
+        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
+    return damping

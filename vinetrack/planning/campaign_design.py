@@ -16,10 +16,9 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.planning.campaign_information import FilmingPlan, Information, filmed, information, joint_model
-from vinetrack.planning.predictive_inputs import PredictiveInputs
-from vinetrack.planning.scaling_priors import burst_pressure_Pa
+from vinetrack.planning.predictive_inputs import PredictiveInputs, burst_pressure_Pa
 
 CANDIDATE_PRESSURES = 13  # Candidate pressures of each vine (chosen)
 

@@ -22,13 +22,13 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import END_FRACTION, FitTrial
-from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.marginal_likelihood import deviations_eliminated, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem
+from vinetrack.inference.optimiser import make_problem
 from vinetrack.inference.parameters import DAMPING, EXPONENT, FreeParameter, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS, Predictor
 from vinetrack.inference.whitening import all_products
-from vinetrack.kinematics.conditions import lead_velocity_at
+from vinetrack.kinematics.summary import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 REST_FRAMES = 20  # Frames at rest before release (chosen)

@@ -22,15 +22,11 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import log_likelihood
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.mixed_effects import FitState
-from vinetrack.inference.optimiser import FixedTerms, Solution, solve
+from vinetrack.inference.optimiser import FixedTerms, Solution, make_problem, solve
 from vinetrack.inference.parameters import ParameterMap
-from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.starts import align, initial_trial_effects
-from vinetrack.planning.feasible_trials import Condition
-from vinetrack.planning.hypothesis_predictions import Hypothesis
-from vinetrack.planning.simulated_tracks import TrackSampling, film_trials
+from vinetrack.inference.sensitivity import Predictor, align, initial_trial_effects
+from vinetrack.planning.discriminating_design import Condition, Hypothesis, TrackSampling, film_trials
 
 MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
 

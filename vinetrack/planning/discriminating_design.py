@@ -12,18 +12,650 @@ deviations s of pressure and B are estimated too, so that a wrong hypothesis may
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, solve_per_trial
-from vinetrack.inference.sensitivity import N_TRIAL_EFFECTS
-from vinetrack.planning.feasible_trials import Condition
-from vinetrack.planning.hypothesis_predictions import Hypothesis, ScatterLevel
-from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank_trial
+from vinetrack.core.records import Floats, Trial, plain_track
+from vinetrack.dynamics.simulate import SimulationError, Trajectory
+from vinetrack.experiment.schema import COLUMNS, with_names
+from vinetrack.experiment.settings import Limits
+from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.marginal_likelihood import LARGEST_SPREAD, marginal, normal_equations
+from vinetrack.inference.mixed_effects import DEVIATION_COLUMNS, LEAST_BETWEEN_TRIAL_SD, solve_per_trial
+from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE, FreeParameter, ParameterMap
+from vinetrack.inference.sensitivity import (
+    DAMPING_DEVIATION,
+    N_TRIAL_EFFECTS,
+    ORIGIN,
+    PRESSURE,
+    RELEASE,
+    Job,
+    Predictor,
+)
+from vinetrack.planning.predictive_inputs import damping_prior, damping_scatter, hoop_stress_Pa
+from vinetrack.tracks.position_noise import ar1_noise
+
+# ------------------------------------------------------------------------------
+# Candidate trials for the next experiment: pressures, payloads, vines and rigs within the user's limits.
+#
+# Where a limit is not given it follows from the experiment: pressures from the lowest used to a quarter above the
+# highest
+# and never above the strength of the film; no payload or the heaviest used; half and twice the chamber; connectors of
+# half and twice the area; and vines of other diameters and film thicknesses. Only one part of a rig changes at a time.
+
+SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
+
+HEADROOM = 1.25  # Highest candidate pressure, as a multiple of the highest used (chosen)
+
+# Lowest candidate pressure of a vine without payload, as a multiple of the yield pressure (chosen)
+LOWEST_PRESSURE_RATIO = 1.15
+
+PRESSURE_STEP_PA = 100.0  # Resolution of set pressures, Pa (chosen)
+
+PAYLOAD_KG = 0.05  # Payload offered where none was used yet, kg (chosen)
+
+CANDIDATE_PRESSURES = 6  # Candidate pressures of a vine (chosen)
+
+MOST_NEW_VINES = 10  # New vines considered, at most; those of the most different sizes are taken (chosen)
+
+EQUAL_TOLERANCE = 1e-4  # Relative difference below which two values are equal (chosen)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A trial that could be made. `like` is the index, among the trials of the experiment, of the trial it is modelled
+    on: for an existing vine a trial with it, else one with the vine nearest in size.
+    """
+
+    trial: Trial
+    like: int
+    effort: int
+    changed: tuple[str, ...] = ()
+
+
+def feasible_conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
+    """Return every candidate trial; empty where the limits exclude all."""
+    typical = _typical_trials(trials)
+    if not typical:
+        return []
+    used = [trial for trial in trials if trial.travel_ratio != 1]
+    vines = [(trials[k], k) for k in typical]
+    feasible = []
+    for vine, k in vines:
+        if _allowed(vine, limits):
+            for effort, rig in _rigs(vine, used, limits):
+                feasible += _loads(rig, k, effort, used, limits)
+    for vine, k in _new_vines(vines, limits) if limits.new_vines else []:
+        rigs = _rigs(vine, used, limits)
+        least = min((effort for effort, _ in rigs), default=SAME_RIG)
+        for effort, rig in rigs:
+            if effort == least:
+                feasible += _loads(rig, k, NEW_VINE, used, limits)
+    named = [f"next_{i + 1}" for i in range(len(feasible))]
+    return [
+        replace(
+            condition,
+            trial=replace(condition.trial, name=name),
+            changed=_changed(condition.trial, trials[condition.like]),
+        )
+        for condition, name in zip(feasible, named, strict=True)
+    ]
+
+
+# Columns of the sheet that describe a rig, with their fields of a trial
+RIG_FIELDS = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
+
+
+def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
+    return tuple(column for column, name in RIG_FIELDS.items() if not _alike(rig, before, [name]))
+
+
+def _typical_trials(trials: Sequence[Trial]) -> list[int]:
+    """Index of a typical trial of each everting vine: the first with its commonest rig and yield pressure."""
+    rigs = [(trial.vine, trial.yield_pressure_Pa, trial.chamber_m3, trial.inlet_m, trial.bends) for trial in trials]
+    texts = [repr(rig) for rig in rigs]
+    places = []
+    for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
+        of_vine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
+        places.append(texts.index(Counter(of_vine).most_common(1)[0][0]))
+    return places
+
+
+def _allowed(vine: Trial, limits: Limits) -> bool:
+    """Whether the user's lists of sizes, where given, contain this vine."""
+    sizes = (
+        (vine.diameter_m * 1e3, limits.diameter_mm),
+        (vine.thickness_m * 1e6, limits.thickness_um),
+        (vine.length_m * 1e3, limits.length_mm),
+    )
+    return all(values is None or not math.isfinite(size) or _is_among(size, values) for size, values in sizes)
+
+
+def _is_among(value: float, values: Iterable[float]) -> bool:
+    return any(math.isclose(value, listed, rel_tol=EQUAL_TOLERANCE, abs_tol=1e-12) for listed in values)
+
+
+def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
+    """The vine on every rig; chamber, connector and angle change one at a time unless the limits require more."""
+    half, twice = math.sqrt(0.5), math.sqrt(2.0)
+    chambers = _choices(vine.chamber_m3, [t.chamber_m3 for t in used], limits.chamber_l, 1e-3, (0.5, 2.0))
+    inlets = _choices(vine.inlet_m, [t.inlet_m for t in used], limits.inlet_mm, 1e-3, (half, twice))
+    angles = _choices(vine.growth_angle_rad, [t.growth_angle_rad for t in used], limits.growth_angle_deg, math.pi / 180)
+    rigs: list[tuple[int, int, Trial]] = []
+    for chamber, inlet, angle in itertools.product(chambers, inlets, angles):
+        rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
+        changes = len(_changed(rig, vine))
+        if changes == 0 or not inlet > vine.diameter_m:
+            at_hand = any(_alike(rig, trial, tuple(RIG_FIELDS.values())) for trial in used)
+            rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
+    fewest = min((changed for changed, _, _ in rigs), default=0)
+    return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
+
+
+def _choices(
+    now: float, used: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float] = ()
+) -> list[float]:
+    """Values of one part of the rig: the user's, else those used and multiples of the present one; NaN stays."""
+    if not math.isfinite(now):
+        return [now]
+    if given is not None:
+        return [value * unit for value in given]
+    values = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
+    values += [_rounded(now * factor) for factor in factors]
+    return [value for i, value in enumerate(values) if not _is_among(value, values[:i])]
+
+
+def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Limits) -> list[Condition]:
+    """Every pressure and payload for one vine on one rig."""
+    return [
+        Condition(replace(rig, pressure_Pa=pressure, pressure_sigma_Pa=sigma, payload_kg=payload), like, effort)
+        for payload in _payloads(used, limits)
+        for pressure, sigma in _pressures(rig, payload, used, limits)
+    ]
+
+
+def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
+    """No payload (or the lightest allowed), the heaviest, and those used in between."""
+    payloads = {trial.payload_kg for trial in used}
+    heaviest = max(payloads) if max(payloads) > 0 else PAYLOAD_KG
+    low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
+    return sorted({low, high, *(payload for payload in payloads if low <= payload <= high)})
+
+
+def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
+    """Set pressures in equal ratios, Pa, each with its standard error."""
+    pressures = [trial.pressure_Pa for trial in used if trial.pressure_Pa > 0]
+    if not pressures:
+        return []
+    low, high = min(pressures), HEADROOM * max(pressures)
+    if limits.pressure_kPa is not None:
+        low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
+    stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
+    if math.isfinite(stress_Pa):
+        # The default strength of film must not exclude pressures that this vine has held; a stated strength may.
+        is_stated = "hoop_stress_MPa" in limits.model_fields_set
+        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not is_stated]
+        bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
+        high = min(high, max([PRESSURE_STEP_PA * math.floor(bursts_Pa / PRESSURE_STEP_PA), *held]))
+    if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
+        low = max(low, LOWEST_PRESSURE_RATIO * rig.yield_pressure_Pa)
+    if not low <= high:
+        return []
+    steps = np.geomspace(low, high, CANDIDATE_PRESSURES) if high > 1.02 * low else np.array([high])
+    relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
+    share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
+    steps = np.clip(PRESSURE_STEP_PA * np.round(steps / PRESSURE_STEP_PA), low, high)
+    return [(float(pressure), share * float(pressure)) for pressure in np.unique(steps.round(3))]
+
+
+def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:
+    """Vines that could be made, each with the index of the trial whose vine is nearest in size."""
+    vines = [trial for trial, _ in models]
+    diameters = _sizes([v.diameter_m for v in vines], limits.diameter_mm, 1e-3, (0.5, 0.75, 1.5))
+    walls = _sizes([v.thickness_m for v in vines], limits.thickness_um, 1e-6, (0.5, 2.0))
+    new_vines: list[tuple[Trial, int]] = []
+    for diameter, wall in itertools.product(diameters, walls):
+        if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
+            continue
+        near, like = min(models, key=lambda m: _distance(m[0], diameter, wall))
+        lengths = [near.length_m] if limits.length_mm is None else [1e-3 * mm for mm in limits.length_mm]
+        for length in lengths:
+            sized = replace(
+                near,
+                diameter_m=diameter,
+                thickness_m=wall,
+                length_m=length,
+                video=None,
+                track=None,
+                pressure_trace=None,
+            )
+            if not any(_alike(sized, vine) for vine in vines):
+                new_vines.append((with_names([sized])[0], like))
+    return _most_different(new_vines, MOST_NEW_VINES)
+
+
+def _sizes(
+    before: Sequence[float], given: Sequence[float] | None, unit: float, factors: Sequence[float]
+) -> list[float]:
+    """Candidate sizes: the user's, else those used and multiples of the smallest and largest."""
+    if given is not None:
+        return [size * unit for size in given]
+    used = {size for size in before if math.isfinite(size)}
+    if not used:
+        return []
+    return sorted(used | {_rounded(f * (min(used) if f < 1 else max(used))) for f in factors})
+
+
+def _rounded(value: float) -> float:
+    """The value to two significant digits, as a person would order it."""
+    return float(f"{value:.2g}")
+
+
+def _distance(vine: Trial, diameter_m: float, thickness_m: float) -> float:
+    return math.hypot(math.log(vine.diameter_m / diameter_m), math.log(vine.thickness_m / thickness_m))
+
+
+def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
+    pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
+    return all(_is_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+
+
+def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
+    """At most so many vines, by farthest-point sampling in ln diameter, ln thickness and ln length."""
+    if len(vines) <= most:
+        return vines
+    sizes = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
+    chosen = [int(np.argmax(np.linalg.norm(sizes - sizes.mean(axis=0), axis=1)))]
+    while len(chosen) < most:
+        distance = np.linalg.norm(sizes[:, None] - sizes[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return [vines[k] for k in sorted(chosen)]
+
+
+# ------------------------------------------------------------------------------
+# Extension of a fitted hypothesis to trials that have not been made.
+#
+# The free parameters of the fit stay as they are. Every new vine adds its own: B from the scaling prior, multiplied by
+# the mean ratio of the measured vines to their prior, and the yield pressure with the error to which it will be
+# measured.
+
+NEW_VINE_SD = 1.0  # Prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)
+
+
+# Factors on the between-trial standard deviations of pressure and B that a refit may estimate (chosen)
+SCATTER_FACTORS = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
+
+
+@dataclass(frozen=True)
+class ScatterLevel:
+    """Likelihood of the trials so far near the best values, for one assumed pair of between-trial standard deviations.
+    `information`, shape (n_free, n_free), and `gradient`, shape (n_free,), of half the sum of squares at the best
+    values; the gradient is not zero at a bound.
+    """
+
+    spread: tuple[float, float]
+    factors: tuple[float, float]
+    information: Floats
+    gradient: Floats
+    rise: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One of the tied fits, extended to further conditions. `layout` maps the free parameters to the trials of the
+    conditions: those of the fit first, then those of new vines. All are scaled as in the fit; `theta`, shape (n_free,),
+    are their best values.
+    """
+
+    name: str
+    fit: Fit
+    layout: ParameterMap
+    theta: Floats
+    scatter_levels: tuple[ScatterLevel, ...]
+    sd_of_new: Floats
+    rho: float
+    variance: float
+    spread: tuple[float, float]
+
+    @property
+    def room(self) -> tuple[Floats, Floats]:
+        """Distance of each parameter to its lower and upper bound, shape (n_free,) each; the first is negative."""
+        lower, upper = self.layout.bounds
+        return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
+
+    def layout_of(self, places: Sequence[int]) -> ParameterMap:
+        """Return the parameter map of some of the conditions."""
+        return replace(self.layout, index=self.layout.index[list(places)], base=self.layout.base[list(places)])
+
+    def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
+        """Return a predictor of these trials, one for each of the conditions at `places`."""
+        predictor = Predictor(self.layout_of(places), items, self.fit.predictor.host)
+        predictor.steps = self.fit.predictor.steps.copy()
+        return predictor
+
+
+def extend(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
+    """Extend a fit to further conditions; new vines add parameters with priors."""
+    old = fit.predictor.layout
+    state = fit.solution.state
+    numbers, index = list(old.free), []
+    places: dict[tuple[str, str], int] = {}
+    for condition in conditions:
+        row = old.index[condition.like].copy()
+        for column, key in enumerate(old.keys):
+            if row[column] >= 0 and old.free[row[column]].vine and condition.trial.vine != _vine_of(fit, condition):
+                spot = (key, condition.trial.vine)
+                if spot not in places:
+                    places[spot] = len(numbers)
+                    numbers.append(_of_new_vine(fit, old.free[row[column]], condition.trial))
+                row[column] = places[spot]
+        index.append(row)
+    added = numbers[len(old.free) :]
+    precision_of_new = np.array([1 / NEW_VINE_SD**2 + (number.scale / number.prior_sd) ** 2 for number in added])
+    sd_of_new = [damping_scatter() if number.key == DAMPING else _stated_sd(number) for number in added]
+    base = np.array([_base_row(fit, condition) for condition in conditions])
+    return Hypothesis(
+        name=name,
+        fit=fit,
+        layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index).reshape(len(conditions), -1), base),
+        theta=np.concatenate([state.theta, [number.to_scaled(number.start) for number in added]]),
+        scatter_levels=_scatter_levels(fit, precision_of_new),
+        sd_of_new=np.array(sd_of_new),
+        rho=state.rho,
+        variance=float(np.exp(np.mean(np.log(state.variance)))),
+        spread=state.spread,
+    )
+
+
+def _scatter_levels(fit: Fit, precision_of_new: Floats) -> tuple[ScatterLevel, ...]:
+    """Likelihood of the trials so far at every scatter that a refit may estimate; new parameters have only priors."""
+    state, problem = fit.solution.state, fit.solution.problem
+    reduced = marginal(fit.solution.cross_products, problem, state)
+    levels: dict[tuple[float, float], ScatterLevel] = {}
+    as_fitted = 0.0
+    for factors in SCATTER_FACTORS:
+        spread = tuple(
+            min(s * factor, most) if can and s > LEAST_BETWEEN_TRIAL_SD else s
+            for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
+        )
+        pair = (max(spread[0], LEAST_BETWEEN_TRIAL_SD), max(spread[1], LEAST_BETWEEN_TRIAL_SD))
+        if pair in levels:
+            continue
+        of_old, gradient_of_old, square, log_det = normal_equations(reduced, problem, state, pair)
+        old, size = gradient_of_old.size, gradient_of_old.size + precision_of_new.size
+        information = np.zeros((size, size))
+        information[:old, :old] = of_old
+        information[range(old, size), range(old, size)] = precision_of_new
+        as_fitted = as_fitted if levels else square + log_det
+        ratios = (
+            pair[0] / max(state.spread[0], LEAST_BETWEEN_TRIAL_SD),
+            pair[1] / max(state.spread[1], LEAST_BETWEEN_TRIAL_SD),
+        )
+        gradient = np.concatenate([gradient_of_old, np.zeros(size - old)])
+        levels[pair] = ScatterLevel(pair, ratios, information, gradient, square + log_det - as_fitted)
+    return tuple(levels.values())
+
+
+def _stated_sd(number: FreeParameter) -> float:
+    return number.prior_sd / number.scale if math.isfinite(number.prior_sd) else 0.0
+
+
+def _vine_of(fit: Fit, condition: Condition) -> str:
+    return fit.predictor.data[condition.like].trial.vine
+
+
+def _of_new_vine(fit: Fit, like: FreeParameter, trial: Trial) -> FreeParameter:
+    """The parameter of a new vine that replaces the one of the vine it is modelled on."""
+    if like.key == YIELD_PRESSURE:
+        return replace(like, vine=trial.vine, start=trial.yield_pressure_Pa)
+    start = _new_damping(fit, trial) if like.key == DAMPING else _mean_of_vines(fit, like.key)
+    return replace(like, vine=trial.vine, start=float(np.clip(start, like.lower, like.upper)))
+
+
+def _mean_of_vines(fit: Fit, key: str) -> float:
+    return float(np.mean([number.value for number in fit.numbers if number.key == key]))
+
+
+def _new_damping(fit: Fit, trial: Trial) -> float:
+    """B of a vine not yet made, N·(s/m)ⁿ: its scaling prior times the mean ratio of measured vines to their prior."""
+    sizes = {
+        trial_data.trial.vine: trial_data.trial
+        for trial_data in fit.predictor.data
+        if trial_data.trial.travel_ratio != 1
+    }
+    column = fit.predictor.damping_column
+    rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
+    grown = {trial_data.trial.vine: float(rows[i, column]) for i, trial_data in enumerate(fit.predictor.data)}
+    log_ratios = [
+        math.log(max(grown[vine], 1e-9) / damping_prior(trial_of_vine.diameter_m, trial_of_vine.thickness_m))
+        for vine, trial_of_vine in sizes.items()
+    ]
+    return damping_prior(trial.diameter_m, trial.thickness_m) * math.exp(float(np.mean(log_ratios)))
+
+
+def _base_row(fit: Fit, condition: Condition) -> Floats:
+    """Model parameters of a condition: those of the trial it is modelled on, with the B of the new vine."""
+    rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
+    row = np.array(rows[condition.like])
+    if fit.predictor.damping_column >= 0 and condition.trial.vine != _vine_of(fit, condition):
+        row[fit.predictor.damping_column] = _new_damping(fit, condition.trial)
+    return row
+
+
+# ------------------------------------------------------------------------------
+# Simulated tracks of candidate trials, sampled as the camera of the experiment would.
+
+LONGEST = 1.5  # Longest recording, as a multiple of the longest so far (chosen)
+
+LEAST_GROWTH = 0.3  # Fraction of its length that a vine must grow while filmed for a trial to be worth making (chosen)
+
+SIMULATED_TIMES = 400  # Times at which a condition is simulated (derived)
+
+# Ratio of tail speed to steady speed at the same pressure above which the model predicts compression in the tail
+# (chosen)
+LARGEST_SPEED_RATIO = 1.05
+
+FEWEST_REST_FRAMES = 3  # Frames at rest that are planned, at least (chosen)
+
+
+@dataclass(frozen=True)
+class TrackSampling:
+    """How the experiment films: frame interval, frames at rest, frames after the end of growth, longest motion."""
+
+    frame_s: float
+    rest_frames: int
+    frames_behind_end: int
+    longest_s: float
+
+
+def sampling_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
+    """Return how the experiment films, at the frame rate of the trial at `like`."""
+    everting = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
+    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in everting]
+    return TrackSampling(
+        frame_s=data[like].frame_s,
+        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in everting])), FEWEST_REST_FRAMES),
+        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in everting])),
+        longest_s=LONGEST * float(max(moving_s)),
+    )
+
+
+def _behind_end(trial_data: FitTrial) -> int:
+    """Number of points of a track that show the vine after the end of its growth."""
+    last = int(np.flatnonzero(trial_data.first)[-1])
+    y = trial_data.lead_position_m
+    if last == 0 or not math.isfinite(trial_data.trial.length_m):
+        return 0
+    left_out = y[last] - y[last - 1] > 0.25 * (1 - END_FRACTION) * trial_data.trial.length_m
+    still = float(np.ptp(y[last:])) < 10 * max(trial_data.noise_m, 1e-6)
+    return y.size - last if left_out and still else 0
+
+
+@dataclass(frozen=True)
+class GrowthCourse:
+    """Course of growth of a condition: when the first hypothesis nears the end, and when the last one has ended.
+    `ends_s` is infinite where one of them does not end in time.
+    """
+
+    near_end_s: float
+    ends_s: float
+
+
+def blank_trial(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
+    """Return the data of a candidate trial at these times; a recorded pressure is constant. Shapes: time_s,
+    lead_position_m (n_points,).
+    """
+    like = data[condition.like]
+    trace = None
+    if like.trace is not None:
+        ends = np.array([-1e3, 1e3])
+        trace = (ends, np.full(2, condition.trial.pressure_Pa))
+    return FitTrial(
+        trial=condition.trial,
+        time_s=time_s,
+        lead_position_m=lead_position_m,
+        first=np.arange(time_s.size) == 0,
+        n_rest=int(np.count_nonzero(time_s <= 0)),
+        noise_m=like.noise_m,
+        correlation=like.correlation,
+        trace=trace,
+    )
+
+
+def growth_courses(
+    hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
+) -> list[GrowthCourse | None]:
+    """Return the course of growth of every condition; None where it is not worth filming or the model is in doubt."""
+    data = hypotheses[0].fit.predictor.data
+    times = [np.linspace(0.0, camera.longest_s, SIMULATED_TIMES) for camera in cameras]
+    items = [blank_trial(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
+    trial_effects = np.zeros((len(conditions), N_TRIAL_EFFECTS))
+    runs: list[list[Trajectory | None]] = []
+    jobs: list[Job] = []
+    for hypothesis in hypotheses:
+        predictor = hypothesis.predictor(range(len(conditions)), items)
+        jobs = predictor.jobs(hypothesis.theta, trial_effects)
+        runs.append(_simulated(predictor, jobs))
+    largest_ratio = max(LARGEST_SPEED_RATIO, _largest_speed_ratio(hypotheses[-1].fit))
+    growth: list[GrowthCourse | None] = []
+    for i, condition in enumerate(conditions):
+        trajectories = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
+        if len(trajectories) < len(runs):
+            growth.append(None)
+            continue
+        length_m = condition.trial.length_m
+        near_s = min(_time_at(moved, END_FRACTION * length_m, cameras[i].longest_s) for moved in trajectories)
+        grown_m = min(float(np.interp(near_s, moved.time_s, moved.lead_position_m)) for moved in trajectories)
+        ratio = _speed_ratio(hypotheses[-1].fit, condition.trial, jobs[i], trajectories[-1].tail_velocity_m_s)
+        grows_enough = grown_m > LEAST_GROWTH * (length_m if math.isfinite(length_m) else 0.0)
+        is_compressed = condition.trial.tail_slack != "free" and ratio > largest_ratio
+        ends = max(moved.end_time_s if moved.status == "ended" else math.inf for moved in trajectories)
+        growth.append(
+            GrowthCourse(near_s, ends)
+            if grows_enough and not is_compressed and near_s > 8 * cameras[i].frame_s
+            else None
+        )
+    return growth
+
+
+def _simulated(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | None]:
+    """Trajectories of all jobs; None for those that cannot be simulated, found by bisection."""
+    try:
+        return list(predictor.run(jobs))
+    except SimulationError:
+        if len(jobs) == 1:
+            return [None]
+    middle = len(jobs) // 2
+    return _simulated(predictor, jobs[:middle]) + _simulated(predictor, jobs[middle:])
+
+
+def _time_at(moved: Trajectory, position_m: float, otherwise_s: float) -> float:
+    """Time at which a vine reaches a position, s."""
+    beyond = moved.lead_position_m >= position_m
+    if not beyond.any():
+        return otherwise_s
+    k = int(np.argmax(beyond))
+    return float(np.interp(position_m, moved.lead_position_m[k - 1 : k + 1], moved.time_s[k - 1 : k + 1]))
+
+
+def _speed_ratio(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:
+    """Ratio of the largest tail speed to the steady speed without payload; 0 where the model has no damping."""
+    names = fit.model.parameter_names
+    if DAMPING not in names or EXPONENT not in names:
+        return 0.0
+    B, n = (float(job.row[names.index(key)]) for key in (DAMPING, EXPONENT))
+    yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
+    drive_N = (trial.pressure_Pa - yield_Pa) * trial.area_m2
+    if not (drive_N > 0 and B > 0 and n > 0.05):
+        return math.inf if not drive_N > 0 else 0.0
+    return float(np.max(tail_velocity_m_s)) / (drive_N / B) ** (1 / n)
+
+
+def _largest_speed_ratio(fit: Fit) -> float:
+    """Largest ratio of tail speed to steady speed among the trials of the experiment."""
+    jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), N_TRIAL_EFFECTS)))
+    ratios = [
+        _speed_ratio(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
+        for trial_fit, job in zip(fit.trials, jobs, strict=True)
+        if trial_fit.trial.travel_ratio != 1
+    ]
+    return max((value for value in ratios if math.isfinite(value)), default=0.0)
+
+
+def film_trials(
+    truth: Hypothesis,
+    places: Sequence[int],
+    conditions: Sequence[Condition],
+    cameras: Sequence[TrackSampling],
+    theta: Floats,
+    deviations: Floats,
+    rng: np.random.Generator,
+) -> list[FitTrial | None]:
+    """Simulate the tracks of the conditions at `places` under a hypothesis, with random release, origin and noise.
+    Shapes: theta (n_free,); deviations (n_places, 2).
+    """
+    chosen, of_chosen = [conditions[k] for k in places], [cameras[k] for k in places]
+    data = truth.fit.predictor.data
+    times = [
+        camera.frame_s * np.arange(camera.rest_frames + math.ceil(camera.longest_s / camera.frame_s), dtype=float)
+        for camera in of_chosen
+    ]
+    items = [blank_trial(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
+    predictor = truth.predictor(places, items)
+    trial_effects = np.zeros((len(chosen), N_TRIAL_EFFECTS))
+    trial_effects[:, RELEASE] = [(camera.rest_frames - 1 + rng.uniform()) * camera.frame_s for camera in of_chosen]
+    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    trial_effects[:, PRESSURE] = np.where(predictor.has_pressure_deviation, deviations[:, 0], 0.0)
+    trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.has_damping_deviation, deviations[:, 1], 0.0)
+    tracks = []
+    for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
+        stop = times[i].size
+        if moved.status == "ended":
+            last_s = trial_effects[i, RELEASE] + moved.end_time_s
+            stop = min(stop, int(np.searchsorted(times[i], last_s)) + of_chosen[i].frames_behind_end)
+        noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - truth.rho**2)), truth.rho, rng)
+        position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
+        tracks.append(_usable_points(chosen[i], times[i][:stop], position_m, items[i].trace))
+    return tracks
+
+
+def _usable_points(
+    condition: Condition, time_s: Floats, position_m: Floats, trace: tuple[Floats, Floats] | None
+) -> FitTrial | None:
+    """The usable points of a simulated track, selected as for a fit; None where there are too few."""
+    pressure = None if trace is None else np.full(time_s.size, trace[1][0])
+    try:
+        return prepare_trial(condition.trial, plain_track(time_s, position_m, pressure_Pa=pressure))
+    except FitError:
+        return None
+
 
 POINTS = 100  # Times at which a condition is evaluated; each stands for the frames around it (chosen)
 

@@ -13,39 +13,42 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import BASE_EFFECTS, Effect
-from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.parameters import DAMPING, EXPONENT
-from vinetrack.planning.fit_inputs import FitNumbers, alike, nearest_vine, numbers_of, same_vine, yield_place
 from vinetrack.planning.predictive_inputs import (
-    PRESSURE,
-    YIELD,
-    Draws,
-    PredictiveInputs,
-    Sampler,
-    Size,
-    Uncertainty,
-    even,
-    relative,
-    scaled,
-    shifted,
-    wanted_model,
-)
-from vinetrack.planning.scaling_priors import (
     DAMPING_SPREAD,
+    PRESSURE,
     PRESSURE_SPREAD,
     PRINTED_ERROR,
     PRINTED_YIELD_SIGMA_PA,
     SCATTER_DOF,
     SPLIT_SIGMA,
+    YIELD,
     YIELD_FACTOR,
     YIELD_PRESSURE_PA,
+    Draws,
+    FitNumbers,
+    PredictiveInputs,
+    Sampler,
+    Size,
+    Uncertainty,
+    alike,
     damping_log_sigma,
     damping_prior,
     damping_scatter,
+    even,
     exponent_sigma,
+    nearest_vine,
+    numbers_of,
+    relative,
+    same_vine,
+    scaled,
+    shifted,
     split_leverage,
+    wanted_model,
     yield_log_sigma,
+    yield_place,
 )
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Check of stated pressures against measured speeds, for errors of unit.
 
 The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the scaling
-prior (`vinetrack.planning.scaling_priors`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even
+prior (`planning.predictive_inputs`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even
 more.
 """
 
@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core import published
-from vinetrack.core.numbers import number
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import Track, Trial
-from vinetrack.core.units import convert
-from vinetrack.planning.scaling_priors import damping_prior
+from vinetrack.core.units import convert, number
+from vinetrack.planning.predictive_inputs import damping_prior
 
 FAR_OFF = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
 

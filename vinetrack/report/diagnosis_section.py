@@ -6,15 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import interval, number, with_error
-from vinetrack.core.units import display_unit
+from vinetrack.core.units import display_unit, interval, number, with_error
 from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
-from vinetrack.figures.candidate_figures import TIED_COSINE
+from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.law_text import PREFERRED
+from vinetrack.narrative.diagnosis_text import PREFERRED
 from vinetrack.narrative.power_text import POWER_COLUMNS, could_have_seen, false_alarm_sentence, power_rows
-from vinetrack.narrative.verdict_summary import (
+from vinetrack.narrative.verdict_text import (
     estimate_text,
     estimates_text,
     is_finite,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core import published
-from vinetrack.core.numbers import interval, number
+from vinetrack.core.units import interval, number
 from vinetrack.figures.style import rows
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
     """Return the section."""
-    from vinetrack.paper.rows import MARKS
+    from vinetrack.paper.arithmetic import MARKS
 
     present = [f"“{mark}”: {words}" for mark, words in MARKS.items() if (table["mark"] == mark).any()]
     return ReportSection(
@@ -38,7 +38,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
 
 def tally(table: pd.DataFrame) -> str:
     """Return the number of rows of each kind, as a sentence."""
-    from vinetrack.paper.rows import MARKS
+    from vinetrack.paper.arithmetic import MARKS
 
     counts = table["mark"].value_counts()
     parts = [f"{counts[mark]} {mark}" for mark in MARKS if counts.get(mark, 0)]

@@ -16,6 +16,10 @@ from vinetrack.core.tables import result_file
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.result import Diagnosis
+    from vinetrack.inference.fit_summary import FitSummary
+
+
 TRACK_COLUMNS = (
     "frame",
     "time_s",
@@ -313,3 +317,45 @@ def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
     import pandas as pd
 
     return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})
+
+
+# ------------------------------------------------------------------------------
+# Reading the fit of a results folder as a typed object; the only reader of `fit.json`.
+#
+# The diagnosis has a module of its own, `stored_diagnosis`, because the stage of the model reads fits and must not
+# rerun
+# when the text of a diagnosis changes.
+
+
+def read_fit(results: Results) -> FitSummary:
+    """Read `fit.json`."""
+    from vinetrack.inference.fit_summary import FitSummary
+
+    content = read_json(results.fit)
+    try:
+        return FitSummary.from_json(content)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise unreadable_file_error(results.fit, error) from None
+
+
+def unreadable_file_error(path: Path, error: Exception) -> ResultsError:
+    """Return the error for a file of the results with unexpected content."""
+    return ResultsError(f"{path} cannot be read ({error!r}): delete it and run snakemake again")
+
+
+# ------------------------------------------------------------------------------
+# Reading the diagnosis of a results folder as a typed object; the only reader of `diagnosis.json`.
+
+
+def read_diagnosis(results: Results) -> Diagnosis | None:
+    """Read `diagnosis.json` and `ladder.csv`."""
+    from vinetrack.diagnosis.result import Diagnosis
+
+    if not results.diagnosis.exists():
+        return None
+    content = read_json(results.diagnosis)
+    ladder = read_result(results.ladder) if results.ladder.exists() else None
+    try:
+        return Diagnosis.from_json(content, ladder if ladder is not None and len(ladder) else None)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise unreadable_file_error(results.diagnosis, error) from None

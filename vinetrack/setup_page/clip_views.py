@@ -15,19 +15,16 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import safe_join
-from vinetrack.experiment.corrections import read_corrections
-from vinetrack.experiment.folder import SETTINGS
+from vinetrack.experiment.folder import SETTINGS, read_corrections
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, read_row
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
-from vinetrack.video.board_search import find_board
 from vinetrack.video.curved_axis import CurvedAxis, axis_through
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
-from vinetrack.video.measure import Measurement, measure_recording
-from vinetrack.video.quick_look import proposed_axis
-from vinetrack.video.recording_facts import size_problems, tracked_facts
+from vinetrack.video.survey import Measurement, measure_recording, proposed_axis, size_problems, tracked_facts
+from vinetrack.video.target_corners import find_board
 from vinetrack.video.track import Tracking, track_recording
 
 JPEG_QUALITY = 90  # JPEG quality, 0 to 100; chosen: at 90 a mark on a ruler shows no blocks under the magnifier
@@ -147,7 +144,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
     Without a scale positions are in pixels, without a rate times are in frames, see `scaled` and `timed`.
     """
     from vinetrack.core.tables import read_table
-    from vinetrack.experiment.other_units import in_sheet_units
+    from vinetrack.experiment.settings import in_sheet_units
 
     settings = read_experiment_settings(folder / SETTINGS)
     table = in_sheet_units(read_table(folder / SHEET), SHEET)[0]

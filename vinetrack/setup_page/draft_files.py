@@ -2,23 +2,197 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Correction
-from vinetrack.core.tables import write_text
-from vinetrack.experiment.corrections import CORRECTIONS_FILE, corrections_text, read_corrections
-from vinetrack.experiment.folder import SETTINGS
+from vinetrack.core.tables import TableError, read_table, read_text, write_text
+from vinetrack.core.units import split_unit
+from vinetrack.core.yaml_document import parse_yaml, with_value
+from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
+from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.setup_page.clip_names import list_recordings
-from vinetrack.setup_page.settings_draft import read_settings_text, shared_values
-from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
+from vinetrack.setup_page.clip_names import columns_from_names, list_recordings, trial_names
+
+# ------------------------------------------------------------------------------
+# Editing of the trial sheet: cells as text, with those of an existing sheet preserved.
+
+# Columns of a new sheet: the names, and what differs between trials in most campaigns
+FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
+
+
+@dataclass(frozen=True)
+class SheetDraft:
+    """Rows of cells by column, as text; `delimiter` and `decimal` are those of the existing sheet."""
+
+    columns: tuple[str, ...]
+    rows: tuple[Mapping[str, str], ...]
+    delimiter: str = ","
+    decimal: str = "."
+
+    def text(self) -> str:
+        """Return the sheet as CSV text."""
+        out = io.StringIO()
+        writer = csv.writer(out, delimiter=self.delimiter, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([row.get(column, "") for column in self.columns] for row in self.rows)
+        return out.getvalue()
+
+
+def read_draft(folder: Path) -> SheetDraft:
+    """Read the sheet of a folder as a draft; without rows if there is none."""
+    path = folder / SHEET
+    if not path.exists():
+        return SheetDraft(FIRST_COLUMNS, ())
+    try:
+        table = read_table(path)
+    except TableError as error:
+        raise ExperimentError([Problem.from_error(error, SHEET)]) from None
+    loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
+    if loose or table.nameless:
+        message = "has cells without a column, which would be lost"
+        remedy = "name their columns in the first line, or remove them"
+        raise ExperimentError([Problem(message=message, file=SHEET, line=loose[0] if loose else 1, remedy=remedy)])
+    return SheetDraft(table.columns, table.rows, table.delimiter, table.decimal)
+
+
+def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mapping[str, object]) -> SheetDraft:
+    """Return the draft with a row added for each recording that has none, filled in from the recordings' names."""
+    named = {_path(row.get("video", "")) for row in draft.rows}
+    new = [recording for recording in recordings if _path(recording) not in named]
+    if not new:
+        return draft
+    names = trial_names(new, [row.get("trial", "") for row in draft.rows])
+    columns = list(draft.columns)
+    rows: list[Mapping[str, str]] = list(draft.rows)
+    present = {split_unit(column)[0]: column for column in columns}
+    for recording, name, guess in zip(new, names, columns_from_names(new), strict=True):
+        row = {"trial": name, "video": recording}
+        for column, cell in guess.items():
+            quantity = split_unit(column)[0]
+            if str(shared.get(column, "")) == cell:
+                continue
+            if present.get(quantity, column) != column and (draft.rows or quantity not in _first_quantities()):
+                continue
+            if present.get(quantity, column) != column:
+                columns[columns.index(present[quantity])] = column
+            elif column not in columns:
+                columns.append(column)
+            present[quantity] = column
+            row[column] = cell.replace(".", draft.decimal or ".")
+        rows.append(row)
+    missing = [column for column in ("trial", "video") if column not in columns]
+    return replace(draft, columns=(*missing, *columns), rows=tuple(rows))
+
+
+def _first_quantities() -> set[str]:
+    return {split_unit(column)[0] for column in FIRST_COLUMNS}
+
+
+def _path(text: str) -> str:
+    """A normalised path."""
+    parts = [part for part in text.strip().replace("\\", "/").split("/") if part not in ("", ".")]
+    return "/".join(parts)
+
+
+# ------------------------------------------------------------------------------
+# Editing of `experiment.yaml` as text with its comments preserved, and a commented template for a new one.
+
+# Keys of a new file: what all trials of most campaigns share
+FIRST_KEYS = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
+
+_HEAD = """\
+# What all trials share; a column of the same name in trials.csv overrides it. The unit of a value is in its name, and
+# a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
+"""
+_SCALE = """\
+# The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
+# (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
+calibration:
+# The growth axis in the picture (from_px, to_px, width_mm); found from the motion if blank.
+axis:
+"""
+
+
+def read_settings_text(folder: Path) -> str:
+    """Return the text of `experiment.yaml`; if there is none, that of a template with blanks to fill."""
+    path = folder / SETTINGS
+    if not path.exists():
+        return first_settings()
+    try:
+        text = read_text(path)
+    except TableError as error:
+        raise ExperimentError([Problem.from_error(error, SETTINGS)]) from None
+    parse_yaml(text, SETTINGS)
+    return text
+
+
+def first_settings() -> str:
+    """Return a template of `experiment.yaml`: keys without values, each with its meaning and how to measure it."""
+    width = max(len(key) for key in FIRST_KEYS) + 3
+    lines = [f"{f'{key}:':{width}}# {_comment(key)}\n" for key in FIRST_KEYS]
+    return _HEAD + "".join(lines) + _SCALE
+
+
+def _comment(key: str) -> str:
+    column = COLUMNS[key]
+    unit = f" [{column.unit}]" if column.unit and column.unit.lower() not in column.meaning.lower() else ""
+    how = f" {column.measured}" if column.measured else ""
+    blank = "" if column.default.startswith("required") else f" Blank: {column.default or 'unknown'}."
+    return f"{column.meaning.rstrip('.')}{unit}.{how}{blank}"
+
+
+def shared_values(text: str) -> dict[str, Any]:
+    """Return the columns that the settings set for all trials, under the names (and units) used there."""
+    quantities = {split_unit(name)[0] for name in SHARED}
+    content = parse_yaml(text, SETTINGS).content
+    return {
+        key: value
+        for key, value in content.items()
+        if value is not None and (key in SHARED or split_unit(str(key))[0] in quantities)
+    }
+
+
+def with_shared(text: str, values: Mapping[str, str]) -> str:
+    """Return the settings with columns set or cleared for all trials; other keys and all comments are kept."""
+    content = parse_yaml(text, SETTINGS).content
+    for key, cell in values.items():
+        for other in [name for name in content if name != key and _same_quantity(str(name), key)]:
+            if content[other] is not None:
+                text = with_value(text, other, None, SETTINGS)
+        value = _value(cell)
+        if value is None and content.get(key) is None:
+            continue
+        if value is not None and content.get(key) is not None and str(content[key]) == str(value):
+            continue
+        text = with_value(text, key, value, SETTINGS)
+    return text
+
+
+def _same_quantity(name: str, other: str) -> bool:
+    return split_unit(name)[0] == split_unit(other)[0] and bool(split_unit(name)[1])
+
+
+def _value(cell: str) -> Any:
+    """A cell as YAML would read it, so that a number is not quoted; None if it is blank."""
+    cell = cell.strip()
+    if not cell:
+        return None
+    try:
+        read = parse_yaml(f"v: {cell}\n", SETTINGS).content["v"]
+    except ExperimentError:
+        return cell
+    return read if isinstance(read, int | float | bool | str) else cell
+
 
 FILES = (SHEET, SETTINGS, CORRECTIONS_FILE)  # The only files that are written
 

@@ -6,18 +6,612 @@ on `records` and `tables` alone, so that the experiment's check can use it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import re
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vinetrack.core.files import file_size
-from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.core.tables import Table, TableError, parse_table, read_text
-from vinetrack.tracks.body_end import flag_end_of_body
-from vinetrack.tracks.physics_tracker import is_export_header, read_export, read_project
-from vinetrack.tracks.rounded_times import unrounded_times
-from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_pressure, check_times, new_track
+from vinetrack.core.records import Floats, Track, Trial, join_flags, plain_track
+from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
+from vinetrack.core.units import convert, split_unit
+from vinetrack.tracks.position_noise import rough_noise
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+
+# ------------------------------------------------------------------------------
+# Checks that every imported track must pass, and how a track is assembled.
+
+FEWEST_POINTS = 5  # Fewest points of a track (derived)
+
+LARGEST_PRESSURE_KPA = 1000.0  # Largest gauge pressure in kPa that is accepted (chosen)
+
+VACUUM_KPA = -101.4  # Least gauge pressure that is accepted; sensors do read a little below zero (derived)
+LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
+
+
+class TrackError(Exception):
+    """A file that cannot be used as a track or a pressure trace: one sentence, with a remedy."""
+
+
+def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
+    """Refuse times that do not increase from row to row. Shapes: time_s (n,)."""
+    wrong = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(wrong):
+        i = int(wrong[0]) + 1
+        place = f"line {lines[i]}, column time_s: " if lines else ""
+        raise TrackError(
+            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s): sort or correct the rows"
+        )
+
+
+def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
+    """Refuse pressures outside what the sheet allows; NaN passes. Shapes: pressure_kPa (n,)."""
+    wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < VACUUM_KPA))
+    if len(wrong):
+        i = int(wrong[0])
+        value = float(pressure_kPa[i])
+        where = f"line {lines[i]}, column pressure_kPa: {value:g}"
+        if value < 0:
+            raise TrackError(f"{where} is below vacuum: gauge pressure in kPa is wanted")
+        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * LARGEST_PRESSURE_KPA else ""
+        raise TrackError(f"{where} is above {LARGEST_PRESSURE_KPA:g} kPa{hint}")
+
+
+def new_track(
+    time_s: Floats,
+    lead_position_m: Floats,
+    *,
+    sigma_m: Floats | None = None,
+    edge_px: Floats | None = None,
+    pressure_Pa: Floats | None = None,
+    notes: Iterable[str] = (),
+) -> Track:
+    """Make a track with blank flags, after the checks that all kinds of file share. Shapes: time_s, lead_position_m,
+    sigma_m, edge_px, pressure_Pa (n,).
+    """
+    known = np.isfinite(lead_position_m)
+    if np.sum(known) < FEWEST_POINTS:
+        count = int(np.sum(known))
+        raise TrackError(f"has {count} point{'s' * (count != 1)}: at least {FEWEST_POINTS} are needed")
+    if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
+        raise TrackError("holds a time or position too large to be one: correct it")
+    check_times(time_s)
+    first, last = lead_position_m[known][[0, -1]]
+    backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
+    track = plain_track(time_s, lead_position_m, sigma_m=sigma_m, pressure_Pa=pressure_Pa)
+    return replace(track, edge_px=track.edge_px if edge_px is None else edge_px, notes=(*notes, *backwards))
+
+
+# ------------------------------------------------------------------------------
+# Restore times of frames that a file holds with too few digits.
+#
+# Frames 0.935 ms apart, written to the millisecond, deviate from the motion by up to half a millisecond, 2 mm at 4 m/s,
+# and two of them may share the same time. Where all times of a file lie within half their last digit of an evenly
+# spaced
+# series, that series is used.
+
+FEWEST_TIMES = 8  # Fewest times from which an even series is recognised (measured)
+
+TOLERANCE_DIGITS = 0.75  # Last digits by which a time may deviate from the series (derived)
+
+LEAST_DIGIT_PART = 0.01  # Last digit, as a part of a frame, from which times are restored (chosen)
+
+MOST_DECIMALS = 7  # Decimals from which a time does not count as rounded (chosen)
+
+
+def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
+    """Times of evenly spaced frames before they were rounded, and a sentence that says so. Returns time_s (unchanged
+    where they are not rounded, or not evenly spaced), note (blank where nothing was done). Shapes: time_s (n,) → (n,).
+    """
+    digit_s = _last_digit_s(time_s) if time_s.size >= FEWEST_TIMES else 0.0
+    if digit_s == 0:
+        return time_s, ""
+    place = np.arange(time_s.size, dtype=float)
+    step_s, first_s = np.polyfit(place, time_s, 1)
+    even_s = first_s + step_s * place
+    off_s = float(np.max(np.abs(time_s - even_s)))
+    if not step_s > 0 or off_s > TOLERANCE_DIGITS * digit_s or off_s < 0.5 * LEAST_DIGIT_PART * step_s:
+        return time_s, ""
+    rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
+    return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are used instead."
+
+
+def _last_digit_s(time_s: Floats) -> float:
+    """Decimal to which all times are rounded, s; 0 where they are not, or have more decimals."""
+    if not np.isfinite(time_s).all():
+        return 0.0
+    for digits in range(MOST_DECIMALS):
+        scaled = time_s * 10.0**digits
+        if np.max(np.abs(scaled - np.round(scaled))) < 1e-6 * max(1.0, float(np.max(np.abs(scaled))) * 1e-6):
+            return float(10.0**-digits)
+    return 0.0
+
+
+# ------------------------------------------------------------------------------
+# Read the channels of a TDMS file, in which LabVIEW writes measurements, as the columns of a table.
+#
+# Source: National Instruments, *TDMS File Format Internal Structure*. A file is a sequence of segments, each with a
+# lead-in of 28 bytes, properties and the layout of its channels, and raw values: one channel after the other or sample
+# by
+# sample. Values that need scaling on reading (DAQmx, `NI_Scale`) are refused by name.
+
+LEAD_IN_BYTES = 28  # Bytes of a segment's lead-in
+# Content of a segment, by bits of its lead-in
+_META, _NEW_LIST, _RAW, _INTERLEAVED, _BIG_ENDIAN, _DAQMX = 1 << 1, 1 << 2, 1 << 3, 1 << 5, 1 << 6, 1 << 7
+# Marks in place of a layout, or of a segment's length
+_NO_RAW, _AS_BEFORE, _TO_THE_END = 0xFFFFFFFF, 0, 0xFFFFFFFFFFFFFFFF
+_TYPES = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8", 25: "f4", 26: "f8"}
+_TEXT, _BOOLEAN, _TIME_STAMP = 0x20, 0x21, 0x44  # Type codes of text, Booleans and time stamps
+_DAQMX_LAYOUTS = {0x1269, 0x1369}
+
+
+@dataclass
+class _Channel:
+    """A channel as far as it has been read: type and count of its values in a segment, properties, and all values."""
+
+    kind: str = ""
+    count: int = 0
+    properties: dict[str, Any] = field(default_factory=dict)
+    parts: list[NDArray[Any]] = field(default_factory=list)
+
+
+def tdms_columns(data: bytes) -> dict[str, Floats]:
+    """Read the channels of a file that are as long as its pressure. A channel is named as in the file, with its unit
+    appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a time, `time_s` comes from the waveform's start and
+    increment. Returns values by column, each of shape (n_samples,).
+    """
+    try:
+        channels = _channels(data)
+    except (struct.error, UnicodeDecodeError, ValueError) as error:
+        raise TrackError(f"is damaged or cut short ({error}): export it from LabVIEW again") from None
+    named = {_column(path, channel): channel for path, channel in channels.items() if channel.parts}
+    pressure = next((channel for name, channel in named.items() if name.startswith("pressure")), None)
+    if pressure is None:
+        there = ", ".join(list(named)[:8]) or "none"
+        raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]}): name it so in LabVIEW")
+    columns = {name: _values(name, channel) for name, channel in named.items()}
+    columns = {name: values for name, values in columns.items() if len(values) == len(_values("", pressure))}
+    if not any(name.startswith("time") for name in columns):
+        step = float(pressure.properties.get("wf_increment", 0.0))
+        if not step > 0:
+            raise TrackError("states no times: write a channel time_s, or the waveform's increment (wf_increment)")
+        start = float(pressure.properties.get("wf_start_offset", 0.0))
+        columns["time_s"] = np.asarray(start + step * np.arange(len(_values("", pressure))), dtype=float)
+    return dict(_in_own_unit(name, values) for name, values in columns.items())
+
+
+def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
+    """Convert a pressure to kPa and a time to s; others stay as they are."""
+    quantity, unit = split_unit(name)
+    wanted = {"pressure": "kPa", "time": "s"}.get(quantity, unit)
+    if unit in ("", wanted):
+        return name, values
+    try:
+        return f"{quantity}_{wanted}", values * convert(1.0, unit, wanted)
+    except ValueError as error:
+        raise TrackError(f"channel {name}: {error}") from None
+
+
+def _column(path: str, channel: _Channel) -> str:
+    """Name of a channel with its unit."""
+    name = path.rpartition("/'")[2].removesuffix("'").replace("''", "'")
+    unit = str(channel.properties.get("unit_string", ""))
+    return name if not unit or name.endswith(f"_{unit}") else f"{name}_{unit}"
+
+
+def _values(name: str, channel: _Channel) -> Floats:
+    """All values of a channel, unless they need scaling on reading."""
+    scales = channel.properties.get("NI_Number_Of_Scales", 0)
+    if name and (scales or any(key.startswith("NI_Scale[") for key in channel.properties)):
+        raise TrackError(f"channel {name} is scaled only when it is read (NI_Scale): export it as CSV")
+    return np.concatenate(channel.parts).astype(float)
+
+
+def _channels(data: bytes) -> dict[str, _Channel]:
+    """All channels by path, with their values from every segment."""
+    if not data.startswith(b"TDSm"):
+        raise TrackError("is not a TDMS file: export it from LabVIEW again, or as CSV")
+    channels: dict[str, _Channel] = {}
+    listed: list[str] = []
+    place = 0
+    while place < len(data):
+        tag, contents = struct.unpack_from("<4sI", data, place)
+        if tag != b"TDSm":
+            raise ValueError(f"no segment at byte {place}")
+        if contents & _DAQMX:
+            raise TrackError("holds raw values of DAQmx, which are scaled only when they are read: export it as CSV")
+        order = ">" if contents & _BIG_ENDIAN else "<"
+        _version, length, raw = struct.unpack_from(f"{order}IQQ", data, place + 8)
+        begin = place + LEAD_IN_BYTES
+        end = len(data) if length == _TO_THE_END else begin + length
+        if end > len(data):
+            raise ValueError(f"{len(data)} of {end} bytes are there")
+        if contents & _META:
+            listed = _read_layout(data, begin, order, [] if contents & _NEW_LIST else listed, channels)
+        if contents & _RAW:
+            layout = [channels[path] for path in listed if channels[path].count]
+            _read_values(data[begin + raw : end], order, layout, bool(contents & _INTERLEAVED))
+        place = end
+    return channels
+
+
+def _read_layout(data: bytes, place: int, order: str, listed: list[str], channels: dict[str, _Channel]) -> list[str]:
+    """Update properties and layout of a segment's channels; return those with raw values, in order."""
+    (objects,) = struct.unpack_from(f"{order}I", data, place)
+    place += 4
+    listed = list(listed)
+    for _ in range(objects):
+        path, place = _text(data, place, order)
+        channel = channels.setdefault(path, _Channel())
+        (index,) = struct.unpack_from(f"{order}I", data, place)
+        place += 4
+        if index in _DAQMX_LAYOUTS:
+            raise TrackError("holds raw values of DAQmx, which are scaled only when they are read: export it as CSV")
+        if index not in (_NO_RAW, _AS_BEFORE):
+            kind, _dimension, count = struct.unpack_from(f"{order}IIQ", data, place)
+            if kind not in _TYPES:
+                raise TrackError(
+                    f"channel {_column(path, channel)} holds no plain numbers: leave it out, or export as CSV"
+                )
+            channel.kind, channel.count = _TYPES[kind], count
+            place += index - 4 if index > 4 else 16
+        if index == _NO_RAW:
+            listed = [other for other in listed if other != path]
+        elif path not in listed:
+            listed.append(path)
+        (properties,) = struct.unpack_from(f"{order}I", data, place)
+        place += 4
+        for _ in range(properties):
+            name, place = _text(data, place, order)
+            channel.properties[name], place = _property(data, place, order)
+    return listed
+
+
+def _text(data: bytes, place: int, order: str) -> tuple[str, int]:
+    (length,) = struct.unpack_from(f"{order}I", data, place)
+    if place + 4 + length > len(data):
+        raise ValueError("a name runs beyond its end")
+    return data[place + 4 : place + 4 + length].decode("utf-8"), place + 4 + length
+
+
+def _property(data: bytes, place: int, order: str) -> tuple[Any, int]:
+    (kind,) = struct.unpack_from(f"{order}I", data, place)
+    place += 4
+    if kind == _TEXT:
+        return _text(data, place, order)
+    if kind == _BOOLEAN:
+        return bool(data[place]), place + 1
+    if kind == _TIME_STAMP:
+        return None, place + 16
+    if kind not in _TYPES:
+        raise ValueError(f"a property of unknown type {kind}")
+    numbers = np.frombuffer(data, dtype=order + _TYPES[kind], count=1, offset=place)
+    return numbers[0].item(), place + numbers.itemsize
+
+
+def _read_values(raw: bytes, order: str, layout: list[_Channel], interleaved: bool) -> None:
+    """Append a segment's values to its channels: repeated chunks of one layout; an incomplete last chunk is dropped."""
+    fields = [(str(i), order + c.kind, () if interleaved else (c.count,)) for i, c in enumerate(layout)]
+    chunk = np.dtype(fields)
+    if not chunk.itemsize:
+        return
+    table = np.frombuffer(raw[: len(raw) // chunk.itemsize * chunk.itemsize], dtype=chunk)
+    for i, channel in enumerate(layout):
+        channel.parts.append(table[str(i)].ravel())
+
+
+# ------------------------------------------------------------------------------
+# Read files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
+#
+# A project stores the marks of a point mass in image pixels, frame by frame, and the axes: origin (px, image y
+# downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The transform to world coordinates
+# is
+# that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale change, a
+# project holds them for key frames; each is valid until the next.
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "µm": 1e-6, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
+SECONDS = {"s": 1.0, "ms": 0.001, "min": 60.0}
+_HEADER_CELL = re.compile(r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Tracker's coordinate system from one frame on: origin in px, angle in rad, px per unit of length."""
+
+    from_frame: int
+    origin_px: tuple[float, float]
+    angle_rad: float
+    px_per_unit: tuple[float, float]
+
+
+def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
+    """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
+    `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
+    """
+    panel = _parse_panel(text)
+    name, marks, others = _choose_mass(panel, point_mass)
+    first, last = frames_used or (0, max(marks))
+    marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
+    if not marks:
+        raise TrackError(f"holds no marks of {name!r} in frames {first} to {last}: widen frames_used")
+    frames = np.array(sorted(marks))
+    pixels = np.array([marks[frame] for frame in sorted(marks)])
+    frame_s, start_s, start_frame = _clock(panel)
+    notes = []
+    if others and not point_mass:
+        notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
+    unit = (_physics_tracker_text(panel, "length_unit") or "").strip()
+    if unit and unit not in METRES:
+        raise TrackError(f"measures lengths in {unit[:20]!r}: set the length unit to m in Tracker")
+    if not unit:
+        notes.append("The project names no unit of length; metres are assumed.")
+    world_m = _to_world(frames, pixels, _axes(panel)) * METRES.get(unit, 1.0)
+    position_m, note = _project_on_axis(world_m)
+    edge_px, _ = _project_on_axis(pixels)
+    missing = int(frames[-1] - frames[0]) + 1 - len(frames)
+    if missing:
+        notes.append(f"{missing} frames between the first and the last point have none.")
+    time_s = start_s + (frames - start_frame) * frame_s
+    return new_track(time_s, position_m, edge_px=edge_px, notes=[*notes, note])
+
+
+def _parse_panel(text: str) -> Element:
+    """The element of Tracker's panel. Documents that define entities are refused: they can expand without end."""
+    from xml.etree import ElementTree
+
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise TrackError("defines XML entities, which no Tracker project does: save it anew in Tracker")
+    try:
+        root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
+    except (ElementTree.ParseError, ValueError, RecursionError):
+        raise TrackError("is not a Tracker project: unpack a .trz, or save as .trk in Tracker") from None
+    panels = [node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")]
+    if not panels:
+        raise TrackError("holds no Tracker panel: save the project as .trk in Tracker")
+    return panels[0]
+
+
+def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
+    """Name and marks (frame → px) of the point mass wanted, or of that with the most marks; names of the others."""
+    masses: list[tuple[str, dict[int, tuple[float, ...]]]] = []
+    for node in panel.iter("object"):
+        if node.get("class", "").endswith(".PointMass"):
+            name = _physics_tracker_text(node, "name") or f"mass {len(masses) + 1}"
+            masses.append((name.strip()[:40], _frame_values(node, "x", "y")))
+    marked = [(name, marks) for name, marks in masses if marks]
+    if not marked:
+        raise TrackError("holds no point mass with marks: mark the leading edge as a point mass in Tracker")
+    best = max(range(len(marked)), key=lambda i: len(marked[i][1]))
+    if wanted:
+        named = [i for i, (name, _) in enumerate(marked) if name.casefold() == wanted.strip().casefold()]
+        if len(named) != 1:
+            names = ", ".join(repr(name) for name, _ in marked)
+            many = "several point masses" if named else "no point mass"
+            raise TrackError(f"holds {many} named {wanted!r}: point_mass is one of {names}")
+        best = named[0]
+    name, marks = marked[best]
+    return name, marks, [other for i, (other, _) in enumerate(marked) if i != best]
+
+
+def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
+    """Numbers stored per frame under `framedata`; frames that lack one are left out."""
+    values: dict[int, tuple[float, ...]] = {}
+    for entry in _children(_physics_tracker_property(node, "framedata")):
+        index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name", ""), re.ASCII)
+        stored = entry.find("object")
+        if index is None or stored is None:
+            continue
+        numbers = tuple(_number(stored, name) for name in names)
+        if all(math.isfinite(number) for number in numbers):
+            values[int(index[1])] = numbers
+    return values
+
+
+def _axes(panel: Element) -> list[_Axes]:
+    """The coordinate systems of the key frames, in their order."""
+    coords = _object(panel, "coords")
+    values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
+    if not values:
+        raise TrackError("holds no coordinate system: calibrate it in Tracker")
+    if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in values.values()):
+        raise TrackError("holds a scale that is not positive: calibrate it anew in Tracker")
+    if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
+        raise TrackError("was never calibrated (1 pixel is 1 m): set a calibration stick or tape in Tracker")
+    return [_Axes(n, (x, y), math.radians(angle), (sx, sy)) for n, (x, y, angle, sx, sy) in sorted(values.items())]
+
+
+def _to_world(frames: np.ndarray, pixels: Floats, axes: list[_Axes]) -> Floats:
+    """World coordinates, in units of length, of points in px; shape (n, 2)."""
+    starts = np.array([system.from_frame for system in axes])
+    which = np.clip(np.searchsorted(starts, frames, side="right") - 1, 0, None)
+    origin = np.array([system.origin_px for system in axes])[which]
+    scale = np.array([system.px_per_unit for system in axes])[which]
+    angle = np.array([system.angle_rad for system in axes])[which]
+    right, up = ((pixels - origin) / scale).T * np.array([[1.0], [-1.0]])
+    return np.column_stack([np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right])
+
+
+def _clock(panel: Element) -> tuple[float, float, int]:
+    """Seconds per frame, and time and number of the start frame."""
+    clip, control = _object(panel, "videoclip"), _object(panel, "clipcontrol")
+    video = None if clip is None else _object(clip, "video")
+    spacings = [_number(node, "delta_t") for node in (control, video) if node is not None]
+    frame_ms = next((spacing for spacing in spacings if math.isfinite(spacing) and spacing > 0), math.nan)
+    if math.isnan(frame_ms):
+        raise TrackError("does not say how long a frame lasts: set the frame rate in Tracker's clip settings")
+    start_ms = 0.0 if clip is None else _number(clip, "starttime")
+    start_frame = 0.0 if clip is None else _number(clip, "startframe")
+    return (
+        frame_ms / 1000,
+        start_ms / 1000 if math.isfinite(start_ms) else 0.0,
+        int(start_frame) if math.isfinite(start_frame) else 0,
+    )
+
+
+def _children(node: Element | None) -> list[Element]:
+    return [] if node is None else node.findall("property")
+
+
+def _physics_tracker_property(node: Element, name: str) -> Element | None:
+    return next((child for child in _children(node) if child.get("name") == name), None)
+
+
+def _object(node: Element, name: str) -> Element | None:
+    """The object stored in a property."""
+    node_of_name = _physics_tracker_property(node, name)
+    return None if node_of_name is None else node_of_name.find("object")
+
+
+def _physics_tracker_text(node: Element, name: str) -> str | None:
+    node_of_name = _physics_tracker_property(node, name)
+    return None if node_of_name is None else node_of_name.text
+
+
+def _number(node: Element, name: str) -> float:
+    """A stored number; NaN where it is missing, is none or is beyond LARGEST_NUMBER."""
+    try:
+        value = float(_physics_tracker_text(node, name) or "nan")
+    except ValueError:
+        return math.nan
+    return value if abs(value) <= LARGEST_NUMBER else math.nan
+
+
+def is_export_header(line: str) -> bool:
+    """Whether a line names the columns of a text export: t, and x or y."""
+    names = {name for cell in re.split(r"[\t;,]", line) if (name := _physics_tracker_column(cell)[0])}
+    return "t" in names and bool(names & {"x", "y"})
+
+
+def _physics_tracker_column(cell: str) -> tuple[str, str]:
+    """Name (t, x, y or blank) and unit of a column of an export.
+
+    >>> _column("x (cm)"), _column("#t"), _column("v_{x}")
+    (('x', 'cm'), ('t', ''), ('', ''))
+    """
+    match = _HEADER_CELL.fullmatch(cell.strip().strip('"').strip())
+    if match is None:
+        return "", ""
+    return {"time": "t"}.get(match[1].lower(), match[1].lower()), (match[2] or "")
+
+
+def read_export(table: Table) -> Track:
+    """Read the track of Tracker's text export; a blank coordinate is a frame without a point."""
+    columns: dict[str, tuple[str, str]] = {}
+    for column in table.columns:
+        name, unit = _physics_tracker_column(column)
+        columns.setdefault(name, (column, unit))
+    if "t" not in columns or not {"x", "y"} & columns.keys():
+        raise TrackError("has no columns t and x or y: export them from Tracker with one separator throughout")
+    time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
+    check_times(time_s, table.lines)
+    axes = [
+        table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name], METRES)
+        for name in ("x", "y")
+        if name in columns
+    ]
+    position_m, note = _project_on_axis(np.column_stack(axes))
+    missing = int(np.sum(~np.isfinite(position_m)))
+    notes = [rounded] if rounded else []
+    if missing:
+        notes.append(f"{missing} rows have no position.")
+    if not columns["t"][1] and not any(columns[name][1] for name in ("x", "y") if name in columns):
+        notes.append("The export names no units; seconds and metres are assumed.")
+    return new_track(time_s, position_m, notes=[*notes, note] if note else notes)
+
+
+def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
+    """Factor that converts a column's unit to SI."""
+    name, unit = column
+    if unit and unit not in units:
+        raise TrackError(f"column {name[:30]!r} has an unknown unit: use one of {', '.join(units)}")
+    return units.get(unit, 1.0)
+
+
+def _project_on_axis(points: Floats) -> tuple[Floats, str]:
+    """Positions along the principal axis of the motion, and a sentence saying so; NaN rows stay NaN. Returns position,
+    note: Shape (n,), with a net displacement that is not negative; the note is blank where nothing was done. Shapes:
+    points (n, 1).
+    """
+    known = np.all(np.isfinite(points), axis=1)
+    if not known.any():
+        return np.full(len(points), np.nan), ""
+    if np.max(np.abs(points[known])) > LARGEST_NUMBER:
+        raise TrackError("holds a position too large to be one: correct it")
+    if points.shape[1] == 1:
+        net = points[known][-1, 0] - points[known][0, 0]
+        return (-points[:, 0], "Turned round so that position grows.") if net < 0 else (points[:, 0], "")
+    centred = points[known] - points[known].mean(axis=0)
+    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+    position = (points - points[known][0]) @ axis
+    if position[known][-1] < 0:
+        axis, position = -axis, -position
+    stray = float(np.sqrt(np.mean((centred - np.outer(centred @ axis, axis)) ** 2) * 2))
+    degrees = math.degrees(math.atan2(axis[1], axis[0]))
+    note = (
+        f"Points in a plane projected on the principal axis of their motion ({degrees:.1f}° from x); "
+        f"they stray {1000 * stray:.3g} mm rms from it."
+    )
+    return np.where(known, position, np.nan), note
+
+
+# ------------------------------------------------------------------------------
+# Find where the motion of a body in an imported track ends: it turns back (a bounce) or stops abruptly.
+
+# Distance behind its furthest place, in standard deviations of a position and as a part of its travel, at which a body
+# has turned back (chosen)
+BACK_SIGMAS, BACK_TRAVEL_PART = 8.0, 0.02
+# Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
+STILL_SIGMAS, FEWEST_STILL = 5.0, 3
+# Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt (chosen)
+ABRUPT_STEP_PART = 0.5
+FEWEST_LEFT = 5  # Fewest points that must be left (derived)
+
+
+def flag_end_of_body(track: Track) -> Track:
+    """Flag points after the end of the body's motion `after_end`, and report the end in the notes."""
+    rows = np.flatnonzero(track.usable)
+    y = track.lead_position_m[rows]
+    if rows.size <= FEWEST_LEFT:
+        return track
+    noise_m = rough_noise(y)
+    end, what = _turns_back(y, noise_m), "turns back"
+    if end is None:
+        end, what = _stops_dead(y, noise_m), "stops"
+    if end is None or end + 1 < FEWEST_LEFT:
+        return track
+    flag = track.flag.astype("<U80")
+    for row in rows[end + 1 :]:
+        flag[row] = join_flags(str(flag[row]), "after_end")
+    note = f"the body {what} after {track.time_s[rows[end]]:.5g} s: the end of its motion; later points are not used"
+    return replace(track, flag=flag, notes=(*track.notes, note))
+
+
+def _turns_back(y: Floats, noise_m: float) -> int | None:
+    """Furthest point before the body comes back; None where it does not."""
+    is_back = np.maximum.accumulate(y) - y > max(BACK_SIGMAS * noise_m, BACK_TRAVEL_PART * float(np.ptp(y)))
+    turned = np.flatnonzero(is_back[:-1] & is_back[1:])
+    return int(np.argmax(y[: turned[0] + 1])) if turned.size else None
+
+
+def _stops_dead(y: Floats, noise_m: float) -> int | None:
+    """First point of a standstill that lasts to the end and begins within a frame; None where there is none."""
+    tolerance_m = max(STILL_SIGMAS * noise_m, 1e-9)
+    moving = np.flatnonzero(np.abs(y - np.median(y[-FEWEST_STILL:])) > tolerance_m)
+    if not moving.size or y.size - moving[-1] - 1 < FEWEST_STILL or moving[-1] < FEWEST_LEFT:
+        return None
+    last = int(moving[-1])
+    median_step = float(np.median(np.diff(y[last - FEWEST_LEFT : last + 1])))
+    last_step = float(y[last] - y[last - 1])
+    return last + 1 if median_step > tolerance_m and last_step > ABRUPT_STEP_PART * median_step else None
+
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
 
@@ -139,8 +733,6 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
 
 def _as_csv(path: Path) -> str:
     """The channels of a TDMS file as the text of a CSV, so that units in their names are converted in the same way."""
-    from vinetrack.tracks.tdms import tdms_columns
-
     try:
         size = file_size(path)
         if size > LARGEST_TDMS_BYTES:

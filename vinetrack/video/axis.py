@@ -8,17 +8,18 @@ change when the path passes them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-from vinetrack.experiment.cells import SHORTEST_AXIS_PX
+from vinetrack.core.records import Floats, Trial
+from vinetrack.experiment.schema import SHORTEST_AXIS_PX
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.order_kernels import monotone_path_sums, passing_times
+from vinetrack.video.kymograph import monotone_path_sums, passing_times
 from vinetrack.video.small_pictures import MIN_GROWN_PART, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 # Least share of all change that one front explains where nothing else of weight moves (chosen)
@@ -344,3 +345,43 @@ def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
     start, stop = max(start, low), min(stop, high)
     first, last = centre + start * along, centre + stop * along
     return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * line.half * factor)
+
+
+# ------------------------------------------------------------------------------
+# Whether the growth axes of recordings agree: vines filmed by one camera grow along one line of its picture.
+
+ASKEW_DEG = 10.0  # Angle between a recording's axis and that of most others above which the recording is named (chosen)
+FEWEST_ALIKE = 3  # Fewest recordings whose axes agree from which the others are judged (chosen)
+
+
+def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
+    """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line."""
+    return math.nan if bends else math.degrees(math.atan2(to_px[1] - from_px[1], to_px[0] - from_px[0]))
+
+
+def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
+    """Recordings whose axis differs from that of most others, where most agree. Returns their names, and how many
+    recordings agree; no names where fewer than FEWEST_ALIKE agree, or not most.
+    """
+    straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
+    agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
+    common = straight[int(np.argmax(agreeing))] if straight else 0.0
+    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, common) < ASKEW_DEG]
+    agreed = len(slopes_deg) - len(names)
+    return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
+
+
+def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:
+    """Trials whose axis was found askew to that of most others that grow at the same angle. Bodies that fly free and
+    trials with a given axis are not compared.
+    """
+    by_angle: dict[float, dict[str, float]] = {}
+    for trial in trials:
+        if trial.name in slopes_deg and trial.axis is None and trial.travel_ratio != 1:
+            by_angle.setdefault(trial.growth_angle_rad, {})[trial.name] = slopes_deg[trial.name]
+    return [named for slopes in by_angle.values() if (named := askew(slopes))[0]]
+
+
+def _apart_deg(slope: float, other: float) -> float:
+    """Angle between two lines, whichever way they run, 0 to 90 degrees."""
+    return abs((slope - other + 90.0) % 180.0 - 90.0)

@@ -8,19 +8,40 @@ straight.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.experiment.cells import SMALLEST_POINT_SPACING_PX
-from vinetrack.video.axis import Axis
+from vinetrack.experiment.schema import SMALLEST_POINT_SPACING_PX
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, FrontShare, find_axis, front_share, pixels_on_front
 from vinetrack.video.frames import RecordingError
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.strip import (
+    BAND_GAP_PX,
+    BAND_HEIGHT_PX,
+    REFERENCE_FRAMES,
+    SHAKE_CONVERGED_PX,
+    SHAKE_FLOOR_PX,
+    SHAKE_ROUNDS,
+    SHAKE_STEP_PX,
+    SHIFT_PIXELS,
+    Reference,
+    Strip,
+    camera_unit,
+    cut_strip,
+    register,
+    shifts_agree,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
+
+    from vinetrack.video.edge import Outline
+
 
 Point = tuple[float, float]
 
@@ -194,3 +215,408 @@ def curve_problem(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple
             "give fewer points or a smaller width",
         )
     return None
+
+
+# ------------------------------------------------------------------------------
+# Measure the shake of a camera beside a curved axis: how far each picture moved, by the still background.
+#
+# A shift of the picture is along the curve in one place and across it in another. It is therefore measured in the
+# picture, before anything is straightened, by the same robust least squares as the bands beside a straight strip.
+
+GROUND_PX = 120  # Distance from the tube within which background counts (chosen)
+
+
+def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Floats | None:
+    """Measure how far each picture moved against the others. Shapes: luma (n_frames, height, width) → (n_frames, 2)."""
+    height, width = luma.shape[1:]
+    level = Axis((0.0, 0.0), (float(max(width - 1, 10)), 0.0))
+    y, x = (values.ravel() for values in np.mgrid[2 : height - 2 : 2, 2 : width - 2 : 2])
+    across = np.abs(axis.along_and_across(np.column_stack([x, y]).astype(float))[1])
+    still = (across > half_px + BAND_GAP_PX) & (across < half_px + GROUND_PX)
+    if np.count_nonzero(still) < SHIFT_PIXELS // 10:
+        return None
+    every = max(1, np.count_nonzero(still) // SHIFT_PIXELS)
+    x, y = x[still][::every], y[still][::every]
+    sampled = np.unique(np.linspace(0, len(luma) - 1, REFERENCE_FRAMES).astype(int))
+    picture, unit = np.median(luma[sampled], axis=0), camera_unit(luma)
+    # Both halves of the background must show the same shift; what moves by itself does not.
+    halves = [_reference(picture, x[part], y[part]) for part in (x < np.median(x), x >= np.median(x))]
+    (first, first_sd), (second, second_sd) = (register(luma, level, half, None, unit) for half in halves)
+    shake_px = float(np.median(np.abs(np.concatenate([first[:, 2:], second[:, 2:]]))))
+    sd_sum = float(np.median(first_sd + second_sd))
+    if not shake_px > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or not shifts_agree(luma, level, halves, unit):
+        return None
+    whole = _reference(picture, x, y)
+    shift = np.zeros((len(luma), 2))
+    for turn in range(SHAKE_ROUNDS):
+        fit, _ = register(luma, level, whole, shift if turn else None, unit)
+        step = np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
+        shift = shift + step
+        if np.abs(step).max() < SHAKE_CONVERGED_PX:
+            break
+        if turn == 0:
+            whole = _reference(np.median(_moved_back(luma[sampled], shift[sampled]), axis=0), x, y)
+    return shift
+
+
+def _reference(picture: Floats, x: NDArray[np.int_], y: NDArray[np.int_]) -> Reference:
+    """Pixels of the background and the basis of the fit: brightness, one, and slopes along rows and columns."""
+    down, right = np.gradient(np.asarray(picture, dtype=float))
+    basis = np.stack([picture[y, x], np.ones(len(x)), -right[y, x], -down[y, x]])
+    return Reference(x.astype(float), y.astype(float), np.ascontiguousarray(basis, dtype=float))
+
+
+def _moved_back(luma: NDArray[Any], shift_px: Floats) -> NDArray[np.float32]:
+    """Pictures shifted back by the shake, bicubic."""
+    import cv2
+
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    size = luma.shape[2], luma.shape[1]
+    return np.stack([
+        cv2.warpAffine(frame.astype(np.float32), np.array([[1, 0, dx], [0, 1, dy]]), size, flags=flags,
+                       borderMode=cv2.BORDER_REPLICATE)
+        for frame, (dx, dy) in zip(luma, shift_px, strict=True)
+    ])  # fmt: skip
+
+
+# ------------------------------------------------------------------------------
+# Cut the strip along an axis, straight or curved; along a curve the picture is straightened by the curve's normals.
+#
+# A straightened picture is a picture like any other: its middle is a level axis, its columns are one pixel of arc
+# length
+# apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of the tube
+# that grew.
+
+KNOT_PX = 40.0  # Distance of the knots of a curve that is moved onto the middle of a tube (chosen)
+STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
+AVERAGING_STRETCHES = 1.0  # Standard deviation, in stretches, of the Gaussian over which the tube's middle is averaged
+CENTRED_PX = 0.3  # Largest distance from the tube's middle at which a curve is left unchanged (measured)
+SLOW_PX_PER_RAD = 0.04  # Slow error of a position along a curve, for each radian by which the curve turns (measured)
+
+
+@dataclass(frozen=True)
+class StraightenedPictures:
+    """Pictures along a curve: `luma`, shape (n_frames, n_across, n_along), and the level `axis` along its middle."""
+
+    luma: NDArray[Any]
+    axis: Axis
+
+
+def straightened(
+    luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None
+) -> StraightenedPictures:
+    """Straighten pictures along a curve by bicubic interpolation. Shapes: luma (n_frames, height, width); shake_px
+    (n_frames, 2).
+    """
+    import cv2
+
+    above, below = (_rows_on_side(axis, half_px, side, luma.shape[1:]) for side in (-1, 1))
+    n_along = int(np.floor(axis.length_px)) + 1
+    rows = np.arange(-above, below + 1, dtype=float)
+    source = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
+    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+    out = np.empty((len(luma), len(rows), n_along), luma.dtype)
+    shake = np.zeros((len(luma), 2)) if shake_px is None else shake_px
+    for frame, straight, (dx, dy) in zip(luma, out, shake.astype(np.float32), strict=True):
+        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
+    return StraightenedPictures(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
+
+
+def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
+    """Cut, level and stabilise the strip about an axis, straight or curved; see `strip.cut_strip`. Shapes: luma
+    (n_frames, height, width).
+    """
+    if not isinstance(axis, CurvedAxis):
+        return cut_strip(luma, axis, half_px)
+    half = min(half_px, max(axis.largest_half_px - 1, 2.0))
+    shake_px = picture_shake(luma, axis, half) if before is None else before.shake_px
+    straight = straightened(luma, axis, half, shake_px)
+    strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
+    return strip if shake_px is None else replace(strip, shift_px=shake_px, stabilised=True)
+
+
+def path_error_px(axis: Axis) -> float:
+    """Return the slow error of positions along an axis that comes from its curvature."""
+    return SLOW_PX_PER_RAD * axis.total_turn_rad if isinstance(axis, CurvedAxis) else 0.0
+
+
+def curve_note(axis: CurvedAxis) -> str:
+    """Say that the growth axis was found to be a curve."""
+    return (
+        f"the vine bends by {np.degrees(axis.total_turn_rad):.0f}° in all, and positions are those along a curve that"
+        " was found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
+    )
+
+
+def shake_along(strip: Strip, edge_px: Floats) -> Floats:
+    """Return how far a shaken camera moved each picture along the axis, at the edge. Shapes: edge_px (n_frames,) →
+    (n_frames,).
+    """
+    if not isinstance(strip.axis, CurvedAxis):
+        return strip.shift_px[:, 0]
+    place_px = np.where(np.isfinite(edge_px), edge_px, 0.5 * strip.axis.length_px)
+    return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(place_px), axis=1))
+
+
+def front_share_on_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
+    """Share of the change along a curve that is one front passing once; see `axis.front_share`. Shapes: luma (n_frames,
+    height, width).
+    """
+    straight = straightened(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
+    return front_share(SmallPictures(straight.luma), straight.axis)
+
+
+def front_share_function(small: SmallPictures, luma: NDArray[Any]) -> FrontShare:
+    """Return the function from an axis to its front share, for straight and curved axes. Shapes: luma (n_frames,
+    height, width).
+    """
+    return lambda axis: front_share_on_curve(luma, axis) if isinstance(axis, CurvedAxis) else front_share(small, axis)
+
+
+def check_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
+    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide."""
+    complaint = curve_problem(axis, half_px, (shape[1], shape[0]))
+    if complaint is not None:
+        raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
+
+
+def outline_stretches(axis: Axis) -> int:
+    """Number of stretches in which the sides of a tube are found."""
+    return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
+
+
+def recentred_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
+    """Move a curve onto the middle of the tube, and measure how far that lies from it. Returns curve, with the tube's
+    width; the given one where the tube's middle makes none that a strip can be cut along., distance.
+    """
+    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
+    offsets = _local_lines(sides.places_px, sides.middles_px, knots)
+    through = axis.points(knots, offsets)
+    separate = [
+        0,
+        *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > SMALLEST_POINT_SPACING_PX),
+    ]
+    try:
+        curve = axis_through(through[separate], 2 * sides.half_px)
+    except RecordingError:
+        return axis, 0.0
+    if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
+        return axis, 0.0
+    return curve, float(np.abs(offsets).max())
+
+
+def _local_lines(places: Floats, middles: Floats, queries: Floats) -> Floats:
+    """Middle of the tube at places along it, by Gaussian-weighted local lines; level beyond the outermost stretches."""
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    queries = np.clip(queries, places[0], places[-1])
+    out = np.empty(len(queries))
+    for k, place in enumerate(queries):
+        offset = (places - place) / (AVERAGING_STRETCHES * spacing)
+        weight = np.exp(-0.5 * offset**2)
+        design = np.column_stack([np.ones(len(places)), offset])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        out[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
+    return out
+
+
+def _rows_on_side(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
+    """Rows on one side: those wanted, and as many more as stay in the picture along the whole curve, uncrossed."""
+    wanted = int(np.ceil(half_px))
+    most = min(wanted + BAND_GAP_PX + BAND_HEIGHT_PX[1], int(axis.largest_half_px))
+    along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)
+    for reach in range(most, wanted, -1):
+        place = axis.points(along, side * float(reach))
+        if ((place > -0.5) & (place < [shape[1] - 0.5, shape[0] - 0.5])).all():
+            return reach
+    return wanted
+
+
+# ------------------------------------------------------------------------------
+# Find the curve along which a vine grew, from the region of pixels that changed.
+#
+# A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end that
+# changed first to the end that changed last, is the path. The curve is used only where its front share is far larger
+# than
+# that of the best straight line.
+
+# Ratio of the front share of a curve to that of the straight line from which the curve is used (measured)
+CURVE_GAIN = 1.35
+# A curve is also used where the straight line needs a band this many times wider and the curve explains at least
+# EQUAL_SHARE of what the line does (measured)
+BAND_RATIO, EQUAL_SHARE = 1.25, 0.98
+LEAST_LENGTH = 3.0  # Least length of the band, in its widths, that has a path (chosen)
+CENTRING_POWER = 3.0  # How strongly the path through the band keeps to its middle: a step costs 1 / depth³ (chosen)
+KNOT_WIDTHS = 1.5  # Distance of the curve's knots in widths of the band (chosen)
+
+
+def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
+    """Find the growth axis from the motion: a straight line, or a curve where that explains far more of the change.
+    Shapes: luma (n_frames, height, width).
+    """
+    try:
+        straight: Axis | None = find_axis(small)
+        line_error = None
+    except RecordingError as error:
+        straight, line_error = None, error
+    band = _changed_band(small)
+    line_share = 0.0 if straight is None else front_share_of_picture(small, straight)
+    line_too_wide = (
+        straight is not None and band is not None and straight.width_px > BAND_RATIO * band.width * small.factor
+    )
+    # No curve can explain more than all of the change: along a straight vine none is searched.
+    curve = find_curve(small, band) if line_too_wide or line_share * CURVE_GAIN < 1 else None
+    if curve is not None:
+        needed = max(LEAST_FRONT_SHARE, line_share * (EQUAL_SHARE if line_too_wide else CURVE_GAIN))
+        if front_share_of_picture(small, curve) >= needed and _front_follows(luma, curve):
+            return curve
+    if straight is None:
+        assert line_error is not None
+        raise line_error
+    return straight
+
+
+def front_share_of_picture(small: SmallPictures, axis: Axis) -> float:
+    """Share of all growth in the picture that is a front passing once along an axis, straight or curved."""
+    x, y, time, weight, n_times = small.grown
+    if len(x) < 12:
+        return 0.0
+    places = (np.column_stack([x, y]) + 0.5) * small.factor - 0.5
+    if isinstance(axis, CurvedAxis):
+        along, across = axis.along_and_across(places)
+    else:
+        along, across = (places - axis.from_px) @ axis.direction, (places - axis.from_px) @ axis.normal
+    band = max(0.6 * axis.width_px / small.factor, 2.0)
+    if not (np.abs(across) < band * small.factor).any():
+        return 0.0
+    in_small_px = along / small.factor, across / small.factor, time, weight
+    on_front, _, _ = pixels_on_front(*in_small_px, n_times, 0.0, np.zeros(2), band)
+    return float(weight[on_front].sum() / weight.sum())
+
+
+def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | None:
+    """Find the smoothed middle of the band that changed, from its first change to its last."""
+    band = band or _changed_band(small)
+    path = None if band is None else _centreline(band)
+    if band is None or path is None or len(path) < LEAST_LENGTH * band.width:
+        return None
+    middle = _smoothed_knots(_in_order_of_time(path, band), max(KNOT_WIDTHS * band.width, 6.0))
+    if middle is None:
+        return None
+    size = small.shape[1], small.shape[0]
+    try:
+        axis = axis_through((middle + 0.5) * small.factor - 0.5, band.width * small.factor)
+        axis = _extended(axis, (3 * band.width + 12) * small.factor, size)
+    except RecordingError:
+        return None
+    if not isinstance(axis, CurvedAxis) or curve_problem(axis, axis.width_px / 2, size):
+        return None
+    return axis
+
+
+@dataclass(frozen=True)
+class Band:
+    """What changed in the small pictures, in their pixels; arrays of shape (height, width). `region` is its largest
+    connected part, `depth` the distance from the border of that, `when` the time of change, NaN where nothing changed;
+    `width` is the width along most of its length.
+    """
+
+    region: NDArray[np.bool_]
+    depth: Floats
+    when: Floats
+    width: float
+
+
+def _changed_band(small: SmallPictures) -> Band | None:
+    """The largest connected region that changed; None where hardly anything does."""
+    from scipy.ndimage import distance_transform_edt
+
+    x, y, time, _, _ = small.grown
+    if len(x) < 12:
+        return None
+    when = np.full(small.frames.shape[1:], np.nan)
+    when[y.astype(int), x.astype(int)] = time
+    region = _largest_region(np.isfinite(when))
+    depth = np.asarray(distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1])
+    half = float(np.quantile(depth[region], 0.9))
+    return Band(region, depth, when, 2 * half + 1)
+
+
+def _front_follows(luma: NDArray[Any], curve: CurvedAxis) -> bool:
+    """Whether one front passes along a curve in the full picture."""
+    try:
+        return front_share_on_curve(luma, curve) >= LEAST_FRONT_SHARE
+    except RecordingError:
+        return False
+
+
+def _largest_region(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The largest connected region, with gaps closed and threads removed."""
+    from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, label
+
+    closed = binary_closing(np.pad(changed, 3), iterations=2)[3:-3, 3:-3]
+    opened = binary_opening(binary_fill_holes(closed), iterations=1)
+    parts, count = label(opened, np.ones((3, 3)))
+    if count == 0:
+        return changed
+    return np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
+
+
+def _centreline(band: Band) -> Floats | None:
+    """Pixels (x, y) of the cheapest path along the middle of a band between its two most distant ends, shape (n, 2)."""
+    from skimage.graph import MCP_Geometric
+
+    rows, columns = np.nonzero(band.region)
+    if not rows.size:
+        return None
+    blocked = np.full(band.region.shape, -1.0)
+    unit_costs = np.where(band.region, 1.0, blocked)
+    start = end = int(rows[0]), int(columns[0])
+    for _ in range(2):
+        costs = np.where(band.region, MCP_Geometric(unit_costs).find_costs([end])[0], -1.0)
+        row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(costs), costs, -1.0))), costs.shape)
+        start, end = end, (int(row), int(column))
+    paths = MCP_Geometric(np.where(band.region, 1 / np.maximum(band.depth, 0.5) ** CENTRING_POWER, blocked))
+    paths.find_costs([start], [end])
+    return np.array(paths.traceback(end), dtype=float)[:, ::-1]
+
+
+def _in_order_of_time(path: Floats, band: Band) -> Floats:
+    """The path, turned round where its pixels changed from its end to its beginning."""
+    times = band.when[path[:, 1].astype(int), path[:, 0].astype(int)]
+    finite = np.flatnonzero(np.isfinite(times))
+    trend = np.sum((finite - finite.mean()) * (times[finite] - times[finite].mean())) if finite.size else 0.0
+    return path if trend >= 0 else path[::-1]
+
+
+def _smoothed_knots(path: Floats, spacing: float) -> Floats | None:
+    """Knots `spacing` from each other of a penalised spline through a path of whole pixels, shape (n, 2), n ≥ 4. The
+    ends of the path run into the corners of the band: half a knot distance at each is left out. None where fewer than
+    five pixels remain between them, the fewest that a cubic spline goes through.
+    """
+    from scipy.interpolate import make_smoothing_spline
+
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    inner = (along >= spacing / 2) & (along <= along[-1] - spacing / 2)
+    if inner.sum() < 5:
+        return None
+    # A wave of the length of two knot distances is damped to a half: penalty λ k⁴ = 1 at k = π / spacing.
+    penalty = (spacing / np.pi) ** 4
+    splines = [make_smoothing_spline(along[inner], path[inner, k], lam=penalty) for k in (0, 1)]
+    count = max(4, round(np.ptp(along[inner]) / spacing) + 1)
+    knots = np.linspace(along[inner][0], along[inner][-1], count)
+    return np.stack([spline(knots) for spline in splines], axis=1)
+
+
+def _extended(axis: Axis, margin: float, size_px: tuple[int, int]) -> Axis:
+    """The curve continued straight at both ends by `margin`, as far as the picture goes."""
+    if not isinstance(axis, CurvedAxis):
+        return axis
+    knots = list(axis.through_px)
+    for end, sign in ((0.0, -1.0), (axis.length_px, 1.0)):
+        extension = axis.points(end + sign * np.arange(1.0, margin + 1))
+        inside = ((extension >= 0) & (extension <= np.array(size_px) - 1)).all(axis=1)
+        count = len(extension) if inside.all() else int(np.argmin(inside))
+        if count > 6:
+            place = (float(extension[count - 1][0]), float(extension[count - 1][1]))
+            knots = [place, *knots] if sign < 0 else [*knots, place]
+    return axis_through(knots, axis.width_px)

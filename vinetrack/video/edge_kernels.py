@@ -8,18 +8,91 @@ the fraction p(y − s) of the pixel at `s`; see `edge_cover`.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import (
-    FASTMATH,
-    MIN_MOTION_BLUR_PX,
-    NO_REFCOUNT,
-    coverage_reach,
-    coverage_table,
-    subpixel_index,
-)
+from vinetrack.core.threads import in_parts
+
+# ------------------------------------------------------------------------------
+# Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).
+#
+# The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that a
+# row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run over
+# neighbours in memory, without a branch.
+
+TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
+Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)
+MIN_MOTION_BLUR_PX = 0.02  # Shorter motion blurs are set to this length (derived)
+SUBPIXEL_STEPS = round(1 / TABLE_STEP_PX)  # Entries of the coverage table per pixel (derived)
+NO_REFCOUNT: dict[str, Any] = {"_nrt": False}  # Numba option for functions that allocate nothing (measured)
+_Z = np.arange(-Z_LAST, Z_LAST + 1.5 * Z_STEP, Z_STEP)
+_NORMAL = np.array([[0.5 * math.erfc(-z / math.sqrt(2)), math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)] for z in _Z])
+FASTMATH = {"contract", "arcp", "nsz", "reassoc"}  # Floating-point freedom of the compiler (chosen)
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _normal(z: float) -> tuple[float, float]:
+    """Interpolate Φ(z) and its integral zΦ(z) + φ(z) from the table."""
+    if z <= -Z_LAST:
+        return 0.0, 0.0
+    if z >= Z_LAST:
+        return 1.0, z
+    at = (z + Z_LAST) / Z_STEP
+    i = int(at)
+    f = at - i
+    low, high = _NORMAL[i, 0], _NORMAL[i + 1, 0]
+    low_slope, high_slope = _NORMAL[i, 1], _NORMAL[i + 1, 1]
+    z_low, z_high = i * Z_STEP - Z_LAST, (i + 1) * Z_STEP - Z_LAST
+    low_sum, high_sum = z_low * low + low_slope, z_high * high + high_slope
+    g = 1 - f
+    a, b, c, d = (1 + 2 * f) * g * g, f * g * g * Z_STEP, f * f * (3 - 2 * f), f * f * g * Z_STEP
+    return a * low + b * low_slope + c * high - d * high_slope, a * low_sum + b * low + c * high_sum - d * high
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def coverage_table(length: float, blur: float, half: float) -> np.ndarray:
+    """Tabulate the coverage p and its slope dp/dx for one length of motion blur. Entry [j, k] is for x = middle − k + j
+    TABLE_STEP_PX, with middle = ceil(half) + 1. p is the mean of the normal distribution function over a box of
+    `length`, from ∫Φ = zΦ(z) + φ(z). Beyond `coverage_reach` it is 0 or 1. Shape (2, SUBPIXEL_STEPS + 1, 2 middle + 2).
+    """
+    middle = math.ceil(half) + 1
+    length = max(length, MIN_MOTION_BLUR_PX)
+    reach = coverage_reach(length, blur)
+    table = np.zeros((2, SUBPIXEL_STEPS + 1, 2 * middle + 2))
+    last = 2 * middle + 1
+    # One half is the other one mirrored: p(−x) = 1 − p(x).
+    for k in range(middle + 1):
+        for j in range(SUBPIXEL_STEPS + 1):
+            x = middle - k + j * TABLE_STEP_PX
+            table[0, j, k] = 1.0
+            if x < reach:
+                cdf_a, sum_a = _normal((x + length / 2) / blur)
+                cdf_b, sum_b = _normal((x - length / 2) / blur)
+                table[0, j, k] = (sum_a - sum_b) * blur / length
+                table[1, j, k] = (cdf_a - cdf_b) / length
+                table[0, SUBPIXEL_STEPS - j, last - k] = 1.0 - table[0, j, k]
+                table[1, SUBPIXEL_STEPS - j, last - k] = table[1, j, k]
+    return table
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def coverage_reach(length: float, blur: float) -> float:
+    """Return the distance from an edge beyond which a pixel is fully covered or fully uncovered."""
+    return 0.5 * length + 4 * blur + 0.5
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def subpixel_index(place: float) -> tuple[int, int, float, int]:
+    """Split the position of an edge into indices of a coverage table. Returns whole part, px; entry j below the
+    fraction; weight of entry j + 1; 1 if the position is a whole number, else 0.
+    """
+    whole = math.floor(place)
+    fraction = (place - whole) / TABLE_STEP_PX
+    j = min(int(fraction), SUBPIXEL_STEPS - 1)
+    return int(whole), j, fraction - j, 0 if fraction > 0 else 1
+
 
 COLUMNS_BEHIND = 25  # Columns behind the first passed one that are used (chosen)
 COLUMNS_AHEAD = 50  # Columns ahead of the last passed one that are used (chosen)
@@ -190,3 +263,542 @@ def _normal_sums(
     return used, (
         float(yy), float(yg), float(yl), float(gg), float(gl), float(ll), float(ry), float(rg), float(rl), float(chi),
     )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------
+# Weighted least squares for the brightness of film and background at every pixel.
+#
+# Compiled loops over strips of shape (n_frames, n_across, n_along): sums over frames, and their solution; see
+# `edge_kernels`.
+
+MEMORY_CUTOFF = 4.0  # Frames further away than this many memories are not read; their weight is e⁻⁴ = 2 % (chosen)
+PARTIAL_WEIGHT = 0.05  # Weight of a half-covered pixel (chosen)
+# Coverage from which a pixel counts as film, and below 1 − COVERED_FRACTION as background (chosen)
+COVERED_FRACTION = 0.98
+MIXED_BLURS = 2.06  # Distance from the edge, in optical blurs, from which a pixel is pure film or background (derived)
+FAR_PX = 80  # Columns beyond the range of the edge that are gathered (chosen)
+ROWS_PER_BLOCK = 8  # Rows processed together, so that their sums stay in the cache (chosen)
+
+
+def gather(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    edge: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    early: np.ndarray,
+    late: np.ndarray,
+    memory_frames: float,
+    appearance: np.ndarray,
+    clip: float,
+    shading: np.ndarray,
+) -> np.ndarray:
+    """Accumulate the sums of the least squares for background and film at every pixel; shape (11, n_across, n_along).
+    The edge is over column s from frame `early[s]` to `late[s]`. A pixel counts as background before and as film after,
+    with the weight exp(−frames / memory_frames), so that the frames nearest to the passage count most. Shapes: strip
+    (n_frames, n_across, n_along); scale, offset, edge, lengths (n_frames,); lag (n_across,); early, late (n_along,).
+    """
+    _, rows, columns = strip.shape
+    sums = np.zeros((11, rows, columns), np.float32)
+    weights = _column_weights(columns, edge, early, late, memory_frames)
+    tables = _tables(edge, lengths, blur, weights[2])
+    clip_weight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
+
+    def gather_rows(first: int, last: int) -> None:
+        _gather_blocks(
+            strip, scale, offset, edge, lengths, lag, blur, early, late, appearance, clip_weight, shading, *weights,
+            *tables, first, last, sums,
+        )  # fmt: skip
+
+    in_parts(gather_rows, rows, ROWS_PER_BLOCK)
+    return sums
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _column_weights(
+    columns: int, edge: np.ndarray, early: np.ndarray, late: np.ndarray, memory_frames: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of columns for background and for film, and the first column that counts and the one behind the last.
+    Shapes (n_frames, n_along) twice and (n_frames, 2); common to all rows.
+    """
+    n = len(edge)
+    bare_weights, film_weights = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
+    limits = np.zeros((n, 2), np.int64)
+    # Columns far from every position of the edge are skipped.
+    low, high = columns, 0
+    for t in range(n):
+        if math.isfinite(edge[t]):
+            low, high = min(low, int(edge[t]) - FAR_PX), max(high, int(edge[t]) + FAR_PX)
+    low, high = max(low, 0), min(high, columns)
+    for t in range(n):
+        first, last = columns, 0
+        if math.isfinite(edge[t]):
+            for s in range(low, high):
+                d = max(early[s] - t, t - late[s], 0.0) / memory_frames
+                if d < MEMORY_CUTOFF:
+                    bare_weights[t, s] = math.exp(-d)
+                    film_weights[t, s] = bare_weights[t, s] if t >= late[s] else 0.0
+                    first, last = min(first, s), s + 1
+        limits[t, 0], limits[t, 1] = first, last
+    return bare_weights, film_weights, limits
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _tables(edge: np.ndarray, lengths: np.ndarray, blur: float, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coverage tables, shape (n_frames, SUBPIXEL_STEPS + 1, n_distances), and which of them each frame uses."""
+    n = len(edge)
+    max_reach = 0.0
+    for t in range(n):
+        if limits[t, 1] > limits[t, 0]:
+            max_reach = max(max_reach, coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur))
+    # Frames at rest (motion blur up to MIN_MOTION_BLUR_PX) share a table.
+    tables = np.zeros((n, SUBPIXEL_STEPS + 1, 2 * math.ceil(max_reach) + 4))
+    table_index, rest_table = np.empty(n, np.int64), -1
+    for t in range(n):
+        table_index[t] = t
+        if limits[t, 1] > limits[t, 0]:
+            if lengths[t] <= MIN_MOTION_BLUR_PX and rest_table >= 0:
+                table_index[t] = rest_table
+                continue
+            table = coverage_table(lengths[t], blur, coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur))
+            tables[t, :, : table.shape[2]] = table[0]
+            if lengths[t] <= MIN_MOTION_BLUR_PX:
+                rest_table = t
+    return tables, table_index
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _gather_blocks(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, edge: np.ndarray, lengths: np.ndarray, lag: np.ndarray,
+    blur: float, early: np.ndarray, late: np.ndarray, appearance: np.ndarray, clip_weight: np.float32,
+    shading: np.ndarray, bare_weights: np.ndarray, film_weights: np.ndarray, limits: np.ndarray, tables: np.ndarray,
+    table_index: np.ndarray, first_row: int, last_row: int, sums: np.ndarray,
+) -> None:  # fmt: skip
+    """Add rows `first_row` up to `last_row`, that one excluded, to `sums`; see `gather`."""
+    n, _, columns = strip.shape
+    brightness = np.empty(columns, np.float32)
+    # A few rows at a time, so that their sums stay in the cache.
+    for block in range(first_row, last_row, ROWS_PER_BLOCK):
+        for t in range(n):
+            first, last = limits[t]
+            if last <= first:
+                continue
+            middle = math.ceil(coverage_reach(max(lengths[t], MIN_MOTION_BLUR_PX), blur)) + 1
+            mixed = min(math.ceil(0.5 * max(lengths[t], MIN_MOTION_BLUR_PX) + MIXED_BLURS * blur) + 1, middle)
+            table, bare_weight, film_weight = tables[table_index[t]], bare_weights[t], film_weights[t]
+            gain, level = np.float32(scale[t]), np.float32(offset[t])
+            _gather_rows(
+                strip[t], block, min(block + ROWS_PER_BLOCK, last_row), gain, level, edge[t], lag, table, middle, mixed,
+                first, last, bare_weight, film_weight, early, late, t, appearance, clip_weight, shading, brightness,
+                sums,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _gather_rows(
+    picture: np.ndarray, low: int, high: int, gain: np.float32, level: np.float32, edge: float, lag: np.ndarray,
+    table: np.ndarray, middle: int, mixed: int, first: int, last: int, bare_weight: np.ndarray,
+    film_weight: np.ndarray, early: np.ndarray, late: np.ndarray, t: int, appearance: np.ndarray,
+    clip_weight: np.float32, shading: np.ndarray, brightness: np.ndarray, sums: np.ndarray,
+) -> None:  # fmt: skip
+    """Add rows `low` to `high` of one frame to `sums`; see `gather`."""
+    unit = np.float32(1.0)
+    for u in range(low, high):
+        row_edge = edge - lag[u]
+        whole_px, j, f, _ = subpixel_index(row_edge)
+        behind = min(max(whole_px - mixed + 1, first), last)
+        ahead = min(max(whole_px + mixed + 1, first), last)
+        values, brightness_of = picture[u, first:last], brightness[first:last]
+        for s in range(last - first):
+            brightness_of[s] = np.float32(values[s]) * gain + level
+        centre = (len(shading) - 1) // 2
+        fraction = row_edge - whole_px
+        for s in range(max(first, whole_px - centre + 1), min(last, whole_px + centre)):
+            d = s - whole_px + centre
+            brightness[s] -= np.float32(shading[d] + fraction * (shading[d - 1] - shading[d]))
+        _add_pure_pixels(brightness[first:behind], film_weight[first:behind], appearance[0, u, first:behind],
+               clip_weight, sums[8, u, first:behind], sums[9, u, first:behind], sums[10, u, first:behind])  # fmt: skip
+        _add_pure_pixels(brightness[ahead:last], bare_weight[ahead:last], appearance[1, u, ahead:last],
+               clip_weight, sums[5, u, ahead:last], sums[6, u, ahead:last], sums[7, u, ahead:last])  # fmt: skip
+        for s in range(behind, ahead):
+            k = s - whole_px + middle
+            p = np.float32(table[j, k] + f * (table[j + 1, k] - table[j, k]))
+            q = unit - p
+            value = brightness[s]
+            w = bare_weight[s]
+            if p > COVERED_FRACTION:
+                w = film_weight[s]
+            elif p > 1 - COVERED_FRACTION:
+                if t < early[s] or t > late[s]:
+                    continue
+                w *= np.float32(PARTIAL_WEIGHT)
+            r = value - appearance[1, u, s] * q - appearance[0, u, s] * p
+            w /= unit + r * r * clip_weight
+            if q > COVERED_FRACTION:
+                sums[5, u, s] += w
+                sums[6, u, s] += w * value
+                sums[7, u, s] += w * value * value
+            elif p > COVERED_FRACTION:
+                sums[8, u, s] += w
+                sums[9, u, s] += w * value
+                sums[10, u, s] += w * value * value
+            else:
+                sums[0, u, s] += w * q * q
+                sums[1, u, s] += w * q * p
+                sums[2, u, s] += w * p * p
+                sums[3, u, s] += w * q * value
+                sums[4, u, s] += w * p * value
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _add_pure_pixels(
+    values: np.ndarray, weight: np.ndarray, picture: np.ndarray, clip_weight: np.float32,
+    count: np.ndarray, total: np.ndarray, squares: np.ndarray,
+) -> None:  # fmt: skip
+    """Add pixels of pure film, or pure background, to their weight, sum and sum of squares."""
+    unit = np.float32(1.0)
+    for k in range(len(values)):
+        value = values[k]
+        r = value - picture[k]
+        w = weight[k] / (unit + r * r * clip_weight)
+        count[k] += w
+        total[k] += w * value
+        squares[k] += w * value * value
+
+
+def solve(sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float) -> np.ndarray:
+    """Solve for the brightness of film and background at every pixel, and the variance about each. A pixel at which one
+    of the two is never visible, or whose background changes (a door swings there), takes it from its row: film from the
+    columns behind it, background from those ahead, with weights that fall as `decay`^distance. Shapes: sums (11,
+    n_across, n_along) → (4, n_across, n_along).
+    """
+    out = np.empty((4, *sums.shape[1:]), np.float32)
+
+    def solve_rows(first: int, last: int) -> None:
+        _solve_rows(sums, ridge, decay, fallback, noise, texture, first, last, out)
+
+    in_parts(solve_rows, sums.shape[1], ROWS_PER_BLOCK)
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _solve_rows(
+    sums: np.ndarray, ridge: float, decay: float, fallback: float, noise: float, texture: float, first_row: int,
+    last_row: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Solve for rows `first_row` up to `last_row`, that one excluded; see `solve`."""
+    columns = sums.shape[2]
+    background_guess = np.empty(columns)
+    variance_limit = (1.5 * texture) ** 2
+    for u in range(first_row, last_row):
+        total, count, film_guess = 0.0, 0.0, fallback
+        for s in range(columns - 1, -1, -1):
+            if count > 1e-3:
+                film_guess = total / count
+            background_guess[s] = film_guess
+            is_steady = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) < variance_limit
+            total = total * decay + (sums[6, u, s] if is_steady else 0.0)
+            count = count * decay + (sums[5, u, s] if is_steady else 0.0)
+        for s in range(columns - 1, -1, -1):
+            if background_guess[s] != fallback:
+                break
+            background_guess[s] = sums[6, u, s] / sums[5, u, s] if sums[5, u, s] > 0 else fallback
+        total, count, film_guess = 0.0, 0.0, fallback
+        for s in range(columns):
+            if count > 1e-3:
+                film_guess = total / count
+            elif sums[8, u, s] > 0:
+                film_guess = sums[9, u, s] / sums[8, u, s]
+            total = total * decay + sums[9, u, s]
+            count = count * decay + sums[8, u, s]
+            # Background never fully visible: the estimate from half-covered pixels would follow any error of the edge.
+            bare_variance = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise)
+            bare, film = sums[5, u, s] > 0.1 and bare_variance < variance_limit, sums[8, u, s] > 0.1
+            qq, qp, pp = sums[0, u, s] + sums[5, u, s], sums[1, u, s], sums[2, u, s] + sums[8, u, s]
+            vq, vp = sums[3, u, s] + sums[6, u, s], sums[4, u, s] + sums[9, u, s]
+            rq = ridge if bare else 1e4 * (1 + qq)
+            rp = ridge if film else 1e4 * (1 + pp)
+            qq, pp, vq, vp = qq + rq, pp + rp, vq + rq * background_guess[s], vp + rp * film_guess
+            det = qq * pp - qp * qp
+            out[0, u, s] = (vp * qq - vq * qp) / det
+            out[1, u, s] = (vq * pp - vp * qp) / det
+            out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
+            out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= variance_limit else 1.0) * texture**2
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _variance(weight: float, total: float, squares: float, noise: float) -> float:
+    """Variance of the values of a pixel, at least that of the noise, shrunk towards it if there are few frames."""
+    if weight <= 0:
+        return noise**2
+    observed = max(squares / weight - (total / weight) ** 2, 0.0)
+    return max((weight * observed + 2 * noise**2) / (weight + 2), noise**2)
+
+
+# ------------------------------------------------------------------------------
+# Compiled sums over the residuals of the edge fit, from which the shape of the tip and its blur follow.
+#
+# Sums are returned frame by frame, so that frames may be shared among threads and no result depends on their number.
+
+# Largest factor of a product whose logarithm is taken, and number of factors (derived)
+LARGEST_FACTOR, FACTORS = 1e9, 32
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def distance_sums(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    fit: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    appearance: np.ndarray,
+    margin: float,
+    frames: np.ndarray,
+    shading: np.ndarray,
+) -> np.ndarray:
+    """Sum the residuals of a fit by distance from the edge, 1 px per bin, edge at the middle bin. The sums are of z² /
+    var z, with z = Σ C r / v over the rows of a column (C the contrast, r the residual, v the variance), and of the
+    number of terms. Shapes: fit (n_frames, 6); frames (n_used,) → (n_used, n_bins, 2).
+    """
+    _, rows, columns = strip.shape
+    bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
+    centre_bin = bins // 2
+    by_distance, pixels = np.zeros((len(frames), bins, 2)), np.empty((2, columns))
+    for used in range(len(frames)):
+        t = frames[used]
+        y = fit[t, 0]
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
+        # Indexed by k, the position in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
+        column_sums = np.zeros((2, table.shape[2] + 1))
+        for u in range(rows):
+            a, k, m, fraction = _residuals_of_row(
+                strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first, last,
+                middle, table, shading, pixels,
+            )  # fmt: skip
+            k += 0 if fraction > 0 else 1
+            residual, weight = pixels[0, :m], pixels[1, :m]
+            film, background = appearance[0, u, a : a + m], appearance[1, u, a : a + m]
+            numerators, denominators = column_sums[0, k : k + m], column_sums[1, k : k + m]
+            for i in range(m):
+                numerators[i] += weight[i] * (film[i] - background[i]) * residual[i]
+            for i in range(m):
+                denominators[i] += weight[i] * (film[i] - background[i]) * (film[i] - background[i])
+        for k in range(column_sums.shape[1]):
+            if column_sums[1, k] > 0:
+                i = min(max(centre_bin - middle + k - 1, 0), bins - 1)
+                by_distance[used, i, 0] += column_sums[0, k] * column_sums[0, k] / column_sums[1, k]
+                by_distance[used, i, 1] += 1
+    return by_distance
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def place_sums(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    fit: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    appearance: np.ndarray,
+    margin: float,
+    frames: np.ndarray,
+    shading: np.ndarray,
+) -> np.ndarray:
+    """Sum Σ w r and Σ w by distance from the row's own edge, in the bins of `shading`, w the weight and r the residual.
+    Shape (n_used, 2, n_distances).
+    """
+    _, rows, columns = strip.shape
+    by_place, pixels = np.zeros((len(frames), 2, len(shading))), np.empty((2, columns))
+    for used in range(len(frames)):
+        t = frames[used]
+        y = fit[t, 0]
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
+        sums = by_place[used]
+        for u in range(rows):
+            _, k, m, fraction = _residuals_of_row(
+                strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first, last,
+                middle, table, shading, pixels,
+            )  # fmt: skip
+            residual, weight = pixels[0, :m], pixels[1, :m]
+            # The row's edge lies between two whole columns: each pixel counts in two bins.
+            for further in range(2):
+                part, d = (fraction if further else 1 - fraction), k - middle + (len(shading) - 1) // 2 - further
+                weighted, weights = sums[0, d : d + m], sums[1, d : d + m]
+                for i in range(m):
+                    weighted[i] += part * weight[i] * residual[i]
+                for i in range(m):
+                    weights[i] += part * weight[i]
+    return by_place
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def _around_edge(
+    y: float, length: float, lag: np.ndarray, blur: float, margin: float, columns: int
+) -> tuple[float, np.ndarray, int, int, int]:
+    """Reach of an edge at `y`, its table of coverage and the middle of that, the first column, one behind the last."""
+    half = coverage_reach(length, blur) + margin
+    table = coverage_table(length, blur, half)
+    return half, table, math.ceil(half) + 1, max(0, math.ceil(y - half - lag.max())), min(columns, int(y + half) + 1)
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _residuals_of_row(
+    picture: np.ndarray, u: int, scale: float, offset: float, appearance: np.ndarray, row_edge: float, gain: float,
+    level: float, half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray,
+    pixels: np.ndarray,
+) -> tuple[int, int, int, float]:  # fmt: skip
+    """Write residual and weight of the pixels of a row into the first columns of `pixels`. Their first column in the
+    picture and in the table, their number, and the fraction of the row's edge are returned. Each loop writes one array:
+    the compiler then proves that none overlaps, and computes several pixels at a time.
+    """
+    whole_px, j, f, _ = subpixel_index(row_edge)
+    a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
+    k, m, fraction = a - whole_px + middle, max(b - a, 0), row_edge - whole_px
+    if m == 0:
+        return 0, 1, 0, fraction
+    low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+    values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+    film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+    first_bin = a - whole_px + (len(shading) - 1) // 2
+    shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
+    residual, weight = pixels[0, :m], pixels[1, :m]
+    for i in range(m):
+        p = low[i] + f * (high[i] - low[i])
+        r = values[i] * scale + offset - background[i] - (film[i] - background[i]) * (gain * p + level)
+        residual[i] = r - shade_after[i] - fraction * (shade_before[i] - shade_after[i])
+    for i in range(m):
+        p = low[i] + f * (high[i] - low[i])
+        v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
+        weight[i] = 1 / (v + residual[i] * residual[i] / 9)
+    return a, k, m, fraction
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def row_sums(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    fit: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    appearance: np.ndarray,
+    margin: float,
+    frames: np.ndarray,
+    shading: np.ndarray,
+) -> np.ndarray:
+    """Sum Σ g r and Σ g² by row, weighted, with g the derivative of the model with respect to the row's lag. Shape
+    (n_used, n_across, 2).
+    """
+    _, rows, columns = strip.shape
+    by_row = np.zeros((len(frames), rows, 2))
+    for used in range(len(frames)):
+        t = frames[used]
+        y = fit[t, 0]
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
+        for u in range(rows):
+            by_row[used, u] = _sums_of_row(
+                strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first,
+                last, middle, table, shading,
+            )  # fmt: skip
+    return by_row
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _sums_of_row(
+    picture: np.ndarray, u: int, scale: float, offset: float, appearance: np.ndarray, row_edge: float, gain: float,
+    level: float, half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray,
+) -> tuple[float, float]:  # fmt: skip
+    """Sums of `row_sums` over one row of one frame."""
+    whole_px, j, f, _ = subpixel_index(row_edge)
+    a, b = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
+    if b <= a:
+        return 0.0, 0.0
+    k, m = a - whole_px + middle, b - a
+    low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+    low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
+    values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+    film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+    fraction, first_bin = row_edge - whole_px, a - whole_px + (len(shading) - 1) // 2
+    shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
+    gradient, curvature = 0.0, 0.0
+    for i in range(m):
+        p = low[i] + f * (high[i] - low[i])
+        slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
+        contrast = film[i] - background[i]
+        r = values[i] * scale + offset - background[i] - contrast * (gain * p + level)
+        r -= shade_after[i] + fraction * (shade_before[i] - shade_after[i])
+        v = p * p * film_variance[i] + (1 - p) * (1 - p) * background_variance[i]
+        w = 1 / (v + r * r / 9)
+        g = -contrast * slope
+        gradient += w * g * r
+        curvature += w * g * g
+    return gradient, curvature
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")
+def misfit_sums(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    fit: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    appearance: np.ndarray,
+    margin: float,
+    frames: np.ndarray,
+    shading: np.ndarray,
+) -> np.ndarray:
+    """Sum log(1 + r²/9v̄) over all pixels, v̄ the mean of the variances of film and background, and count the pixels.
+    The mean is a robust misfit for comparing blurs. The variance does not depend on the blur: otherwise a wider blur
+    would lower its own misfit. Shape (n_used, 2).
+    """
+    _, rows, columns = strip.shape
+    out = np.zeros((len(frames), 2))
+    for used in range(len(frames)):
+        t = frames[used]
+        y = fit[t, 0]
+        half, table, middle, first, last = _around_edge(y, lengths[t], lag, blur, margin, columns)
+        for u in range(rows):
+            logarithms, pixels = _logarithms_of_row(
+                strip[t], u, scale[t], offset[t], appearance, y - lag[u], 1 + fit[t, 3], fit[t, 4], half, first,
+                last, middle, table, shading,
+            )  # fmt: skip
+            out[used, 0] += logarithms
+            out[used, 1] += pixels
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy", **NO_REFCOUNT)
+def _logarithms_of_row(
+    picture: np.ndarray, u: int, scale: float, offset: float, appearance: np.ndarray, row_edge: float, gain: float,
+    level: float, half: float, first: int, last: int, middle: int, table: np.ndarray, shading: np.ndarray,
+) -> tuple[float, int]:  # fmt: skip
+    """Sum the logarithms of `misfit_sums` over one row of one frame, and count its pixels."""
+    whole_px, j, f, _ = subpixel_index(row_edge)
+    begin, end = max(first, math.ceil(row_edge - half)), min(last, math.floor(row_edge + half) + 1)
+    if end <= begin:
+        return 0.0, 0
+    fraction, total = row_edge - whole_px, 0.0
+    for a in range(begin, end, FACTORS):
+        m = min(FACTORS, end - a)
+        k, b, first_bin = a - whole_px + middle, a + m, a - whole_px + (len(shading) - 1) // 2
+        low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+        values, film, background = picture[u, a:b], appearance[0, u, a:b], appearance[1, u, a:b]
+        film_variance, background_variance = appearance[2, u, a:b], appearance[3, u, a:b]
+        shade_before, shade_after = shading[first_bin - 1 : first_bin - 1 + m], shading[first_bin : first_bin + m]
+        product = 1.0
+        for i in range(m):
+            p = low[i] + f * (high[i] - low[i])
+            r = values[i] * scale + offset - background[i] - (film[i] - background[i]) * (gain * p + level)
+            r -= shade_after[i] + fraction * (shade_before[i] - shade_after[i])
+            factor = 1 + r * r / (4.5 * (film_variance[i] + background_variance[i]))
+            product *= min(factor, LARGEST_FACTOR)
+        total += math.log(product)
+    return total, end - begin

@@ -3,17 +3,361 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.files import NOT_A_FILE, is_pipe_or_device
-from vinetrack.video.camera_headers import side_file_of
-from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
-from vinetrack.video.raw_frames import mosaic_brightness, unpack_pixels
+from vinetrack.core.records import Floats, Trial
+from vinetrack.core.tables import NOT_A_FILE, file_size, is_pipe_or_device
+from vinetrack.video.frames import (
+    IMAGES,
+    Frames,
+    RawFrames,
+    Recording,
+    RecordingError,
+    Region,
+    mosaic_brightness,
+    unpack_pixels,
+)
+
+# ------------------------------------------------------------------------------
+# Rate and exposure of capture: what the recording states, else the sheet; never the playback rate.
+
+SAME_RATE = 0.005  # Relative difference within which two rates are the same (derived)
+
+SAME_EXPOSURE = 0.02  # Relative difference within which exposures of sheet and recording are the same (chosen)
+
+
+def capture_rate(trial: Trial, recording: Recording) -> float:
+    """Return the capture rate: the recording's where it states one, else the sheet's."""
+    true_fps, stated = recording.capture_fps, trial.capture_fps
+    if true_fps is not None:
+        if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
+            raise RecordingError(
+                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording; "
+                "correct the sheet"
+            )
+        return true_fps
+    if not np.isfinite(stated):
+        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
+    playback = recording.playback_fps
+    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
+        raise RecordingError(
+            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
+            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
+        )
+    return stated
+
+
+def capture_exposure(trial: Trial, recording: Recording) -> float:
+    """Return the exposure of a frame: the recording's where it states one, else the sheet's."""
+    true_s, stated_s = recording.exposure_s, trial.exposure_s
+    if true_s is None:
+        return stated_s
+    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > SAME_EXPOSURE:
+        raise RecordingError(
+            f"{trial.name}: exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording; "
+            "correct the sheet"
+        )
+    return true_s
+
+
+# ------------------------------------------------------------------------------
+# Read the headers of high-speed camera files: Phantom `.cine`, Photron `.mraw` with its `.cih` or `.cihx`.
+#
+# They state rate and exposure of capture, which no ordinary film does. What cannot be read with certainty is refused by
+# name: compressed frames, unknown depths and versions, interleaved colours.
+
+# Offsets in the settings of a cine, bytes from their beginning
+MARK_AT, RATE_AT, SHUTTER_US_AT, COLOUR_FILTER_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 768, 772, 808, 896, 1568
+
+SETUP_BYTES = SHUTTER_NS_AT + 4  # Bytes of the settings that are read (derived)
+
+# XML path in a `.cihx` of each line of a `.cih`
+CIHX_PLACES = {
+    "Record Rate(fps)": "recordInfo/recordRate",
+    "Shutter Speed(s)": "recordInfo/shutterSpeed",
+    "Total Frame": "frameInfo/totalFrame",
+    "Image Width": "imageDataInfo/resolution/width",
+    "Image Height": "imageDataInfo/resolution/height",
+    "Color Bit": "imageDataInfo/colorInfo/bit",
+    "Color Type": "imageDataInfo/colorInfo/type",
+    "EffectiveBit Depth": "imageDataInfo/effectiveBit/depth",
+    "File Format": "imageFileInfo/fileFormat",
+}
+
+SIDE_FILES = (".cih", ".cihx")
+LONGEST_SIDE_FILE = 4_000_000  # Most bytes of a side file that are read (chosen)
+
+PACKED_BITS = {0: None, 256: 10, 1024: 12}  # Bits of a packed pixel by `biCompression` of a cine
+
+BAYER_CODES = frozenset({1, 2, 3, 4, 5, 6})  # Codes of colour filters of 2 by 2 pixels in a cine
+
+EXPOSURE_TOLERANCE = 0.01  # Relative difference within which the exposures of frames count as one (chosen)
+
+IMAGE_TIMES, IMAGE_EXPOSURES = 1002, 1003  # Types of the tagged blocks of a cine
+
+FRACTION_S = 2.0**-32  # Unit of times and exposures in a cine (defined)
+
+
+def inspect_cine(path: Path) -> Recording:
+    """Read the header of a Phantom `.cine`."""
+    name = path.name
+    try:
+        size = file_size(path)
+        with path.open("rb") as stream:
+            header = stream.read(44)
+            kind, _, compression, version, _, _, _, count, bitmap, setup, table = struct.unpack(
+                "<2s3HiIiI3I", header[:36]
+            )
+            if kind != b"CI":
+                raise RecordingError(f"{name}: not a Phantom cine; name a film, or a folder of pictures")
+            if version != 1:
+                raise RecordingError(f"{name}: a cine of version {version} is not read; save it anew in version 1")
+            end = table + 8 * count
+            if min(bitmap, setup, table) < 44 or count == 0 or end > size:
+                raise RecordingError(f"{name}: cut short, or its header is damaged; copy it from the camera again")
+            stream.seek(0)
+            header = stream.read(max(end, setup + SETUP_BYTES))
+            offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
+            frames = _cine_frames(path, stream, header, (compression, bitmap, setup), offsets, size)
+        setup_bytes = header[setup:]
+        rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, _tagged_blocks(header[:table], setup), count)
+    except (struct.error, ValueError, OSError) as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{name}: its header is damaged; copy it from the camera again") from None
+    depth = struct.unpack_from("<I", setup_bytes, REAL_BITS_AT)[0]
+    depth = 12 if frames.stored_bits in (10, 12) else depth if 0 < depth <= frames.stored_bits else frames.stored_bits
+    return Recording(
+        path, "raw", frames.width, frames.height, int(depth), count, rate, exposure_s,
+        notes=notes, raw=replace(frames, times_s=times_s),
+    )  # fmt: skip
+
+
+def _cine_frames(
+    path: Path, stream: BinaryIO, header: bytes, places: tuple[int, int, int], offsets: tuple[int, ...], size: int
+) -> RawFrames:
+    """Offsets of the frames and how they are packed; refuses what cannot be read."""
+    name = path.name
+    compression, bitmap, setup = places
+    _, width, height, _, bits, packing = struct.unpack_from("<IiiHHI", header, bitmap)
+    mark, length = struct.unpack_from("<2sH", header, setup + MARK_AT)
+    if mark != b"ST" or length < REAL_BITS_AT + 4:
+        raise RecordingError(f"{name}: its camera's settings are missing or of an unknown kind; save it anew")
+    filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER_AT)[0]
+    if compression == 1:
+        raise RecordingError(f"{name}: a compressed cine (JPEG) is not read; save it uncompressed")
+    if compression not in (0, 2) or packing not in PACKED_BITS:
+        raise RecordingError(
+            f"{name}: a cine of compression {compression}, packing {packing} is not read; save it as raw cine"
+        )
+    if bits not in (8, 16):
+        raise RecordingError(f"{name}: {bits} bits a pixel, colours interleaved, are not read; save it as raw cine")
+    if compression == 2 and (filters >> 8 or filters not in {0} | BAYER_CODES):
+        raise RecordingError(f"{name}: a sensor with colour filters of code {filters:#x} is not read; save it as AVI")
+    packed = PACKED_BITS[packing]
+    frames = RawFrames(
+        path, (), width, abs(height), packed or bits, bottom_up=packed is None and height > 0,
+        linearise=packed == 10, mosaic=compression == 2 and filters in BAYER_CODES,
+    )  # fmt: skip
+    if width <= 0 or height == 0 or (width * abs(height) * frames.stored_bits) % 8:
+        raise RecordingError(f"{name}: its header is damaged; copy it from the camera again")
+    starts = []
+    for at in offsets:
+        if not 0 < at <= size - 8:
+            break
+        stream.seek(at)
+        annotation = struct.unpack("<I", stream.read(4))[0]
+        stream.seek(at + annotation - 4)
+        size_field = stream.read(4)
+        if annotation < 8 or len(size_field) < 4:
+            break
+        if struct.unpack("<I", size_field)[0] != frames.frame_bytes:
+            raise RecordingError(
+                f"{name}: a frame takes {struct.unpack('<I', size_field)[0]} bytes where {width} x {abs(height)} px of "
+                f"{frames.stored_bits} bits take {frames.frame_bytes}; it is not read"
+            )
+        starts.append(at + annotation)
+    return replace(frames, offsets=tuple(starts))
+
+
+def _tagged_blocks(header: bytes, setup: int) -> dict[int, bytes]:
+    """Content of the tagged blocks behind the settings, by type."""
+    blocks: dict[int, bytes] = {}
+    at = setup + struct.unpack_from("<H", header, setup + MARK_AT + 2)[0]
+    while at + 8 <= len(header):
+        length, kind, more = struct.unpack_from("<IHH", header, at)
+        if length < 8 or at + length > len(header):
+            break
+        blocks[kind] = header[at + 8 : at + length]
+        at += length
+        if not more:
+            break
+    return blocks
+
+
+def _cine_clock(
+    name: str, setup: bytes, blocks: dict[int, bytes], count: int
+) -> tuple[float | None, float | None, Floats | None, tuple[str, ...]]:
+    """Rate and exposure of capture: from the stamps of the frames where they exist, else as the camera was set."""
+    notes = []
+    length, rate = struct.unpack_from("<H", setup, MARK_AT + 2)[0], float(struct.unpack_from("<I", setup, RATE_AT)[0])
+    exposure_s = struct.unpack_from("<I", setup, SHUTTER_US_AT)[0] * 1e-6
+    if length >= SHUTTER_NS_AT + 4:
+        exposure_s = struct.unpack_from("<I", setup, SHUTTER_NS_AT)[0] * 1e-9 or exposure_s
+    times_s, stored_exposures = None, blocks.get(IMAGE_EXPOSURES, b"")
+    if len(stored_exposures) >= 4 * count:
+        exposures_s = np.frombuffer(stored_exposures, "<u4", count) * FRACTION_S
+        exposure_s = float(np.median(exposures_s)) or exposure_s
+        if np.ptp(exposures_s) > EXPOSURE_TOLERANCE * exposure_s:
+            span = f"{1e6 * exposures_s.min():.4g} to {1e6 * exposures_s.max():.4g} µs"
+            notes.append(f"{name}: the exposure changes from frame to frame, {span}: switch automatic exposure off")
+    stamps = blocks.get(IMAGE_TIMES, b"")
+    if len(stamps) >= 8 * count and count > 2:
+        pairs = np.frombuffer(stamps, "<u4", 2 * count).reshape(-1, 2).astype(np.int64)
+        # The lowest two bits flag synchronisation. Integers are subtracted: a float cannot hold both words.
+        ticks = ((pairs[:, 1] - pairs[0, 1]) << 32) + (pairs[:, 0] & ~3)
+        times_s = (ticks - ticks[0]) * FRACTION_S
+        period_s = float(np.median(np.diff(times_s)))
+        if period_s <= 0:
+            times_s = None
+        elif rate <= 0 or abs(rate * period_s - 1) > SAME_RATE:
+            if rate > 0:
+                notes.append(f"{name}: set to {rate:g} frames a second, but its frames are {1 / period_s:.6g} a second")
+            rate = 1 / period_s
+    return rate or None, exposure_s or None, times_s, tuple(notes)
+
+
+def inspect_mraw(path: Path) -> Recording:
+    """Read the side file of a Photron `.mraw`."""
+    data = next((at for at in _siblings(path, (".mraw",))), None)
+    side = path if path.suffix.lower() in SIDE_FILES else next(iter(_siblings(path, SIDE_FILES)), None)
+    if side is None:
+        raise RecordingError(
+            f"{path.name}: its .cih or .cihx is missing, which describes the pictures; put it in the same folder"
+        )
+    facts = read_side_file(side)
+    if data is None:
+        raise RecordingError(f"{path.name}: its .mraw is missing, which holds the pictures; put it in the same folder")
+    if facts.file_format.lower() != "mraw":
+        raise RecordingError(f"{side.name}: describes {facts.file_format or 'unknown'} pictures, not {data.name}")
+    if not facts.colour.lower().startswith("mono") and facts.colour:
+        raise RecordingError(f"{data.name}: colour ({facts.colour}) is not read; save it as AVI or TIFF")
+    if facts.stored_bits not in (8, 12, 16):
+        raise RecordingError(f"{data.name}: {facts.stored_bits} bits a pixel are not read; save it with 8, 12 or 16")
+    frames = RawFrames(data, (), facts.width, facts.height, facts.stored_bits)
+    if min(facts.width, facts.height, facts.n_frames) < 1 or (facts.width * facts.height * facts.stored_bits) % 8:
+        raise RecordingError(f"{side.name}: size or number of frames is missing; copy it from the camera again")
+    present = min(facts.n_frames, file_size(data) // frames.frame_bytes)
+    frames = replace(frames, offsets=range(0, present * frames.frame_bytes, frames.frame_bytes))
+    depth = facts.depth if 0 < facts.depth <= facts.stored_bits else facts.stored_bits
+    return Recording(
+        data, "raw", facts.width, facts.height, depth, facts.n_frames, facts.rate, facts.exposure_s,
+        notes=facts.notes, raw=frames,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SideFile:
+    """Content of a Photron side file: `rate` in frames a second of capture and `exposure_s`, None where not stated."""
+
+    n_frames: int
+    width: int
+    height: int
+    stored_bits: int
+    depth: int
+    file_format: str
+    colour: str
+    rate: float | None
+    exposure_s: float | None
+    notes: tuple[str, ...] = ()
+
+
+def read_side_file(path: Path) -> SideFile:
+    """Read a Photron `.cih` or `.cihx`."""
+    name = path.name
+    try:
+        file_size(path)  # refuses a pipe, on which reading would wait
+        with path.open("rb") as stream:
+            data = stream.read(LONGEST_SIDE_FILE)
+    except OSError as error:
+        raise RecordingError(f"{name}: cannot be read: {error.strerror}") from None
+    values = _cihx_values(name, data) if path.suffix.lower() == ".cihx" else _cih_values(data)
+
+    def value(key: str) -> float:
+        return _as_number(values.get(key, ""))
+
+    rate, exposure_s, notes = value("Record Rate(fps)"), value("Shutter Speed(s)"), []
+    # A number above 1 is the denominator: 20000 for 1/20000 s.
+    exposure_s = 1 / exposure_s if exposure_s > 1 else exposure_s
+    step = value("Save Step")
+    if step > 1:
+        rate /= step
+        notes.append(f"{name}: every {step:g}th frame was saved: {rate:g} frames a second of {rate * step:g}")
+    if not 0 < exposure_s * rate <= 1.0 + EXPOSURE_TOLERANCE:
+        exposure_s = 0.0
+    return SideFile(
+        int(value("Total Frame")), int(value("Image Width")), int(value("Image Height")), int(value("Color Bit")),
+        int(value("EffectiveBit Depth")), values.get("File Format", ""), values.get("Color Type", ""),
+        rate if rate > 0 else None, exposure_s or None, tuple(notes),
+    )  # fmt: skip
+
+
+def side_file_of(pictures: Path, file_format: str, size: tuple[int, int], count: int) -> SideFile | None:
+    """Find and read the side file of a TIFF stack or of a folder of pictures."""
+    if pictures.is_dir():
+        side_files = [at for at in sorted(pictures.iterdir()) if at.suffix.lower() in SIDE_FILES]
+    else:
+        side_files = _siblings(pictures, SIDE_FILES)
+    if len({at.stem for at in side_files}) != 1:
+        return None
+    facts = read_side_file(side_files[0])
+    formats = {"tif": "tiff", "jpg": "jpeg"}
+    stated = formats.get(facts.file_format.lower(), facts.file_format.lower())
+    same = (facts.width, facts.height) == size and facts.n_frames == count
+    return facts if same and stated == formats.get(file_format, file_format) else None
+
+
+def _siblings(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files of the same name with one of the suffixes, in upper or lower case."""
+    if not path.parent.is_dir():
+        return []
+    return sorted(at for at in path.parent.iterdir() if at.stem == path.stem and at.suffix.lower() in suffixes)
+
+
+def _cih_values(data: bytes) -> dict[str, str]:
+    """Values of the lines `key : value`."""
+    lines = (line.partition(":") for line in data.decode("utf-8", "replace").splitlines())
+    return {key.strip(): text.strip() for key, colon, text in reversed(list(lines)) if colon}
+
+
+def _cihx_values(name: str, data: bytes) -> dict[str, str]:
+    """The same values, by the keys of a `.cih`, from the XML within a `.cihx`."""
+    begin, end = data.find(b"<cih>"), data.rfind(b"</cih>")
+    try:
+        root = ElementTree.fromstring(data[begin : end + 6].decode("utf-8", "replace")) if begin >= 0 else None
+    except ElementTree.ParseError:
+        root = None
+    if root is None:
+        raise RecordingError(f"{name}: its XML is damaged; copy it from the camera again")
+    return {key: (root.findtext(place) or "").strip() for key, place in CIHX_PLACES.items()}
+
+
+def _as_number(text: str) -> float:
+    """The number at the beginning of a value, or a fraction such as 1/20000; 0 where there is none."""
+    match = re.match(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)(?:\s*/\s*([0-9.]+))?", text)
+    try:
+        return float(match.group(1)) / float(match.group(2) or 1) if match else 0.0
+    except (ValueError, ZeroDivisionError):
+        return 0.0
+
 
 TAG_EXPOSURE = 33434  # Defined by TIFF/EP (ISO 12234-2): exposure time
 

@@ -8,27 +8,416 @@ condition is looked into, and what it shows is compared with the sheet.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import PictureAxis, Trial
-from vinetrack.core.terminal import progress
+from vinetrack.core.terminal import progress, table
+from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
-from vinetrack.video.capture_clock import capture_exposure, capture_rate
-from vinetrack.video.curved_axis import axis_through, curve_problem
-from vinetrack.video.frames import Recording, RecordingError, inspect_recording
-from vinetrack.video.measure import given_axis
-from vinetrack.video.quick_look import look_at
-from vinetrack.video.recording_facts import RecordingFacts, size_problems
-from vinetrack.video.track import FEWEST_FRAMES
+from vinetrack.video.axis import Axis, askew_trials, slope_deg
+from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
+from vinetrack.video.curved_axis import (
+    CurvedAxis,
+    axis_entry,
+    axis_through,
+    curve_problem,
+    find_growth_axis,
+    front_share_function,
+)
+from vinetrack.video.edge import rough_growth
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.images import capture_exposure, capture_rate
+from vinetrack.video.small_pictures import SmallPictures, read_event
+from vinetrack.video.track import FEWEST_FRAMES, Tracking, locate_axis, track_frames, tube_strip
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.video.calibration import PlaneCalibration
-    from vinetrack.video.raw_frames import RawFrames
+    from vinetrack.video.frames import RawFrames
+
+
+# ------------------------------------------------------------------------------
+# Measure a recording: its track in metres by the experiment's calibration, and the error of the scale.
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A tracked recording with its scale. `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its
+    relative standard error, NaN where unknown: an error that all points share, kept apart from the random error of
+    each.
+    """
+
+    tracking: Tracking
+    m_per_px: float
+    scale_rel_sigma: float
+    calibration: PlaneCalibration | None
+    capture_fps: float
+    recording: Recording
+
+    @property
+    def growth_m(self) -> float:
+        """Distance from the first usable position to the furthest, m."""
+        position_m = self.tracking.track.lead_position_m[self.tracking.track.usable]
+        return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
+
+
+def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) -> Measurement:
+    """Decode, calibrate and track the recording of one trial."""
+    if trial.video is None:
+        raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
+    recording = inspect_recording(trial.video)
+    capture_fps = capture_rate(trial, recording)
+    calibration = calibration_of(trial, settings, folder, recording)
+    if calibration is None and not math.isfinite(trial.m_per_px):
+        raise RecordingError(
+            f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+        )
+    frames = read_event(recording, trial.frames_used)
+    m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
+    axis = given_axis(trial, settings, m_per_px)
+    along_path = None if calibration is None else calibration.along_path
+    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, along_path=along_path)
+    rel_sigma = math.nan
+    if calibration is not None:
+        bent = isinstance(tracking.axis, CurvedAxis) and math.isfinite(tracking.tube_width_sigma_px)
+        along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
+        m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
+    notes = [*tracking.track.notes]
+    # Notes on a scale that was merely given belong to the experiment, not to each of its trials.
+    if calibration is not None and math.isfinite(calibration.reprojection_px):
+        notes += calibration.notes
+    tracking = replace(tracking, track=replace(tracking.track, notes=tuple(notes)))
+    return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
+
+
+def calibration_of(
+    trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
+) -> PlaneCalibration | None:
+    """The calibration of the experiment; None where the trial has its own scale or there is no calibration."""
+    if math.isfinite(trial.m_per_px) or settings.calibration is None:
+        return None
+    try:
+        return calibrate(settings.calibration, folder, recording.width, recording.height)
+    except CalibrationError as error:
+        raise RecordingError(f"calibration: {error}") from error
+
+
+def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+    """Return the growth axis of the sheet, else of the settings."""
+    if trial.axis is not None:
+        axis = trial.axis
+        return axis_through((axis.from_px, *axis.via_px, axis.to_px), axis.width_m / m_per_px)
+    if settings.axis is None:
+        return None
+    shared = settings.axis
+    width_px = shared.width_mm / 1e3 / m_per_px if shared.width_mm is not None else math.nan
+    return axis_through((shared.from_px, *(shared.via_px or ()), shared.to_px), width_px)
+
+
+# ------------------------------------------------------------------------------
+# Look into a recording before any work: axis, width of the tube and growth, from about a hundred of its frames.
+#
+# It takes a second a recording and fits no edge: the widths agree with those of the tracker, growth is known to some
+# per
+# cent.
+
+FRAMES_LOOKED_AT = 100  # Frames of a recording that are looked at (chosen)
+MOST_BYTES = 200_000_000  # Memory for those frames (chosen)
+MOST_DECODED = 4000  # Most frames that are decoded, some three seconds' work (chosen)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a quick look shows; NaN where not seen. `growth_px` is NaN as well where the recording is longer than what
+    was looked at; `px_per_frame` is the mean speed over the middle of the growth.
+    """
+
+    axis: Axis | None = None
+    tube_width_px: float = math.nan
+    tube_width_sigma_px: float = math.nan
+    growth_px: float = math.nan
+    px_per_frame: float = math.nan
+
+
+def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | None) -> Look:
+    """Look for the axis, the width of the tube and its growth. The sheet's diameter is not used: what it will be
+    compared with must not depend on it.
+    """
+    most = int(np.clip(MOST_BYTES // (recording.width * recording.height), FRAMES_LOOKED_AT // 4, FRAMES_LOOKED_AT))
+    every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
+    luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
+    try:
+        located, front_share_of = locate_axis(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        outlined = tube_strip(luma, located, front_share_of) if trial.travel_ratio == 2 else None
+        if outlined is None:
+            return Look(located)
+        strip, tube = outlined
+        growth_px, px_per_frame = rough_growth(strip)
+    except (RecordingError, ValueError):
+        return Look()
+    whole = count is None or count <= MOST_DECODED
+    return Look(strip.axis, tube.width_px, tube.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every)
+
+
+def proposed_axis(luma: NDArray[Any]) -> Axis:
+    """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once. Shapes:
+    luma (n_frames, height, width).
+    """
+    small = SmallPictures(luma)
+    axis = find_growth_axis(small, luma)
+    try:
+        outlined = tube_strip(luma, axis, front_share_function(small, luma))
+    except ValueError:
+        return axis
+    return axis if outlined is None else outlined[0].axis
+
+
+# ------------------------------------------------------------------------------
+# Facts of a recording, and whether they agree with the sheet.
+#
+# A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
+# as
+# physics. `vinetrack.video.survey` measures width and growth before any work; the tracker measures them better.
+
+WIDTH_TOLERANCE = 0.08  # Relative difference of width and diameter that is allowed beyond the stated error (measured)
+# Relative excess of growth over length that is allowed, with growth from the tracker (True) or a quick look (measured)
+GROWTH_TOLERANCE = {True: 0.06, False: 0.12}
+EXPOSURE_TOLERANCE_PX = 3.0  # Difference of the blur lengths of stated and seen exposure that is allowed (measured)
+ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
+SIGMAS = 3.0  # Standard errors of the width that are allowed for
+# Difference of logarithms within which width and growth are off by the same factor (chosen)
+SAME_FACTOR_LOG = 0.1
+# Angle, in degrees, between growth and the picture's rows above which growth runs up or down (chosen)
+STEEP_DEG = 60.0
+OR_SKIP_COMPARISON = "or write compare_sizes: no where only part of the tube is seen"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingFacts:
+    """Facts of one recording; NaN (None) where not known. `tracked` says whether width and growth come from the tracker
+    or from a quick look; `picture_mm` is the width of the picture; `mean_speed_m_s` is that of the leading edge over
+    the middle of its growth.
+    """
+
+    trial: str
+    n_frames: int | None
+    capture_fps: float
+    playback_fps: float | None
+    mm_per_px: float
+    scale_rel_sigma: float = math.nan
+    picture_mm: float
+    axis: Axis | None
+    tube_width_mm: float = math.nan
+    tube_width_sigma_mm: float = math.nan
+    growth_mm: float = math.nan
+    mean_speed_m_s: float = math.nan
+    tracked: bool = False
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first frame to the last."""
+        return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
+
+
+def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
+    """Facts of a recording that was tracked."""
+    tracking = measurement.tracking
+    mm_per_px = 1e3 * measurement.m_per_px
+    return RecordingFacts(
+        trial=trial.name,
+        n_frames=len(tracking.track.time_s),
+        capture_fps=measurement.capture_fps,
+        playback_fps=measurement.recording.playback_fps,
+        mm_per_px=mm_per_px,
+        scale_rel_sigma=measurement.scale_rel_sigma,
+        picture_mm=mm_per_px * measurement.recording.width,
+        axis=tracking.axis,
+        tube_width_mm=mm_per_px * tracking.tube_width_px,
+        tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
+        growth_mm=1e3 * measurement.growth_m,
+        tracked=True,
+    )
+
+
+def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
+    """List the sizes in the picture that contradict the sheet: warnings, or errors beyond a factor of ERROR_FACTOR. A
+    body that moves as a whole has no tube; `compare_sizes: no` in the sheet skips the comparison.
+    """
+    if trial.travel_ratio == 1 or not trial.compare_sizes:
+        return []
+    diameter_mm, length_mm = 1e3 * trial.diameter_m, 1e3 * trial.length_m
+    width, growth = facts.tube_width_mm / diameter_mm, facts.growth_mm / length_mm
+    sigma = math.hypot(facts.tube_width_sigma_mm / diameter_mm, float(np.nan_to_num(facts.scale_rel_sigma)))
+    width_off = abs(width - 1) > WIDTH_TOLERANCE + SIGMAS * sigma
+    growth_too_long = growth > 1 + GROWTH_TOLERANCE[facts.tracked]
+    width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
+    growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
+    remedy = f"check it, its unit and the scale, {OR_SKIP_COMPARISON}"
+    if width_off and _near_one(facts.tube_width_mm / length_mm) and _near_one(facts.growth_mm / diameter_mm):
+        remedy = "diameter_mm and length_mm are swapped"
+    elif width_off and growth > 0 and abs(math.log(width / growth)) < SAME_FACTOR_LOG:
+        both = f"{width_text}, and {growth_text} ({length_mm:g} in the sheet)"
+        return [_problem("diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
+    problems = [_problem("diameter_mm", diameter_mm, width_text, width, remedy)] if width_off else []
+    return [*problems, *([_problem("length_mm", length_mm, growth_text, growth, remedy)] if growth_too_long else [])]
+
+
+def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
+    """Report a stated exposure that the blur of the moving edge contradicts. It is a warning beyond
+    EXPOSURE_TOLERANCE_PX, and an error beyond twice that.
+    """
+    stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
+    difference_px = abs(stated - seen) * tracking.fast_px_per_frame
+    if not (
+        difference_px > EXPOSURE_TOLERANCE_PX
+        and max(stated / seen, seen / stated) > ERROR_FACTOR
+        and trial.exposure_s > 0
+    ):
+        return []
+    stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
+    message = (
+        f"differs: the edge is blurred as by {number(seen_us, 2)} µs, a factor {_factor(stated / seen)}, where it "
+        f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
+    )
+    severity = "error" if difference_px > 2 * EXPOSURE_TOLERANCE_PX else "warning"
+    remedy = "check exposure_us, its unit and capture_fps"
+    return [
+        Problem(
+            message=message,
+            severity=severity,
+            column="exposure_us",
+            value=f"{stated_us:g}",
+            remedy=remedy,
+            of_a_measurement=True,
+        )
+    ]
+
+
+def _near_one(ratio: float) -> bool:
+    """Whether a ratio is 1 to within 0.2."""
+    return abs(ratio - 1) < 0.2
+
+
+def _factor(ratio: float) -> str:
+    """The larger of a ratio and its inverse, in words."""
+    return f"{max(ratio, 1 / ratio):.3g}"
+
+
+def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
+    """The problem of a stated size, an error beyond ERROR_FACTOR."""
+    severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
+    return Problem(
+        message=f"differs: {seen}",
+        severity=severity,
+        column=column,
+        value=f"{stated_mm:g}",
+        remedy=remedy,
+        of_a_measurement=True,
+    )
+
+
+def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
+    """Note where growth in the picture runs in another direction than in the sheet; no fault, since cameras are turned.
+    That is a vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as
+    straight down and that runs level.
+    """
+    upright, level = [], []
+    for fact, trial in zip(facts, trials, strict=True):
+        if fact.axis is None or isinstance(fact.axis, CurvedAxis) or trial.travel_ratio == 1:
+            continue
+        right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
+        slope_deg = math.degrees(math.atan2(down, right))
+        from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
+        upright += [trial.name] if slope_deg > STEEP_DEG and from_level_deg < 90 - STEEP_DEG else []
+        level += [trial.name] if slope_deg < 90 - STEEP_DEG and trial.name in blank else []
+    findings = (
+        (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
+        (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
+    )
+    return [
+        f"growth runs {way} in the picture ({_named(names)}) and {remark}" for names, way, remark in findings if names
+    ]
+
+
+def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
+    """Name recordings whose axis was found askew to that of most others that grow at the same angle. Something else
+    that moves, such as a door as long as the growth, was then taken for the tube.
+    """
+    axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
+    slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
+    return [
+        f"a growth axis other than that of {n_agreeing} recordings was found ({_named(names)}): where one camera "
+        "filmed them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those "
+        "(column `axis`)"
+        for names, n_agreeing in askew_trials(slopes_deg, trials)
+    ]
+
+
+def _named(names: list[str]) -> str:
+    """One name, or how many recordings and the first of them."""
+    return names[0] if len(names) == 1 else f"{len(names)} recordings, {names[0]} first"
+
+
+def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
+    """Lay out a table for the terminal, a line a recording, with sizes in the picture next to those of the sheet.
+    `down` is the growth angle from straight down as the sheet states it: no picture shows it.
+    """
+    rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
+    head = (
+        "recording",
+        "frames",
+        "rate",
+        "plays",
+        "lasts",
+        "scale",
+        "picture",
+        "axis",
+        "down",
+        "tube",
+        "sheet",
+        "growth",
+        "sheet",
+    )
+    units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "°", "mm", "mm", "mm", "mm")
+    return table(rows, head, units, align="<>>>>>><>>>>>")
+
+
+def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
+    """Convert the facts of a recording to a JSON mapping. Returns mapping; units are in the keys."""
+    entry = {key: value for key, value in vars(facts).items() if key != "axis"}
+    axis = None if facts.axis is None else axis_entry(facts.axis)
+    return entry | {"duration_s": facts.duration_s, "axis": axis}
+
+
+def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
+    """Cells of one recording's row."""
+    axis = "–"
+    if facts.axis is not None:
+        ends = (*facts.axis.from_px, *facts.axis.to_px)
+        axis = "{},{} → {},{}".format(*(round(end) for end in ends))
+    return (
+        facts.trial,
+        "–" if facts.n_frames is None else str(facts.n_frames),
+        f"{facts.capture_fps:g}",
+        "–" if facts.playback_fps is None else f"{facts.playback_fps:.4g}",
+        number(facts.duration_s),
+        number(facts.mm_per_px, 4),
+        number(facts.picture_mm),
+        axis,
+        f"{math.degrees(trial.growth_angle_rad):g}",
+        number(facts.tube_width_mm),
+        number(1e3 * trial.diameter_m),
+        number(facts.growth_mm),
+        number(1e3 * trial.length_m),
+    )
+
 
 SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000  # Largest file without an index that is read to its end to count its frames (chosen)

@@ -12,24 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, FrontShare, centred_on_motion, find_axis
-from vinetrack.video.capture_clock import capture_exposure, capture_rate
-from vinetrack.video.curve_search import find_growth_axis
-from vinetrack.video.curved_axis import CurvedAxis
-from vinetrack.video.curved_strip import (
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, FrontShare, centred_on_motion, find_axis
+from vinetrack.video.calibration import corrected_by_hand
+from vinetrack.video.curved_axis import (
+    CENTRED_PX,
+    CurvedAxis,
     check_curve,
     curve_note,
+    cut_along,
+    find_growth_axis,
     front_share_function,
     front_share_on_curve,
+    outline_stretches,
     path_error_px,
+    recentred_curve,
     shake_along,
 )
-from vinetrack.video.event_frames import read_event
-from vinetrack.video.follow import Positions, follow
+from vinetrack.video.edge import Outline, outline
+from vinetrack.video.edge_repair import ARRIVAL_PX, SLOW_PX
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
-from vinetrack.video.hand_corrections import corrected_by_hand
-from vinetrack.video.motion_end import body_end_note, growth_end_notes, is_grown, truncation_notes
+from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.point_quality import (
     FLOOR_PX,
     LARGEST_BODY_FACTOR,
@@ -37,14 +40,211 @@ from vinetrack.video.point_quality import (
     LOST_SIGMA_PX,
     PointQuality,
     assess_points,
+    body_end_note,
     calibrated_sigma,
+    growth_end_notes,
+    is_grown,
+    truncation_notes,
 )
-from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.sound_frames import sound_stretch
-from vinetrack.video.strip import Strip
+from vinetrack.video.small_pictures import SmallPictures, read_event
+from vinetrack.video.strip import Strip, recut, snap_to_grid
 
 if TYPE_CHECKING:
+    from vinetrack.video.body import BodyEnd
     from vinetrack.video.calibration import AxisScale
+    from vinetrack.video.edge import EdgeFit
+
+
+# ------------------------------------------------------------------------------
+# Cut the strip about a tube, centred on what its front left behind; decide whether a tube lies along the axis.
+
+MOST_RECUTS = 3  # Most times that the strip is cut anew: what lay outside the first shows only in the second (chosen)
+# Part of its width by which an axis may slope over its length for the first strip to be cut along whole rows or columns
+# (chosen)
+FIRST_SLOPE = 0.08
+OFF_CENTRE_PX = 0.8  # Tilt of the axis over its length, or shift, that is left uncorrected (chosen)
+
+
+def tube_strip(luma: NDArray[Any], axis: Axis, front_share_of: FrontShare) -> tuple[Strip, Outline] | None:
+    """Cut the strip about the tube that grows along an axis. An outline is found for anything that changes in order.
+    Where that is no tube, the outline is arbitrary and no front passes along its middle, which the front share along
+    the middle shows. Returns the strip, centred on the tube, and the tube's outline in it; None where no single front
+    passes along the axis, or, none along the middle of what it leaves behind.. Shapes: luma (n_frames, height, width).
+    """
+    if front_share_of(axis) < LEAST_FRONT_SHARE:
+        return None
+    strip = first = cut_along(luma, snap_to_grid(axis, FIRST_SLOPE * axis.width_px), 0.65 * axis.width_px + 3)
+    tube = outline(strip, outline_stretches(axis))
+    try:
+        for _ in range(2 * MOST_RECUTS if axis.bends else MOST_RECUTS):
+            before, strip = strip, recentred_strip(luma, strip, tube)
+            if strip is before:
+                break
+            tube = outline(strip, outline_stretches(axis))
+        off_tube = strip is not first and front_share_of(strip.axis) < LEAST_FRONT_SHARE
+    except (RecordingError, ValueError):
+        return None
+    return None if off_tube else (strip, tube)
+
+
+def recentred_strip(luma: NDArray[Any], strip: Strip, tube: Outline) -> Strip:
+    """Cut the strip anew about the tube's centreline; the same strip where it is centred already. The ends of a given
+    axis keep their places along it: only the position across is corrected. Shapes: luma (n_frames, height, width).
+    """
+    shift, slope, half = tube.shift_px, tube.slope, tube.half_px
+    room = (strip.values.shape[1] - 1) / 2 - half - 3
+    if isinstance(strip.axis, CurvedAxis):
+        curve, distance = recentred_curve(strip.axis, tube)
+        if distance < CENTRED_PX and 0 <= room < 0.3 * half + 6:
+            return strip
+        return cut_along(luma, curve, half * 1.15 + 5, strip)
+    tilt = slope * strip.axis.length_px
+    middle = shift + tilt / 2
+    if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
+        return strip
+    start = strip.axis.points(np.array(0.0), shift)
+    stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
+    turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
+    return recut(strip, luma, snap_to_grid(turned), half * 1.15 + 5)
+
+
+# ------------------------------------------------------------------------------
+# Follow what moves along an axis, by frame: the edge of a tube, a body, or else the arrival of whatever comes.
+
+DISAGREEMENT_PX = 1.0  # Disagreement of bands above which some band follows something other than the edge (chosen)
+LARGEST_AMPLITUDE = 1.5  # Amplitude (relative contrast) above which something adds to the edge (chosen)
+# A frame whose misfit is this many times the median one, taken as at least LEAST_MISFIT, is doubtful (chosen)
+MISFIT_RATIO, LEAST_MISFIT = 6.0, 0.3
+# A point with a larger standard error, and one this many times the median, is doubtful (chosen)
+UNCERTAIN_PX, UNCERTAIN_RATIO = 1.0, 5.0
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Positions along the axis by frame, px, from any of the trackers; arrays of shape (n_frames,)."""
+
+    edge_px: Floats
+    sigma_px: Floats
+    unsure: Bools
+    blur_px: float
+    exposure_frames: float
+    reach_px: float
+    extra_sigma_px: Floats | float = 0.0
+    bands_sigma_px: Floats | float = 0.0
+    slow_px: Floats | float = SLOW_PX
+    end: BodyEnd | None = None
+    width_px: tuple[float, float] = (math.nan, math.nan)
+    seen_exposure: tuple[float, float] = (math.nan, math.nan)
+    is_edge: bool = True
+
+
+def follow(
+    luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, front_share_of: FrontShare
+) -> tuple[Strip, Positions]:
+    """Follow a body (travel ratio 1) or the edge of a tube; where there is no tube, the arrival of whatever comes.
+    Returns the strip, centred on what moves along the axis, and the positions along it. Shapes: luma (n_frames, height,
+    width).
+    """
+    try:
+        if trial.travel_ratio == 1:
+            return _body(luma, axis, exposure_frames)
+        return _edge(luma, axis, exposure_frames, front_share_of) or _arrival(luma, axis, exposure_frames)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+
+
+def _body(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
+    """Register a body against itself."""
+    from vinetrack.video.body import track_body
+
+    strip = cut_along(luma, axis, 0.75 * axis.width_px + 12)
+    fit = track_body(strip)
+    position_px = np.where(fit.unseen, np.nan, fit.position_px)
+    return strip, Positions(
+        position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end
+    )  # fmt: skip
+
+
+def _edge(
+    luma: NDArray[Any], axis: Axis, exposure_frames: float, front_share_of: FrontShare
+) -> tuple[Strip, Positions] | None:
+    """Track the edge of a tube; None where there is no tube along the axis."""
+    from vinetrack.video.edge import track_edge
+
+    outlined = tube_strip(luma, axis, front_share_of)
+    if outlined is None:
+        return None
+    strip, tube = outlined
+    fit = track_edge(strip, exposure_frames, sides=tube)
+    reach = 3 * fit.blur_px + 1
+    return strip, Positions(
+        fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames, reach,
+        fit.extra_sigma_px, fit.bands_sigma_px, fit.slow_px, width_px=(tube.width_px, tube.width_sigma_px),
+        seen_exposure=(fit.seen_exposure_frames, fit.fast_px_per_frame),
+    )  # fmt: skip
+
+
+def _arrival(luma: NDArray[Any], axis: Axis, exposure_frames: float) -> tuple[Strip, Positions]:
+    """Follow the arrival of whatever comes along the axis, of any width and direction, to about a pixel."""
+    from vinetrack.video.kymograph import track_arrival
+
+    strip = cut_along(luma, axis, min(4 * axis.width_px, 0.3 * max(luma.shape[1:])))
+    edge, sigma = track_arrival(strip)
+    unsure = np.zeros(len(edge), dtype=bool)
+    return strip, Positions(edge, sigma, unsure, 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX, is_edge=False)
+
+
+def _unsure(fit: EdgeFit) -> Bools:
+    """Frames in which the fit of the edge is poor: odd contrast, large misfit, disagreeing bands, hidden, uncertain."""
+    from vinetrack.video.edge_repair import LEAST_AMPLITUDE
+
+    median_misfit = float(np.nanmedian(fit.misfit))
+    poor = (fit.amplitude < LEAST_AMPLITUDE) | (fit.amplitude > LARGEST_AMPLITUDE)
+    poor = poor | (fit.misfit > MISFIT_RATIO * max(median_misfit, LEAST_MISFIT))
+    poor |= (fit.extra_sigma_px > DISAGREEMENT_PX) | fit.hidden
+    uncertain = fit.sigma_px > np.maximum(UNCERTAIN_PX, UNCERTAIN_RATIO * np.nanmedian(fit.sigma_px))
+    return np.asarray(poor | uncertain)
+
+
+# ------------------------------------------------------------------------------
+# Select the frames of a damaged recording that are tracked: the longest undamaged stretch.
+#
+# What a decoder makes of a damaged frame looks like a picture and may be tracked, with small stated errors, to a wrong
+# place; so may the frames after a hole in the motion. Neither is used until a person has placed the edge of such a
+# frame
+# (`corrections.csv`).
+
+LONGEST_HOLE = 1  # Most frames missing in a row that the tracker bridges (measured)
+MOST_DROPPED = 3  # Most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
+LEAST_PART = 0.5  # Least part of the frames that must follow each other without damage (measured)
+
+
+def sound_stretch(frames: Frames, allowed: Bools) -> Bools:
+    """Frames to be tracked: all that are allowed where none is damaged, else the longest stretch without damage.
+    Shapes: allowed (n_frames,) → (n_frames,).
+    """
+    damaged = frames.damaged & allowed
+    # Lost frames, within the recording or at its end, count as damage.
+    span = 1 + int(np.ptp(frames.slot[allowed]))
+    if allowed.all():
+        span = max(span, (frames.recording.declared_frames or 0) - len(frames.slots_before) - len(frames.slots_after))
+    complete = span < allowed.sum() / LEAST_PART
+    if complete and not damaged.any() and np.max(np.diff(frames.slot[allowed]), initial=1) <= MOST_DROPPED + 1:
+        return allowed
+    sound = np.flatnonzero(allowed & ~damaged)
+    breaks = np.flatnonzero(np.diff(frames.slot[sound]) > LONGEST_HOLE + 1) + 1
+    longest = max(np.split(sound, breaks), key=len)
+    if len(longest) < LEAST_PART * span:
+        where = f", {longest[0]} to {longest[-1]}," if len(longest) else ""
+        count = int(damaged.sum())
+        problem = f"{count} of {int(allowed.sum())} frames are damaged" if count else "frames are missing"
+        raise RecordingError(
+            f"{frames.recording.path.name}: {problem} and only {len(longest)}{where} follow each other without damage: "
+            "copy it from the camera again, or name sound ones in frames_used"
+        )
+    mask = np.zeros(len(frames), dtype=bool)
+    mask[longest] = True
+    return mask
 
 
 FEWEST_FRAMES = 5  # Fewest frames that can be tracked (derived)

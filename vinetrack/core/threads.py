@@ -1,0 +1,84 @@
+"""Compiled loops over frames, rows or pixels in several threads; no result depends on their number."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import ParamSpec, TypeVar
+
+# ------------------------------------------------------------------------------
+# Cores of a process, and its pool of threads for compiled code that releases Python's lock.
+
+
+@lru_cache
+def available_cores() -> int:
+    """Number of cores that this process may use, determined once."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # no affinity on macOS and Windows
+        return os.cpu_count() or 1
+
+
+def thread_pool(threads: int) -> ThreadPoolExecutor:
+    """Thread pool of this process; a forked process gets its own."""
+    return _pool(os.getpid(), threads)
+
+
+@lru_cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    return ThreadPoolExecutor(threads)
+
+
+# ------------------------------------------------------------------------------
+# Linear algebra in one thread.
+#
+# The matrices of a fit have ten to a few hundred rows: too few to be shared out. A library that does so nevertheless
+# keeps threads waiting for each other, which costs processor time, and far more of it where other work runs beside.
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def in_one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function so that linear algebra in it uses one thread; afterwards as many as before."""
+
+    @functools.wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
+
+
+Part = TypeVar("Part")
+
+MOST_THREADS = 4  # Most threads of one recording (chosen)
+FEWEST_PICTURES = 16  # Fewest pictures for which another thread is used (chosen)
+
+
+def n_threads() -> int:
+    """Number of threads that the tracking of a recording may use. It is 1 in a worker process, beside which others
+    track other recordings, and at most OMP_NUM_THREADS where that is set: the workflow sets it to 1 for every
+    recording, since it tracks as many at a time as there are cores.
+    """
+    if multiprocessing.parent_process() is not None:
+        return 1
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    limit = int(stated) if stated.isdigit() and int(stated) > 0 else MOST_THREADS
+    return min(available_cores(), limit, MOST_THREADS)
+
+
+def in_parts(work: Callable[[int, int], Part], count: int, least: int) -> list[Part]:
+    """Call `work(first, one behind the last)` for consecutive parts of a range, side by side."""
+    threads = 1 if count < 2 * least else min(n_threads(), count // least)
+    if threads == 1:
+        return [work(0, count)]
+    cuts = [count * k // threads for k in range(threads + 1)]
+    others = [thread_pool(MOST_THREADS - 1).submit(work, cuts[k], cuts[k + 1]) for k in range(1, threads)]
+    return [work(0, cuts[1]), *(other.result() for other in others)]
