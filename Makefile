@@ -1,13 +1,13 @@
 # What each target does: `make help`. Everything happens in .venv; nothing else on the machine is touched.
 .DEFAULT_GOAL := help
-.PHONY: help venv demo guide test lint docs
+.PHONY: help venv demo guide test test-all lint docs
 
 BIN := .venv/bin
 STAMP := .venv/installed
 CORES ?= 2
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-6s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
 
 venv: $(STAMP)  ## .venv with the locked version of everything, extras included
 
@@ -19,8 +19,13 @@ guide: demo  ## outputs and pictures of the docs, printed and drawn anew from th
 
 # Told to keep no compiled modules, each process that tests start would compile the package anew. One thread of linear
 # algebra in each of as many processes as there are cores: more would wait for each other.
-test: $(STAMP)  ## all tests
-	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist worksteal
+TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist worksteal
+
+test: $(STAMP)  ## the tests of every day
+	$(TESTS) -m "not slow"
+
+test-all: $(STAMP)  ## all tests, with the slow ones: browsers, killed runs, whole experiments
+	$(TESTS)
 
 lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .

@@ -32,10 +32,7 @@ from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted, 
 from vinetrack.effects import Effect, State, TrialInputs
 
 # Files of the integrator, which are part of the compiled form of a model
-PARTS = (
-    *("equations.py", "radau.py", "slack_tail.py", "between_frames.py", "row_readout.py", "time_average.py"),
-    "integrator.py",
-)
+PARTS = ("equations.py", "integrator.py")
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
