@@ -1,34 +1,22 @@
-"""Further trials where nothing is found, or where one name needs more evidence."""
+"""Further trials where nothing is found."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.explorer_campaign import SMALL, make_experiment
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
-from vinetrack.diagnosis.further_trials import (
-    DesignInformation,
-    InformativeTrials,
-    confirming_trials,
-    exploratory_trials,
-)
+from vinetrack.diagnosis.further_trials import InformativeTrials, _alone_and_distinct, exploratory_trials
 from vinetrack.diagnosis.linear_power import effect_power, power_of
 from vinetrack.diagnosis.power import Power
-from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.diagnosis.stopping import GO_ON, CampaignLook
 from vinetrack.experiment.settings import Limits
 from vinetrack.narrative.power_text import informative_text
-from vinetrack.pipeline.power_stage import recommended_trials
 from vinetrack.planning.campaign_information import FilmingPlan
-from vinetrack.planning.discriminating_design import feasible_conditions
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), payload_g=(0.0, 0.0), inlet_mm=(5.5, 8.0), chamber_l=(3.7,), trials=4)
 NAMES = ("inlet_loss", "linear_damping", "leak")
@@ -97,41 +85,11 @@ def test_what_is_recommended_reveals_more_than_repeats_do(design: CampaignDesign
     assert "inlet loss from K = " in informative_text(plan)
 
 
-def test_trials_that_confirm_a_name_are_the_best_pairs_of_all(design: CampaignDesign, power: Power) -> None:
-    found = confirming_trials(design, power, "inlet_loss", "linear_damping", LIMITS)
-    assert found is not None
-    information = DesignInformation(
-        design, feasible_conditions(design.trials, LIMITS.model_copy(update={"new_vines": False})),
-        ("inlet_loss", "linear_damping"),
-    )  # fmt: skip
-
-    def apart(chosen: tuple[int, ...]) -> float:
-        (a, b), (_, c) = information.information_of(information.total(chosen)[None])[0]
-        return float(a - b**2 / c)
-
-    settings = [(c.trial.pressure_Pa / 1e3, 1e3 * c.trial.inlet_m) for c in information.conditions]
-    chosen = [
-        next(k for k, at in enumerate(settings) if at == pytest.approx((t["pressure_kPa"], t["inlet_mm"]), rel=1e-3))
-        for t in found.trials
-        for _ in range(t["replicates"] // 2)
-    ]
-    pairs = itertools.combinations_with_replacement(range(len(settings)), 2)
-    assert apart(tuple(chosen)) == pytest.approx(max(apart(pair) for pair in pairs), rel=0.01)
-    text = informative_text(found, "inlet_loss", "linear_damping")
-    assert "tell most about inlet loss apart from linear damping" in text
-    assert text.count("K = ") == 1
-
-
 def test_nothing_is_recommended_where_nothing_can_be_made(design: CampaignDesign, power: Power) -> None:
     assert exploratory_trials(design, power, Limits(pressure_kPa=(1.0, 2.0), payload_g=(0.0, 0.0))) is None
-    assert confirming_trials(design, power, "air_drag", "", LIMITS) is None
 
 
-def test_a_campaign_in_which_nothing_is_found_is_told_which_trials_to_make(tmp_path: Path) -> None:
-    settings = "capture_fps: 1069\nyield_pressure_kPa: 3\nchamber_l: 2\ncandidates: [leak, tail_friction]\n"
-    settings += "limits: {pressure_kPa: 24:60, payload_g: 0:20, trials: 2}\n"
-    folder = make_experiment(tmp_path / "experiment", SMALL, settings)
-    look = CampaignLook(6, ADEQUATE, (), math.nan, "", 5.0, GO_ON, "nothing is found")
-    text = recommended_trials(folder, None, look)
-    assert text.startswith("Make 2 trials at ")
-    assert "reveal most of what could be missing" in text
+def test_information_apart_from_the_most_similar_rival() -> None:
+    alone, apart = _alone_and_distinct(np.array([[[4.0, 2.0, 1.0], [2.0, 5.0, 0.0], [1.0, 0.0, 0.5]]]))
+    assert alone.tolist() == [[4.0, 5.0, 0.5]]
+    assert apart[0] == pytest.approx([4 - 1 / 0.5, 5 - 4 / 4, 0.5 - 1 / 4])

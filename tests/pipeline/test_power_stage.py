@@ -1,12 +1,9 @@
-"""`vinetrack power` on a sheet that nobody has filmed, and answers that an earlier run has kept."""
+"""`vinetrack power` on a sheet that nobody has filmed."""
 
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -15,10 +12,9 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
-from vinetrack.diagnosis.null_calibration import TESTS, CampaignPValues
 from vinetrack.figures.registry import draw
 from vinetrack.pipeline import power_stage
-from vinetrack.pipeline.power_stage import PowerRequest, fingerprint, power_of_target, stored_answers
+from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
 SHEET = (
     "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -83,29 +79,6 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
 
 
-def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked_for: list[int] = []
-
-    def chances(design: CampaignDesign, seed: int) -> CampaignPValues:  # noqa: ARG001
-        asked_for.append(seed)
-        return CampaignPValues(seed, dict.fromkeys(TESTS, 0.1 * (seed + 1)))
-
-    monkeypatch.setattr(power_stage, "null_p_values", chances)
-    monkeypatch.setattr(power_stage, "fingerprint", lambda _: "design")
-    how = power_stage.Simulation(2, 0, 1, tmp_path / "chances.csv")
-    design: Any = None
-    first = power_stage.simulate_null_tests(design, how)
-    again = power_stage.simulate_null_tests(design, replace(how, campaigns=3))
-    assert asked_for == [0, 1, 2]
-    assert again[:2] == first
-    assert again[2].p_values["any smooth force"] == pytest.approx(0.3)
-
-
-def test_a_sheet_that_nobody_has_filmed_cannot_be_calibrated(folder: Path) -> None:
-    with pytest.raises(ExperimentError, match="needs measured trials"):
-        power_of_target(PowerRequest(folder, calibrate=3))
-
-
 def test_trials_to_add_need_a_size(folder: Path) -> None:
     with pytest.raises(ExperimentError, match="needs a size"):
         power_of_target(PowerRequest(folder, ("leak",), reach=0.9))
@@ -116,7 +89,7 @@ def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:
         power_of_target(PowerRequest(folder, ("leek",)))
 
 
-def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[tuple[str, int]] = []
 
     def answered(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedDiagnosis:  # noqa: ARG001
@@ -125,48 +98,19 @@ def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monk
         return SimulatedDiagnosis(effect, value, seed, verdict, names, (), 1.0)
 
     monkeypatch.setattr(power_stage, "simulated_diagnosis", answered)
-    asked = PowerRequest(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
-    first = power_of_target(asked)
-    assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]
-    asked_for.clear()
-    again = power_of_target(replace(asked, simulate=3))
-    assert sorted(asked_for) == [("", 3), ("leak", 3)]
-    nothing, leak = again.simulated
+    nothing, leak = power_of_target(PowerRequest(folder, ("leak=0.01",), simulate=3)).simulated
+    assert asked_for == [("", 1), ("", 2), ("", 3), ("leak", 1), ("leak", 2), ("leak", 3)]
     assert (nothing.alarms.count, nothing.alarms.campaigns) == (0, 3)
     assert (leak.detections.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
-    assert first.simulated[1].detections.campaigns == 2
 
 
-def test_answers_about_another_design_are_passed_over(tmp_path: Path) -> None:
-    path = tmp_path / "answers.csv"
-    path.write_text(
-        "design,effect,value,seed,verdict,answer_set,effects,seconds,failed\n"
-        "abc,,,1,adequate,,,1.0,\nabc,leak,0.5,1,ambiguous,leak|air_drag,,2.0,\nother,,,1,missing,leak,leak,1.0,\nabc,le"
-    )
-    null, leak = stored_answers(path, "abc")
-    assert (null.effect, math.isnan(null.value), null.answer_set) == ("", True, ())
-    assert (leak.value, leak.answer_set, leak.is_found) == (0.5, ("leak", "air_drag"), True)
-
-
-def test_a_fingerprint_changes_with_the_scatter(folder: Path) -> None:
-    from vinetrack.experiment.planned import planned_sheet
-    from vinetrack.planning.campaign_information import FilmingPlan
-
-    trials = planned_sheet(folder, every_row=True).trials
-    assert [trial.name for trial in trials] == ["a1", "a2", "b1", "b2"]
-    import vinetrack as vt
-
-    count = len(trials)
-    design = CampaignDesign(
-        vt.base_model(),
-        trials,
-        (FilmingPlan(500.0, 1e-4),) * count,
-        (0.01, 0.03),
-        (math.nan,) * count,
-        (False,) * count,
-    )
-    assert fingerprint(design) == fingerprint(replace(design))
-    assert fingerprint(design) != fingerprint(replace(design, spreads=(0.01, 0.02)))
+def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> None:
+    (tmp_path / "trials.csv").write_text(SHEET)
+    (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, trials: 2}\n")
+    power = power_of_target(PowerRequest(tmp_path, recommend=True))
+    assert power.recommended is not None
+    assert sum(trial["replicates"] for trial in power.to_json()["recommended_trials"]) == 2
+    assert power.recommended.then["leak"].size_at(0.9) < power["leak"].size_at(0.9)
 
 
 def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli.campaign_commands import register as register_campaign
 from vinetrack.cli.command_frame import (
     MORE,
     ExperimentPath,
@@ -189,7 +188,6 @@ def _overlays(
 
 register_diagnose(app)
 register_power(app)
-register_campaign(app)
 register_design(app)
 
 

@@ -71,28 +71,23 @@ def _power(
     ] = None,
     simulate: Annotated[
         int,
-        typer.Option("--simulate", min=0, max=100_000, rich_help_panel=SIMULATION,
+        typer.Option("--simulate", min=0, max=1000, rich_help_panel=SIMULATION,
                      help="Campaigns to simulate and diagnose: without any effect, and with each --effect."),
-    ] = 0,
-    calibrate: Annotated[
-        int,
-        typer.Option("--calibrate", min=0, max=100_000, rich_help_panel=SIMULATION,
-                     help="Simulated null campaigns with which the tests of a verdict are calibrated."),
     ] = 0,
     jobs: Annotated[int, typer.Option("--jobs", min=1, rich_help_panel=SIMULATION, help="Processes.")] = 2,
     seed: Annotated[
         int, typer.Option("--seed", min=0, rich_help_panel=SIMULATION, help="Seed of the first simulated campaign.")
     ] = 1,
-    answers: Annotated[
-        Path | None,
-        typer.Option("--answers", metavar="FILE", rich_help_panel=SIMULATION, show_default=False,
-                     help="CSV file of the answers; those it contains are not simulated again."),
-    ] = None,
     reach: Annotated[
         float | None,
         typer.Option("--reach", min=0.5, max=0.98, metavar="PROBABILITY", rich_help_panel=FURTHER, show_default=False,
                      help="Find the fewest further trials that detect each --effect NAME=SIZE with this probability."),
     ] = None,
+    recommend: Annotated[
+        bool,
+        typer.Option("--next", rich_help_panel=FURTHER,
+                     help="Recommend the further trials that would reveal most of what could be missing."),
+    ] = False,
     sheet: Annotated[
         Path | None,
         typer.Option("--sheet", metavar="FILE", rich_help_panel=FURTHER, show_default=False,
@@ -131,10 +126,9 @@ def _power(
                 B=_or_nan(B),
                 n=_or_nan(n),
                 simulate=simulate,
-                calibrate=calibrate,
+                recommend=recommend,
                 jobs=jobs,
                 first_seed=seed,
-                answers=answers,
                 reach=_or_nan(reach),
                 experiment=experiment,
             )

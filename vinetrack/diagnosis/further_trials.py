@@ -390,35 +390,17 @@ class InformativeTrials:
 
 
 def exploratory_trials(design: CampaignDesign, power: Power, limits: Limits | None = None) -> InformativeTrials | None:
-    """Find the further trials that would reveal most of what could be missing."""
-    return _most_informative(design, power, [entry.effect for entry in power.effects], limits, named="")
-
-
-def confirming_trials(
-    design: CampaignDesign, power: Power, name: str, rival: str = "", limits: Limits | None = None
-) -> InformativeTrials | None:
-    """Find the further trials that tell most about one effect, apart from a rival."""
-    known = {entry.effect for entry in power.effects}
-    if name not in known:
-        return None
-    return _most_informative(design, power, [name, *({rival} & known)], limits, named=name)
-
-
-def _most_informative(
-    design: CampaignDesign, power: Power, effects: Sequence[str], limits: Limits | None, *, named: str
-) -> InformativeTrials | None:
-    """The design of largest worth within the limits, about one named effect or about all."""
+    """Find the further trials within the limits that would reveal most of what could be missing."""
     limits = limits or Limits()
     feasible = feasible_conditions(design.trials, limits.model_copy(update={"new_vines": False}))
-    if not feasible or not effects:
+    if not feasible or not power.effects:
         return None
-    search = _InformativeTrialsSearch(design, feasible, power, effects)
-    if not search.conditions or not search.effects or named not in ("", search.effects[0]):
+    search = _InformativeTrialsSearch(design, feasible, power)
+    if not search.conditions or not search.effects:
         return None
-    worth = search.distinct_information if named else search.expected_discoveries
-    chosen = search.best(max(limits.trials // REPLICATES, 1), worth)
+    chosen = search.best(max(limits.trials // REPLICATES, 1))
     before, after = search.total(())[None], search.total(chosen)[None]
-    if not worth(after)[0] > worth(before)[0]:
+    if not search.expected_discoveries(after)[0] > search.expected_discoveries(before)[0]:
         return None
     groups = [k for k in chosen for _ in range(min(REPLICATES, limits.trials))]
     return InformativeTrials(
@@ -438,16 +420,10 @@ def _power_with(design: CampaignDesign, added: Sequence[Condition]) -> Power:
 class _InformativeTrialsSearch(DesignInformation):
     """The design that is worth most."""
 
-    def __init__(
-        self, design: CampaignDesign, every: Sequence[Condition], power: Power, effects: Sequence[str]
-    ) -> None:
-        super().__init__(design, every, effects)
+    def __init__(self, design: CampaignDesign, every: Sequence[Condition], power: Power) -> None:
+        super().__init__(design, every, [entry.effect for entry in power.effects])
         self.largest = np.array([abs(power[name].largest - power[name].zero) for name in self.effects])
         self.required = power.threshold
-
-    def distinct_information(self, totals: Floats) -> Floats:
-        """Information about the first effect with its rival free, shape (n_designs,)."""
-        return np.asarray(_alone_and_distinct(self.information_of(totals))[1][:, 0])
 
     def expected_discoveries(self, totals: Floats) -> Floats:
         """Expected numbers of effects that are detected, and that are told from all others, added up."""
@@ -459,12 +435,12 @@ class _InformativeTrialsSearch(DesignInformation):
         scores = SIZES[:, None, None] * self.largest * np.sqrt(information)
         return np.asarray(ndtr(scores - self.required).mean(axis=0).sum(axis=1))
 
-    def best(self, count: int, worth: Worth) -> list[int]:
+    def best(self, count: int) -> list[int]:
         """As many groups of trials, added one by one and exchanged."""
         chosen: list[int] = []
         for _ in range(count):
-            chosen.append(int(np.argmax(worth(self.total(chosen) + self.each))))
-        return self.exchanged(chosen, np.arange(len(self.conditions)), worth)
+            chosen.append(int(np.argmax(self.expected_discoveries(self.total(chosen) + self.each))))
+        return self.exchanged(chosen, np.arange(len(self.conditions)), self.expected_discoveries)
 
 
 def _alone_and_distinct(information: Floats) -> tuple[Floats, Floats]:

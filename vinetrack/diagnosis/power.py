@@ -21,7 +21,7 @@ from vinetrack.experiment.schema import COLUMNS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vinetrack.diagnosis.null_calibration import NullCalibration
+    from vinetrack.diagnosis.further_trials import InformativeTrials
 
 STATED_95 = 0.95  # Confidence of the intervals of rates; a convention
 
@@ -279,7 +279,7 @@ class Power:
     wary: str = ""
     simulated: tuple[SimulatedRates, ...] = ()
     further: tuple[FurtherTrials, ...] = ()
-    calibration: NullCalibration | None = None
+    recommended: InformativeTrials | None = None
 
     @property
     def false_alarm_rate(self) -> float:
@@ -319,7 +319,7 @@ class Power:
             "wary": self.wary,
             "simulated": [rates.to_json() for rates in self.simulated],
             "in_words": [false_alarm_sentence(self), *could_have_seen(self)],
-            **({"calibration": self.calibration.to_json()} if self.calibration else {}),
+            **({"recommended_trials": list(self.recommended.trials)} if self.recommended else {}),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
 

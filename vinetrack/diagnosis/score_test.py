@@ -534,32 +534,6 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
     return FamilyTest(level, math.exp(low), thresholds(low))
 
 
-def family_p_value(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
-    """Family-wise p-value of the most significant candidate. Returns 1 where there is no candidate. Shapes: observed
-    (n_shapes,).
-    """
-    scores = _Scores(cosines, signs) if effects else None
-    if scores is None or not scores.informative.any():
-        return 1.0
-    names = np.array(effects)
-    shapes = [
-        indices
-        for name in dict.fromkeys(effects)
-        if (indices := np.flatnonzero((names == name) & scores.informative)).size
-    ]
-    p_values = [
-        scores.exceedance(indices, np.full(indices.size, max(float(observed[indices].max()), 0.0)))
-        for indices in shapes
-    ]
-    smallest = min(p_values)
-    thresholds = []
-    for indices in shapes:
-        nodes, logs = _exceedance_table(scores, indices, smallest, len(shapes))
-        thresholds.append(math.sqrt(float(np.interp(-math.log(max(smallest, 1e-300)), -logs, nodes))))
-    by_shape = np.concatenate([np.full(k.size, threshold) for k, threshold in zip(shapes, thresholds, strict=True)])
-    return min(scores.exceedance(np.concatenate(shapes), by_shape), 1.0)
-
-
 def _exceedance_table(
     scores: _Scores, indices: NDArray[np.intp], level: float, candidates: int
 ) -> tuple[Floats, Floats]:

@@ -112,9 +112,9 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     *effects : names, or `name=size` in the unit of the parameter; all by default.
     **options
         Options of `vinetrack.pipeline.power_stage.PowerRequest`: `noise_mm`, `noise_correlation`, `spread_P` and
-        `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed`, `answers` for complete
-        diagnoses of simulated campaigns; `calibrate`, the number of simulated null campaigns for calibrating the tests
-        of a verdict; `reach`, the probability with which further trials shall detect `name=size`.
+        `spread_B` (relative), `capture_fps`, `B`, `n`; `simulate`, `jobs`, `first_seed` for complete diagnoses
+        of simulated campaigns; `reach`, the probability with which further trials shall detect `name=size`;
+        `recommend`, whether to search for the trials that would reveal most.
 
     Returns
     -------

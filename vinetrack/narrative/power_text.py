@@ -17,7 +17,6 @@ from vinetrack.planning.discriminating_design import NEW_VINE, Condition
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.further_trials import InformativeTrials
-    from vinetrack.diagnosis.null_calibration import CalibratedTest, NullCalibration
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
 
 
@@ -184,8 +183,8 @@ def power_lines(power: Power) -> list[str]:
     lines += [false_alarm_sentence(power)]
     if power.numbers:
         lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
-    if power.calibration is not None:
-        lines += ["", *calibration_lines(power.calibration)]
+    if power.recommended is not None:
+        lines += ["", informative_text(power.recommended)]
     for plan in power.further:
         lines += ["", *further_lines(plan)]
     return lines + simulated_lines(power)
@@ -294,75 +293,6 @@ def further_lines(plan: FurtherTrials) -> list[str]:
 
 # Columns of the rig that a further trial may change, as printed
 COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
-
-
-# ------------------------------------------------------------------------------
-# Thresholds of a verdict calibrated for one design by simulated null campaigns: a table and sentences.
-
-
-def calibration_lines(calibration: NullCalibration) -> list[str]:
-    """Return nominal and Monte-Carlo p-values of each test for this design, and whether the calls change."""
-    from vinetrack.core.terminal import table
-
-    count = calibration.campaigns
-    rows = []
-    for test in calibration.tests:
-        low, high = test.exceeding.interval
-        least, most = test.by_tail[1:]
-        tail = "–" if math.isnan(least) else f"{_chance(least)} to {_chance(most)}"
-        rows.append(
-            (
-                test.name, _chance(test.level), _chance(test.observed), f"{test.exceeding.count} of {count}",
-                _chance(test.monte_carlo), f"{_chance(low)} to {_chance(high)}", tail, _is_called(test),
-            )
-        )  # fmt: skip
-    head = ("test", "level", "p", "as extreme", "Monte-Carlo p", "95 %", "fitted tail", "called")
-    low, high = calibration.alarms.interval
-    lines = [
-        f"{count} campaigns of this design, simulated with {' + '.join(calibration.model)}, fitted and tested alike:",
-        *(f"  {line}" for line in table(rows, head, align="<>>>>>><")),
-        f"At the nominal levels, {calibration.alarms.count} of them raise a false alarm (95 % interval {percent(low)} "
-        "to "
-        f"{percent(high)}).",
-    ]
-    unresolved = [test for test in calibration.tests if not test.resolves and math.isnan(test.by_tail[0])]
-    lines.append(_verdict_of(calibration))
-    if unresolved:
-        needed = math.ceil(1 / min(test.level for test in unresolved)) - 1
-        names = listed_names([test.name for test in unresolved])
-        lines.append(f"Too few campaigns to resolve the level of {names}: that takes {needed}.")
-    if calibration.failed:
-        lines.append(f"{calibration.failed} campaigns could not be fitted and are not counted.")
-    return lines
-
-
-def _verdict_of(calibration: NullCalibration) -> str:
-    """Whether calibration changes what the nominal levels call missing."""
-    now = calibration.still_called
-    if calibration.was_called:
-        if now is None:
-            return "Something was called missing or at fault; these campaigns are too few to confirm or to revoke it."
-        if now:
-            return "Something was called missing or at fault; by the null distribution of this design it still is."
-        return (
-            "Something was called missing or at fault; by the null distribution of this design it no longer would be."
-        )
-    if now:
-        return "Nothing was called missing; by the null distribution of this design something would be."
-    return "Nothing was called missing, and by the null distribution of this design nothing would be."
-
-
-def _is_called(test: CalibratedTest) -> str:
-    """Whether a test is significant at its nominal level, and whether it is by the null distribution."""
-    words = {True: "yes", False: "no", None: "not known"}
-    return f"{words[test.is_called]}, calibrated {words[test.still_called]}"
-
-
-def _chance(chance: float) -> str:
-    """A probability in per cent, two digits; small ones as a power of ten."""
-    if math.isnan(chance):
-        return "–"
-    return percent(chance) if chance >= 1e-5 or chance == 0 else f"{chance:.0e}"
 
 
 # ------------------------------------------------------------------------------
@@ -492,24 +422,20 @@ def advice_text(
 
 
 # ------------------------------------------------------------------------------
-# Trials recommended for a campaign that goes on, in words.
+# Trials that would reveal most, in words.
 
 MOST_SIZES = 3  # Effects whose detectable sizes are stated beside recommended trials, at most (chosen)
 
 LEAST_STATED_GAIN = 1.1  # Factor by which a detectable size must fall to be stated (chosen)
 
 
-def informative_text(plan: InformativeTrials, named: str = "", rival: str = "") -> str:
+def informative_text(plan: InformativeTrials) -> str:
     """Return recommended trials in words, and the detectable sizes that they lower most."""
-    purpose = "These trials are expected to reveal most of what could be missing"
-    if named:
-        purpose = f"These trials tell most about {spaced_name(named)}"
-        purpose += f" apart from {spaced_name(rival)}" if rival else ""
     before = {entry.effect: entry for entry in plan.now.effects}
     gains = [
         (before[entry.effect], entry, _gain(before[entry.effect], entry))
         for entry in plan.then.effects
-        if entry.effect in before and (entry.effect == named or not named) and _is_plausible(entry)
+        if entry.effect in before and _is_plausible(entry)
     ]
     gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > LEAST_STATED_GAIN][:MOST_SIZES]
     lower = [
@@ -518,7 +444,8 @@ def informative_text(plan: InformativeTrials, named: str = "", rival: str = "") 
         for now, then, _ in gains
     ]
     sizes = f" They lower the size that is detected with 90 % power: {joined(lower)}." if lower else ""
-    return f"Make {trials_in_words(plan.trials)}. {purpose}.{sizes}"
+    made = trials_in_words(plan.trials)
+    return f"Make {made}. These trials are expected to reveal most of what could be missing.{sizes}"
 
 
 def _gain(now: EffectPower, then: EffectPower) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,20 +12,11 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
-    SimulatedDiagnosis,
     design_of_fit,
     design_power,
     fit_power,
     rates_of,
     simulated_diagnosis,
-)
-from vinetrack.diagnosis.null_calibration import (
-    TESTS,
-    CampaignPValues,
-    NullCalibration,
-    calibrate,
-    null_p_values,
-    p_values_of,
 )
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.effects import BASE_EFFECTS
@@ -39,160 +28,12 @@ from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
     from vinetrack.core.records import Track, Trial
-    from vinetrack.diagnosis.stopping import CampaignLook
+    from vinetrack.diagnosis.campaign_power import SimulatedDiagnosis
+    from vinetrack.diagnosis.further_trials import InformativeTrials
     from vinetrack.effects import Effect
     from vinetrack.experiment.planned import PlannedTrials
     from vinetrack.inference.fit_data import Pairs
     from vinetrack.inference.fit_result import Fit
-
-
-# ------------------------------------------------------------------------------
-# Simulation of campaigns in one or several processes, with each answer stored in a file when it is ready.
-#
-# When a simulation is resumed, only missing answers are simulated; stored answers of other designs are ignored.
-
-Task = tuple[CampaignDesign, str, float, int]
-ANSWER_COLUMNS = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
-P_VALUE_COLUMNS = ("design", "seed", *TESTS, "failed")
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """Settings of a simulation: number of campaigns, first seed, number of processes, and file of answers."""
-
-    campaigns: int
-    first_seed: int
-    jobs: int
-    path: Path
-
-    @property
-    def seeds(self) -> range:
-        """Seeds of the campaigns."""
-        return range(self.first_seed, self.first_seed + self.campaigns)
-
-
-def simulate_answers(
-    design: CampaignDesign, wanted: Sequence[tuple[str, float]], simulation: Simulation
-) -> dict[tuple[str, str, int], SimulatedDiagnosis]:
-    """Simulate campaigns and diagnose each completely. Returns answers by effect, `size_key` of the size, and seed."""
-    from vinetrack.core.terminal import Progress, progress
-
-    mark = fingerprint(design)
-    kept = {(a.effect, size_key(a.value), a.seed): a for a in stored_answers(simulation.path, mark)}
-    tasks: list[Task] = [
-        (design, effect, value, seed)
-        for seed in simulation.seeds
-        for effect, value in wanted
-        if (effect, size_key(value), seed) not in kept
-    ]
-    total = len(wanted) * simulation.campaigns
-    bar: Progress[None]
-    with progress(total, "simulating", unit="campaign") as bar:
-        bar.advance(total - len(tasks))
-        for answer in map_unordered(_diagnose_task, tasks, simulation.jobs):
-            _append_row(simulation.path, ANSWER_COLUMNS, _row(mark, answer))
-            kept[answer.effect, size_key(answer.value), answer.seed] = answer
-            bar.advance()
-    return kept
-
-
-def simulate_null_tests(design: CampaignDesign, simulation: Simulation) -> list[CampaignPValues]:
-    """Apply every test to simulated null campaigns."""
-    from vinetrack.core.terminal import Progress, progress
-
-    mark = fingerprint(design)
-    kept = {campaign.seed: campaign for campaign in _stored_p_values(simulation.path, mark)}
-    tasks = [(design, seed) for seed in simulation.seeds if seed not in kept]
-    bar: Progress[None]
-    with progress(simulation.campaigns, "calibrating", unit="campaign") as bar:
-        bar.advance(simulation.campaigns - len(tasks))
-        for campaign in map_unordered(_test_task, tasks, simulation.jobs):
-            values = [f"{campaign.p_values[name]:.6g}" if campaign.p_values else "" for name in TESTS]
-            _append_row(simulation.path, P_VALUE_COLUMNS, [mark, campaign.seed, *values, campaign.failed])
-            kept[campaign.seed] = campaign
-            bar.advance()
-    return [kept[seed] for seed in simulation.seeds]
-
-
-def size_key(value: float) -> str:
-    """Return the text of a size in the file of answers."""
-    return "" if math.isnan(value) else f"{value:.9g}"
-
-
-def _diagnose_task(task: Task) -> SimulatedDiagnosis:
-    return simulated_diagnosis(*task)
-
-
-def _test_task(task: tuple[CampaignDesign, int]) -> CampaignPValues:
-    return null_p_values(*task)
-
-
-def fingerprint(design: CampaignDesign) -> str:
-    """Return a short hash of everything that simulated campaigns depend on."""
-    parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
-    around = (
-        design.spreads,
-        design.slow_error_m,
-        design.has_trace,
-        design.candidates,
-        sorted(design.other_values.items()),
-    )
-    return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
-
-
-def stored_answers(path: Path, mark: str) -> list[SimulatedDiagnosis]:
-    """Return the stored answers of a design."""
-    return [
-        SimulatedDiagnosis(
-            effect=row["effect"],
-            value=float(row["value"] or "nan"),
-            seed=int(row["seed"]),
-            verdict=row["verdict"],
-            answer_set=tuple(row["answer_set"].split("|")) if row["answer_set"] else (),
-            effects=tuple(row["effects"].split("|")) if row["effects"] else (),
-            seconds=float(row["seconds"] or "nan"),
-            failed=row["failed"],
-        )
-        for row in _stored_rows(path, mark)
-    ]
-
-
-def _stored_p_values(path: Path, mark: str) -> list[CampaignPValues]:
-    """Chances that an earlier run has kept about this design."""
-    return [
-        CampaignPValues(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
-        for row in _stored_rows(path, mark)
-    ]
-
-
-def _stored_rows(path: Path, mark: str) -> list[dict[str, str]]:
-    """Return the complete rows of a design; none if there is no file."""
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as stream:
-        return [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
-
-
-def _row(mark: str, answer: SimulatedDiagnosis) -> list[object]:
-    seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
-    return [
-        mark, answer.effect, size_key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
-        "|".join(answer.effects), seconds, answer.failed,
-    ]  # fmt: skip
-
-
-def _append_row(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
-    """Append a row to the file; write the header first if the file is new."""
-    new = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        if new:
-            writer.writerow(columns)
-        writer.writerow(row)
-
-
-# ------------------------------------------------------------------------------
-# Measured or planned trials whose power is asked: design, noise and scatter of the campaign, by linear theory.
 
 DEFAULT_NOISE_MM, DEFAULT_CAPTURE_FPS = 0.1, 1069.0  # Default noise of a position, and default frame rate (chosen)
 
@@ -217,9 +58,8 @@ class PowerRequest:
     simulate: int = 0
     jobs: int = 1
     first_seed: int = 1
-    answers: Path | None = None
     reach: float = math.nan
-    calibrate: int = 0
+    recommend: bool = False
     experiment: Path | None = None
 
 
@@ -443,8 +283,8 @@ def power_of_target(request: PowerRequest, given: Fit | Pairs | None = None) -> 
             _refuse_effect(name, power)
     if request.simulate:
         power = replace(power, simulated=tuple(_simulated_rates(request, campaign)))
-    if request.calibrate:
-        power = replace(power, calibration=_null_calibration(request, given))
+    if request.recommend:
+        power = replace(power, recommended=_recommended_trials(campaign))
     if math.isfinite(request.reach):
         power = replace(power, further=tuple(_further_trials(request, campaign)))
     return power.of_effects(names)
@@ -466,27 +306,13 @@ def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[
             yield further_trials(campaign.design, campaign.power[name], value, request.reach, campaign.limits)
 
 
-def recommended_trials(target: Path, experiment: Path | None, look: CampaignLook) -> str:
-    """Recommend the further trials of a campaign that goes on, in words; blank where none can be recommended."""
+def _recommended_trials(campaign: PowerCampaign) -> InformativeTrials | None:
+    """The further trials that would reveal most of what could be missing; None where none can be recommended."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.diagnosis.further_trials import confirming_trials, exploratory_trials
-    from vinetrack.narrative.power_text import informative_text
+    from vinetrack.diagnosis.further_trials import exploratory_trials
 
-    request = PowerRequest(target=target, experiment=experiment)
-    measured = trials_of_target(request)
-    if measured is None:
-        return ""
-    names = tuple(name for name in measured.names if name not in look.names)
     with waiting("searching for the trials to make next"):
-        campaign = measured_campaign(request, replace(measured, names=names))
-        design, power = campaign.design, campaign.power
-        named = look.names[0] if look.names else ""
-        rival = look.rival if look.rival in {entry.effect for entry in power.effects} else ""
-        if named:
-            plan = confirming_trials(design, power, named, rival, campaign.limits)
-        else:
-            plan = exploratory_trials(design, power, campaign.limits)
-    return "" if plan is None else informative_text(plan, named, rival)
+        return exploratory_trials(campaign.design, campaign.power, campaign.limits)
 
 
 def sheet_rows(power: Power) -> list[dict[str, object]]:
@@ -538,54 +364,23 @@ def _size_of(text: str, entry: EffectPower) -> float:
 
 
 def _simulated_rates(request: PowerRequest, campaign: PowerCampaign) -> Iterator[SimulatedRates]:
-    """Simulate and diagnose campaigns; yield the rate of each kind. Answers of an earlier run are reused."""
-    wanted = _simulated_sizes(request, campaign)
-    simulation = Simulation(
-        request.simulate, request.first_seed, request.jobs, request.answers or _answers_file(request.target)
-    )
+    """Simulate campaigns of the design and diagnose each in full; yield the rate of each kind."""
+    from vinetrack.core.terminal import Progress, progress
+
     design = replace(
         campaign.design, other_values={entry.effect: entry.other_values for entry in campaign.power.effects}
     )
-    answers = simulate_answers(design, [(effect, value) for effect, value, _ in wanted], simulation)
-    for effect, value, predicted_rate in wanted:
-        yield rates_of([answers[effect, size_key(value), seed] for seed in simulation.seeds], predicted_rate)
+    seeds = range(request.first_seed, request.first_seed + request.simulate)
+    wanted = _simulated_sizes(request, campaign)
+    bar: Progress[None]
+    with progress(len(wanted) * len(seeds), "simulating", unit="campaign") as bar:
+        for effect, value, predicted_rate in wanted:
+            diagnoses = []
+            for answer in map_unordered(_diagnosed, [(design, effect, value, seed) for seed in seeds], request.jobs):
+                diagnoses.append(answer)
+                bar.advance()
+            yield rates_of(diagnoses, predicted_rate)
 
 
-def _null_calibration(request: PowerRequest, given: Fit | Pairs | None) -> NullCalibration:
-    """Calibrate the tests of the first model of measured trials with simulated null campaigns of the same design."""
-    from vinetrack.diagnosis.candidates import testable
-    from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
-    from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
-    from vinetrack.dynamics.model import host_for, make_model
-    from vinetrack.inference.fit_result import Fit
-
-    candidates: Sequence[str] | None = None
-    if isinstance(given, Fit):
-        questioned = candidates_of(given.model, None, given.model.user_effects)
-        fitted = with_host(given, host_for(given.model, questioned))
-    else:
-        measured = trials_of_target(request) if given is None else MeasuredTrials(list(given), BASE_EFFECTS)
-        if measured is None:
-            problem = Problem(
-                message="needs measured trials", column="--calibrate", value=str(request.target),
-                remedy="run the trials first, or estimate the false-alarm rate with --simulate",
-            )  # fmt: skip
-            raise ExperimentError([problem])
-        names = tuple(name for name in measured.names if name not in measured.added)
-        model, candidates = make_model(names, measured.user_effects), measured.candidates
-        questioned = candidates_of(model, candidates, measured.user_effects)
-        fitted = initial_fit(model, measured.pairs, questioned, profile=False)
-    effects, _ = testable(questioned, fitted.predictor.data)
-    observed = p_values_of(misfit_tests(fitted, effects, FALSE_ALARM_LEVEL_FIRST_ROUND))
-    path = request.answers or _answers_file(request.target)
-    path = path.with_name(f"{path.stem}_calibration.csv")
-    simulation = Simulation(request.calibrate, request.first_seed, request.jobs, path)
-    return calibrate(observed, simulate_null_tests(design_of_fit(fitted, candidates), simulation), fitted.model.names)
-
-
-def _answers_file(target: Path) -> Path:
-    """Return the file of simulated answers: in the results folder, else in the working directory."""
-    if (target / PROVENANCE).exists():
-        return target / "power_answers.csv"
-    name = target.resolve().name if target.is_dir() else target.stem
-    return Path(f"power_answers_{name}.csv")
+def _diagnosed(task: tuple[CampaignDesign, str, float, int]) -> SimulatedDiagnosis:
+    return simulated_diagnosis(*task)
