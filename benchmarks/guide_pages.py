@@ -1,12 +1,12 @@
 """The commands of the guide run again: what stands below each on its page, and the guide's pictures.
 
     make guide
-    python benchmarks/guide_pages.py [--results results/demo] [--pages tutorial own_effect verdicts] [--no-pictures]
+    python benchmarks/guide_pages.py [--results results/demo] [--pages tutorial own_effect] [--no-pictures]
 
 Needs a finished demonstration (`make demo`, which `make guide` runs first), and a Chromium for the pictures of the
 report and of the explorer, whose caption follows what the page says. Everything runs in a scratch folder, on copies of
 the demonstration and its results. With the effect of docs/own_effect.md trials of two vines are grown in the virtual
-laboratory; the walk-through on `film_friction` stays as it stands. Pages are rewritten in place; folders are shown
+laboratory. Pages are rewritten in place; folders are shown
 relative, long lines wrapped.
 """
 
@@ -34,7 +34,7 @@ from vinetrack.core.tables import write_csv, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = ("tutorial", "own_effect", "verdicts")
+PAGES = ("tutorial", "own_effect")
 WIDTH = 116
 LARGEST_BYTES, LARGEST_WITH_A_RECORDING_BYTES = 150_000, 200_000
 EXPLORER_PX = (1400, 1330)
@@ -44,8 +44,6 @@ CAPTION = (
 )
 FIGURES = {"tutorial_strip": "strip_d24_30kPa_1", "tutorial_before_after": "before_after", "verdict_ladder": "ladder"}
 SEED, STIFFNESS_N_M = 41, 0.4
-LEFT_AS_IT_STANDS = "film_friction"
-"""Experiment of docs/own_effect.md whose commands take a quarter of an hour: what stands below them is not renewed."""
 
 
 def block(page: str, language: str) -> str:
@@ -108,8 +106,6 @@ class Runner:
 
     def __call__(self, shown: Shown) -> str:
         """What a command prints, as the page shows it."""
-        if any(LEFT_AS_IT_STANDS in argument for argument in shown.arguments):
-            return shown.output
         arguments, pipe = shown.arguments, len(shown.arguments)
         if "|" in arguments:
             pipe = arguments.index("|")
@@ -197,7 +193,7 @@ def main() -> None:
     results = asked.results.resolve()
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder).resolve()
-        if {"tutorial", "verdicts"} & set(asked.pages) or not asked.no_pictures:
+        if "tutorial" in asked.pages or not asked.no_pictures:
             stage_demonstration(results, scratch)
         if "own_effect" in asked.pages:
             stage_own_effect(scratch / "my_experiment")

@@ -14,7 +14,6 @@ from vinetrack.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-GUIDE = ("tutorial", "own_effect", "verdicts", "limits", "physics_tracker", "film")
 LARGEST_PICTURE_BYTES = 200_000
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -66,7 +65,7 @@ def test_every_page_of_the_docs_is_reached_from_the_readme() -> None:
 
 def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives() -> None:
     text = PAGES[0].read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 150
+    assert len(text.splitlines()) <= 120
     assert "![" in text.split("\n## ")[0]
     for name, command in COMMANDS.items():
         if command.rich_help_panel is None or "Stages" not in str(command.rich_help_panel):
@@ -78,7 +77,7 @@ def test_no_page_names_a_folder_of_the_machine_it_was_written_on(page: Path) -> 
     assert re.findall(r"(?<![\w.])/(?:tmp|home|root|work|Users)\b", page.read_text(encoding="utf-8")) == []
 
 
-@pytest.mark.parametrize("name", ["tutorial", "own_effect", "verdicts"])
+@pytest.mark.parametrize("name", ["tutorial", "own_effect", "design"])
 def test_every_command_that_a_page_runs_shows_what_it_prints(name: str) -> None:
     shown = [piece for piece in pieces((ROOT / "docs" / f"{name}.md").read_text("utf-8")) if isinstance(piece, Shown)]
     assert shown
