@@ -9,11 +9,8 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.core.tables import read_table
-from vinetrack.experiment.folder import read_experiment
 from vinetrack.pipeline.design_stage import read_list, read_range
 
-TWO = ("--vine", "24x200x280", "--vine", "12×100×140")
 INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--chamber-l", 0.003534)
 
 
@@ -66,35 +63,6 @@ def test_a_supply_without_a_wall_says_what_is_missing() -> None:
     assert "--supply-s needs --thickness-um" in run("reservoir", *INJECTOR, "--supply-s", 0.1).output
 
 
-def test_a_campaign_is_planned_simulated_and_written_as_a_sheet(tmp_path: Path) -> None:
-    sheet = tmp_path / "mine" / "trials.csv"
-    done = run("campaign", *TWO, "--pressure-kPa", "9:40", "--payload-g", "0,35.6", "--check", 2, "--sheet", sheet,
-               "--figure", tmp_path / "a.svg", "--yield-pressure-kPa", 3)  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert cells(done.output, "this campaign")[1] in done.output.splitlines()[3]
-    assert "2 campaigns simulated" in done.output
-    assert cells(done.output, "n ")[0] == "n"
-    trials = read_experiment(sheet.parent).trials
-    assert len(trials) == int(cells(done.output, "this campaign")[1])
-    assert len({trial.vine for trial in trials}) == 2
-    pressures = [row["pressure_kPa"] for row in read_table(sheet).rows]
-    assert pressures != sorted(pressures, key=float)
-    assert (tmp_path / "a.svg").exists()
-
-
-def test_a_campaign_says_what_it_could_see_of_other_effects() -> None:
-    output = run("campaign", "--vine", "24x200x280", "--pressure-kPa", "9:40", "--check", 0, "--power").output
-    assert "to detect physics that their model lacks" in output
-    drag = next(line for line in output.splitlines() if line.strip().startswith("air drag"))
-    assert "C_D" in drag
-
-
-def test_a_campaign_out_of_reach_says_what_would_help() -> None:
-    output = run("campaign", *TWO, "--n-se", 1e-5, "--most-trials", 30, "--check", 0).output
-    assert "! no campaign of 30 trials or fewer with the allowed pressures and replicates reaches that" in output
-    assert "widen the pressures" in output
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -121,12 +89,6 @@ def test_a_campaign_out_of_reach_says_what_would_help() -> None:
         ),
         (("reservoir", "--diameter-mm", 25), "--length-mm is missing"),
         ((*RESERVOIR, "--effect", "inlet_loss"), "needs it: give it as --inlet-mm"),
-        (("campaign", "--vine", "24x200x280", "--effect", "inlet_loss"), "needs it: give it as --inlet-mm"),
-        (("campaign",), "--vine is missing"),
-        (("campaign", "--vine", "24x200"), "write diameter, wall and length in mm, µm, mm"),
-        (("campaign", "--vine", "24x20000x280"), "quarter of the diameter"),
-        (("campaign", "--vine", "24x200x280", "--payload-g", "heavy"), "--payload-g 'heavy'"),
-        (("campaign", "--vine", "24x200x280", "--pressure-kPa", "1:2"), "No trial of the campaign could be filmed"),
     ],
 )
 def test_refusals_are_sentences(arguments: tuple[object, ...], words: str) -> None:
@@ -136,21 +98,7 @@ def test_refusals_are_sentences(arguments: tuple[object, ...], words: str) -> No
     assert "internal error of the program" not in done.output
 
 
-@pytest.mark.parametrize("text", ["8:4", "1:5", "4:20", "a", "4:5:6"])
-def test_numbers_of_pressures_that_are_no_range_are_refused(text: str) -> None:
-    done = run("campaign", *TWO, "--pressures", text)
-    assert done.exit_code == 2
-    assert "is not a range within 2:13" in " ".join(done.output.replace("│", " ").split())
-
-
 def test_ranges_and_lists_are_in_si_and_judged_as_cells_are() -> None:
     assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
     assert read_range("pressure_kPa", "62") == (62e3, 62e3)
     assert read_list("thickness_um", "50, 100,50") == pytest.approx((50e-6, 100e-6))
-
-
-@pytest.mark.parametrize("old", [("--fps", "1000"), ("--of-burst=0.8",), ("--n-within", "0.02"), ("--from", "nowhere")])
-def test_an_option_of_the_last_release_is_read_with_a_warning(old: tuple[str, ...]) -> None:
-    done = run("campaign", *old)
-    assert f"{old[0].partition('=')[0]} is now --" in done.stderr
-    assert "No such option" not in done.stderr

@@ -17,7 +17,7 @@ from vinetrack.diagnosis.power import FurtherTrials, Power
 from vinetrack.experiment.settings import Limits
 from vinetrack.narrative.power_text import further_lines
 from vinetrack.pipeline.power_stage import sheet_rows
-from vinetrack.planning.campaign_information import FilmingPlan
+from vinetrack.planning.simulated_campaigns import FilmingPlan
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), new_vines=False, payload_g=(0.0, 0.0))
 

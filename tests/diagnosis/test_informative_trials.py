@@ -16,7 +16,7 @@ from vinetrack.diagnosis.linear_power import effect_power, power_of
 from vinetrack.diagnosis.power import Power
 from vinetrack.experiment.settings import Limits
 from vinetrack.narrative.power_text import informative_text
-from vinetrack.planning.campaign_information import FilmingPlan
+from vinetrack.planning.simulated_campaigns import FilmingPlan
 
 LIMITS = Limits(pressure_kPa=(14.0, 40.0), payload_g=(0.0, 0.0), inlet_mm=(5.5, 8.0), chamber_l=(3.7,), trials=4)
 NAMES = ("inlet_loss", "linear_damping", "leak")

@@ -39,7 +39,7 @@ from vinetrack.diagnosis.score_test import fit_columns, informations_at, scores_
 from vinetrack.inference import sensitivity
 from vinetrack.narrative.power_text import effect_sentence
 from vinetrack.narrative.verdict_text import summary_facts
-from vinetrack.planning.campaign_information import FilmingPlan
+from vinetrack.planning.simulated_campaigns import FilmingPlan
 
 CAMERA = FilmingPlan(500.0, 1e-4)
 CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")

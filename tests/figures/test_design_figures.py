@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from vinetrack.figures.prediction_figures import FilmChoice, GasLawLoss, draw_campaign, draw_choice, draw_reservoir
-from vinetrack.figures.style import render
+from vinetrack.figures.prediction_figures import FilmChoice, GasLawLoss, draw_choice, draw_reservoir
 
 
 def words(fig: Figure) -> str:
@@ -51,13 +50,3 @@ def test_a_reservoir_far_off_is_not_drawn() -> None:
     volumes = 1e-4 * np.geomspace(3, 300, 20)
     laws = [GasLawLoss("slow", 1e-4 / volumes), GasLawLoss("fast", 1.4e-4 / volumes)]
     assert "chosen" not in words(draw_reservoir(volumes, laws, 0.05, 1e-4, 10.0))
-
-
-def test_a_campaign_with_its_vines_loads_and_counts() -> None:
-    points = [("24mm-200um-280mm", 10.0, 0.0, 0.1)] * 3 + [("24mm-200um-280mm", 40.0, 35.6, 2.0)] * 3
-    points += [("12mm-100um-140mm", 20.0, 0.0, 1.0)] * 3
-    fig = draw_campaign(points, 0.0021, {"24mm-200um-280mm": 0.013, "12mm-100um-140mm": 0.012})
-    said = words(fig)
-    for expected in ("gauge pressure (kPa)", "(m/s)", "9 trials: n ± 0.0021", "B ± 1.3 %", "×3", "hollow: 35.6 g"):
-        assert expected in said
-    assert render(fig, ("svg",))["svg"].startswith(b"<?xml")

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-import typer.core
 
 from vinetrack.experiment.schema import COLUMNS, Column, option
 
@@ -20,35 +19,6 @@ VINE, RIG, INPUTS, OUT = "The vine", "The rig", "Inputs of the model", "Output f
 _VINE_COLUMNS = frozenset(
     {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
 )
-
-# Former names of options in version 0.1 and their current names
-RENAMED_OPTIONS = {
-    "--fps": "--capture-fps",
-    "--of-burst": "--burst-fraction",
-    "--at": "--final-at-fraction",
-    "--n-within": "--n-se",
-    "--B-within": "--B-se-percent",
-    "--from": "--fit",
-}
-
-
-class RenamedOptions(typer.core.TyperCommand):
-    """A command that also accepts options by their former names."""
-
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Replace former names of options, with a warning for each, and parse the arguments."""
-        current = []
-        for argument in args:
-            name, equals, value = argument.partition("=")
-            if name in RENAMED_OPTIONS:
-                typer.echo(
-                    f"{name} is now {RENAMED_OPTIONS[name]}; the old name will be removed in the next release.",
-                    err=True,
-                )
-                name = RENAMED_OPTIONS[name]
-            current.append(name + equals + value)
-        return super().parse_args(ctx, current)
-
 
 YIELD_MEANING = "Yield pressure; a scaling prior if not given."
 

@@ -28,8 +28,7 @@ from vinetrack.effects import EffectError
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.planning.campaign_information import FilmingPlan
-from vinetrack.planning.simulated_campaigns import make
+from vinetrack.planning.simulated_campaigns import FilmingPlan, make
 
 NOISELESS = 1e-3  # Part of the stated noise that the noise-free campaign has (chosen)
 

@@ -28,9 +28,9 @@ from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.narrative.power_text import trial_entries
-from vinetrack.planning.campaign_information import FEWEST_GROWTH_FRAMES
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.predictive_inputs import damping_prior
+from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES
 
 # ------------------------------------------------------------------------------
 # Information of candidate designs about the sizes of effects, by linear theory.

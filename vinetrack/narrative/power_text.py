@@ -199,13 +199,6 @@ def _size_table(effects: Sequence[EffectPower]) -> list[str]:
     ]
 
 
-def seen_lines(power: Power) -> list[str]:
-    """Return the power of a campaign designed for n and B to detect other effects."""
-    physical = [entry for entry in power.effects if entry.kind == "physical"]
-    head = f"power of these {power.n_trials} trials to detect physics that their model lacks, by linear theory:"
-    return [head, *_size_table(physical), false_alarm_sentence(power)]
-
-
 def _effects_in_sentences(power: Power) -> list[EffectPower]:
     """All effects if they are few, else the physical ones of the lowest power."""
     if len(power.effects) <= MOST_SENTENCES:

@@ -24,7 +24,7 @@ from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.settings import ExperimentSettings, Limits
 from vinetrack.experiment.sheet import expected_systematic_m
 from vinetrack.pipeline.tracks_stage import map_unordered
-from vinetrack.planning.campaign_information import FilmingPlan, joint_model
+from vinetrack.planning.simulated_campaigns import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
     from vinetrack.core.records import Track, Trial

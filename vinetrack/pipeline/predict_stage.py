@@ -81,8 +81,7 @@ NEVER = "never"
 @dataclass(frozen=True)
 class PredictionRequest:
     """Options of a command about new vines; NaN and None for those not given. `cells` are texts by column of the sheet,
-    for the columns that were given. `B_error` and the between-trial standard deviations `spreads` are relative.
-    `anyway` allows a fit whose model was refuted.
+    for the columns that were given. `B_error` is relative. `anyway` allows a fit whose model was refuted.
     """
 
     cells: Mapping[str, str] = field(default_factory=dict)
@@ -95,7 +94,6 @@ class PredictionRequest:
     B_error: float = 0.0
     n: float = math.nan
     n_error: float = 0.0
-    spreads: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,6 @@ def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) 
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         user_effects=user_effects,
-        spreads=request.spreads,
     )
     return PredictionBasis(planned, stated, fit)
 
