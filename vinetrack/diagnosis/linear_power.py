@@ -246,6 +246,8 @@ def _with_positions(
         time_s=trial_data.time_s[keep],
         lead_position_m=(trial_effects[ORIGIN] + trajectory.observed_position_m)[keep],
         first=_stretch_starts(trial_data, keep),
+        stated_m=None if trial_data.stated_m is None else trial_data.stated_m[keep],
+        slow_m=None if trial_data.slow_m is None else trial_data.slow_m[keep],
         relative_sd=None if trial_data.relative_sd is None else trial_data.relative_sd[keep],
     )
 
