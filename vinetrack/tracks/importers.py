@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-import struct
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
@@ -136,56 +135,56 @@ def _last_digit_s(time_s: Floats) -> float:
 
 
 # ------------------------------------------------------------------------------
-# Read the channels of a TDMS file, in which LabVIEW writes measurements, as the columns of a table.
-#
-# Source: National Instruments, *TDMS File Format Internal Structure*. A file is a sequence of segments, each with a
-# lead-in of 28 bytes, properties and the layout of its channels, and raw values: one channel after the other or sample
-# by
-# sample. Values that need scaling on reading (DAQmx, `NI_Scale`) are refused by name.
-
-LEAD_IN_BYTES = 28  # Bytes of a segment's lead-in
-# Content of a segment, by bits of its lead-in
-_META, _NEW_LIST, _RAW, _INTERLEAVED, _BIG_ENDIAN, _DAQMX = 1 << 1, 1 << 2, 1 << 3, 1 << 5, 1 << 6, 1 << 7
-# Marks in place of a layout, or of a segment's length
-_NO_RAW, _AS_BEFORE, _TO_THE_END = 0xFFFFFFFF, 0, 0xFFFFFFFFFFFFFFFF
-_TYPES = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8", 25: "f4", 26: "f8"}
-_TEXT, _BOOLEAN, _TIME_STAMP = 0x20, 0x21, 0x44  # Type codes of text, Booleans and time stamps
-_DAQMX_LAYOUTS = {0x1269, 0x1369}
+# Pressure traces in TDMS files, in which LabVIEW writes measurements, read by npTDMS.
 
 
-@dataclass
-class _Channel:
-    """A channel as far as it has been read: type and count of its values in a segment, properties, and all values."""
-
-    kind: str = ""
-    count: int = 0
-    properties: dict[str, Any] = field(default_factory=dict)
-    parts: list[NDArray[Any]] = field(default_factory=list)
-
-
-def tdms_columns(data: bytes) -> dict[str, Floats]:
+def tdms_columns(path: Path) -> dict[str, Floats]:
     """Read the channels of a file that are as long as its pressure. A channel is named as in the file, with its unit
     appended (`pressure` in `kPa` is `pressure_kPa`). Where none is a time, `time_s` comes from the waveform's start and
     increment. Returns values by column, each of shape (n_samples,).
     """
     try:
-        channels = _channels(data)
-    except (struct.error, UnicodeDecodeError, ValueError) as error:
-        raise TrackError(f"is damaged or cut short ({error}): export it from LabVIEW again") from None
-    named = {_column(path, channel): channel for path, channel in channels.items() if channel.parts}
-    pressure = next((channel for name, channel in named.items() if name.startswith("pressure")), None)
+        from nptdms import TdmsFile
+    except ModuleNotFoundError:
+        raise TrackError("is a TDMS file, which npTDMS reads: pip install 'vinetrack[cameras]', or use a CSV") from None
+    _require_whole(path.read_bytes())
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            file = TdmsFile.read(path)
+            channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
+            read = {
+                _with_unit(channel.name, channel.properties): (channel.properties, channel[:]) for channel in channels
+            }
+    except Exception as error:  # Damaged files end in errors of many kinds.
+        raise TrackError(f"is no whole TDMS file ({error}): export it from LabVIEW again, or as CSV") from None
+    named = {name: (properties, values) for name, (properties, values) in read.items() if values.dtype.kind in "iuf"}
+    pressure = next((name for name in named if name.startswith("pressure")), None)
     if pressure is None:
         there = ", ".join(list(named)[:8]) or "none"
         raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]}): name it so in LabVIEW")
-    columns = {name: _values(name, channel) for name, channel in named.items()}
-    columns = {name: values for name, values in columns.items() if len(values) == len(_values("", pressure))}
+    properties, samples = named[pressure]
+    columns = {
+        name: np.asarray(values, dtype=float) for name, (_, values) in named.items() if len(values) == len(samples)
+    }
     if not any(name.startswith("time") for name in columns):
-        step = float(pressure.properties.get("wf_increment", 0.0))
+        step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
         if not step > 0:
             raise TrackError("states no times: write a channel time_s, or the waveform's increment (wf_increment)")
-        start = float(pressure.properties.get("wf_start_offset", 0.0))
-        columns["time_s"] = np.asarray(start + step * np.arange(len(_values("", pressure))), dtype=float)
+        columns["time_s"] = start + step * np.arange(len(samples))
     return dict(_in_own_unit(name, values) for name, values in columns.items())
+
+
+def _require_whole(data: bytes) -> None:
+    """Refuse a file that is cut short, of which npTDMS reads the rest: follow the lengths that its segments state."""
+    place = 0
+    while place < len(data):
+        length = data[place + 12 : place + 20]
+        if data[place : place + 4] != b"TDSm" or len(length) < 8:
+            raise TrackError("is no whole TDMS file: export it from LabVIEW again, or as CSV")
+        place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
+    if place > len(data):
+        raise TrackError("is cut short: export it from LabVIEW again, or as CSV")
 
 
 def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
@@ -200,112 +199,9 @@ def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
         raise TrackError(f"channel {name}: {error}") from None
 
 
-def _column(path: str, channel: _Channel) -> str:
-    """Name of a channel with its unit."""
-    name = path.rpartition("/'")[2].removesuffix("'").replace("''", "'")
-    unit = str(channel.properties.get("unit_string", ""))
+def _with_unit(name: str, properties: Mapping[str, Any]) -> str:
+    unit = str(properties.get("unit_string", ""))
     return name if not unit or name.endswith(f"_{unit}") else f"{name}_{unit}"
-
-
-def _values(name: str, channel: _Channel) -> Floats:
-    """All values of a channel, unless they need scaling on reading."""
-    scales = channel.properties.get("NI_Number_Of_Scales", 0)
-    if name and (scales or any(key.startswith("NI_Scale[") for key in channel.properties)):
-        raise TrackError(f"channel {name} is scaled only when it is read (NI_Scale): export it as CSV")
-    return np.concatenate(channel.parts).astype(float)
-
-
-def _channels(data: bytes) -> dict[str, _Channel]:
-    """All channels by path, with their values from every segment."""
-    if not data.startswith(b"TDSm"):
-        raise TrackError("is not a TDMS file: export it from LabVIEW again, or as CSV")
-    channels: dict[str, _Channel] = {}
-    listed: list[str] = []
-    place = 0
-    while place < len(data):
-        tag, contents = struct.unpack_from("<4sI", data, place)
-        if tag != b"TDSm":
-            raise ValueError(f"no segment at byte {place}")
-        if contents & _DAQMX:
-            raise TrackError("holds raw values of DAQmx, which are scaled only when they are read: export it as CSV")
-        order = ">" if contents & _BIG_ENDIAN else "<"
-        _version, length, raw = struct.unpack_from(f"{order}IQQ", data, place + 8)
-        begin = place + LEAD_IN_BYTES
-        end = len(data) if length == _TO_THE_END else begin + length
-        if end > len(data):
-            raise ValueError(f"{len(data)} of {end} bytes are there")
-        if contents & _META:
-            listed = _read_layout(data, begin, order, [] if contents & _NEW_LIST else listed, channels)
-        if contents & _RAW:
-            layout = [channels[path] for path in listed if channels[path].count]
-            _read_values(data[begin + raw : end], order, layout, bool(contents & _INTERLEAVED))
-        place = end
-    return channels
-
-
-def _read_layout(data: bytes, place: int, order: str, listed: list[str], channels: dict[str, _Channel]) -> list[str]:
-    """Update properties and layout of a segment's channels; return those with raw values, in order."""
-    (objects,) = struct.unpack_from(f"{order}I", data, place)
-    place += 4
-    listed = list(listed)
-    for _ in range(objects):
-        path, place = _text(data, place, order)
-        channel = channels.setdefault(path, _Channel())
-        (index,) = struct.unpack_from(f"{order}I", data, place)
-        place += 4
-        if index in _DAQMX_LAYOUTS:
-            raise TrackError("holds raw values of DAQmx, which are scaled only when they are read: export it as CSV")
-        if index not in (_NO_RAW, _AS_BEFORE):
-            kind, _dimension, count = struct.unpack_from(f"{order}IIQ", data, place)
-            if kind not in _TYPES:
-                raise TrackError(
-                    f"channel {_column(path, channel)} holds no plain numbers: leave it out, or export as CSV"
-                )
-            channel.kind, channel.count = _TYPES[kind], count
-            place += index - 4 if index > 4 else 16
-        if index == _NO_RAW:
-            listed = [other for other in listed if other != path]
-        elif path not in listed:
-            listed.append(path)
-        (properties,) = struct.unpack_from(f"{order}I", data, place)
-        place += 4
-        for _ in range(properties):
-            name, place = _text(data, place, order)
-            channel.properties[name], place = _property(data, place, order)
-    return listed
-
-
-def _text(data: bytes, place: int, order: str) -> tuple[str, int]:
-    (length,) = struct.unpack_from(f"{order}I", data, place)
-    if place + 4 + length > len(data):
-        raise ValueError("a name runs beyond its end")
-    return data[place + 4 : place + 4 + length].decode("utf-8"), place + 4 + length
-
-
-def _property(data: bytes, place: int, order: str) -> tuple[Any, int]:
-    (kind,) = struct.unpack_from(f"{order}I", data, place)
-    place += 4
-    if kind == _TEXT:
-        return _text(data, place, order)
-    if kind == _BOOLEAN:
-        return bool(data[place]), place + 1
-    if kind == _TIME_STAMP:
-        return None, place + 16
-    if kind not in _TYPES:
-        raise ValueError(f"a property of unknown type {kind}")
-    numbers = np.frombuffer(data, dtype=order + _TYPES[kind], count=1, offset=place)
-    return numbers[0].item(), place + numbers.itemsize
-
-
-def _read_values(raw: bytes, order: str, layout: list[_Channel], interleaved: bool) -> None:
-    """Append a segment's values to its channels: repeated chunks of one layout; an incomplete last chunk is dropped."""
-    fields = [(str(i), order + c.kind, () if interleaved else (c.count,)) for i, c in enumerate(layout)]
-    chunk = np.dtype(fields)
-    if not chunk.itemsize:
-        return
-    table = np.frombuffer(raw[: len(raw) // chunk.itemsize * chunk.itemsize], dtype=chunk)
-    for i, channel in enumerate(layout):
-        channel.parts.append(table[str(i)].ravel())
 
 
 # ------------------------------------------------------------------------------
@@ -737,7 +633,7 @@ def _as_csv(path: Path) -> str:
         size = file_size(path)
         if size > LARGEST_TDMS_BYTES:
             raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB: keep only its pressure channels")
-        columns = tdms_columns(path.read_bytes())
+        columns = tdms_columns(path)
     except OSError as error:
         raise TrackError(f"cannot be read: {error.strerror}") from None
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
