@@ -110,6 +110,17 @@ def test_sound_frames_beyond_the_damage_are_not_used(clip: Clip, tmp_path: Path)
     assert np.abs(clip.errors_m(track)).max() < 0.5e-3
 
 
+@pytest.mark.parametrize("unused", ["frames_used", "damaged tail"])
+def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_one(clip: Clip, unused: str) -> None:
+    kept = np.delete(np.arange(len(clip.frames)), 35)
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=np.arange(70), damaged=np.arange(70) >= 50)
+    trial = clip.trial
+    if unused == "frames_used":
+        frames, trial = replace(frames, damaged=np.zeros(70, dtype=bool)), replace(trial, frames_used=(0, 49))
+    track = track_frames(frames, trial, CAPTURE_FPS).track
+    assert np.rint((track.time_s - track.time_s[0]) * CAPTURE_FPS).tolist() == kept.tolist()
+
+
 def test_one_damaged_frame_among_sound_ones_is_left_out_alone(clip: Clip) -> None:
     damaged = np.arange(len(clip.frames)) == 35
     track = track_frames(replace(clip.frames, damaged=damaged), clip.trial, CAPTURE_FPS).track

@@ -79,8 +79,8 @@ def decode_container(
                 if between_s is not None:
                     container.seek(max(int(between_s[0] / base), 0), stream=stream)
                 for frame in _frames_of(container.demux(stream), messages):
-                    if between_s is not None and frame.pts is not None:
-                        if frame.pts * base < between_s[0] - HALF_TICK * base:
+                    if between_s is not None:
+                        if frame.pts is None or frame.pts * base < between_s[0] - HALF_TICK * base:
                             continue
                         if frame.pts * base > between_s[1] + HALF_TICK * base:
                             break

@@ -500,14 +500,14 @@ def _assemble(
     flag = np.full(n, "rejected", dtype="<U64")
     flag[int(rows[-1]) + 1 :] = "after_end"
     flag[frames.damaged] = "rejected"
-    slot = frames.slot.astype(float)
     edge[rows] = np.where(quality.without_edge, np.nan, followed.edge_px)
     noise[rows], slow[rows] = np.where(quality.without_edge, np.nan, errors_px)
     flag[rows] = quality.flag
-    slot[rows] = quality.slot
+    # What was dropped among the tracked frames delays those between and after them too.
+    delay = np.concatenate([[0], quality.slot - frames.slot[rows]])[np.searchsorted(rows, np.arange(n), "right")]
     # Frames before and after the event were not decoded, since nothing moves in them; they have rows as well.
     before, after = frames.slots_before, frames.slots_after
-    slot = np.concatenate([before, slot, after + (slot[-1] - frames.slot[-1])])
+    slot = np.concatenate([before, frames.slot + delay, after + delay[-1]])
     flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
     edge, noise, slow = np.pad([edge, noise, slow], ((0, 0), (len(before), len(after))), constant_values=np.nan)
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
