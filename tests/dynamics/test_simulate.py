@@ -401,12 +401,6 @@ def breakpoints(rig):
 '''
 
 
-def test_the_former_name_of_breakpoints_is_read_with_a_warning(tmp_path: Path) -> None:
-    (tmp_path / "band.py").write_text(BAND.replace("breakpoints", "corners"))
-    with pytest.warns(FutureWarning, match="now called `breakpoints`"):
-        assert effects.load_effect(tmp_path / "band.py").breakpoints is not None
-
-
 def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path: Path) -> None:
     """A ball that falls by g, and beyond 0.1 m is drawn on by k (y − 0.1 m): m z̈ = m g + k z."""
     (tmp_path / "band.py").write_text(BAND)

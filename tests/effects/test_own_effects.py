@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +93,39 @@ def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: 
     if "brushes" not in line:
         one, other = copies(tmp_path, f"{BRUSH}\n{line}\n")
         assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
+
+
+def test_an_edit_of_a_module_that_it_imports_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The numbers of a module are constants of the compiled form: an old form would go on with the old ones."""
+    monkeypatch.syspath_prepend(tmp_path)
+    grips, table = tmp_path / "brush_grips.py", tmp_path / "brush_table.py"
+    path = written(tmp_path, BRUSH.replace("import numpy as np\n", "import brush_grips\nimport numpy as np\n", 1))
+
+    def digest(grip: str, number: str) -> str:
+        grips.write_text(grip, encoding="utf-8")
+        table.write_text(number, encoding="utf-8")
+        for name in ("brush_grips", "brush_table"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        kernel.cache_clear()
+        importlib.import_module("brush_grips")
+        return kernel((load_effect(path),)).__name__
+
+    by_table = "from brush_table import SHARE\nGRIP = SHARE"
+    digests = [
+        digest("GRIP = 1.0", ""),
+        digest("GRIP = 2.0", ""),
+        digest(by_table, "SHARE = 3"),
+        digest(by_table, "SHARE = 4"),
+    ]
+    assert len(set(digests)) == 4
+    assert digest(by_table, "SHARE = 4") == digests[-1]
+
+
+def test_effect_files_are_read_as_utf_8_whatever_the_system_writes() -> None:
+    code = "from vinetrack.dynamics.kernel import kernel; from vinetrack.dynamics.model import base_model\n"
+    code += "kernel(base_model().effects)"
+    plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, **plain}, check=True)
 
 
 def test_a_missed_worked_number_is_told_with_its_arithmetic(tmp_path: Path) -> None:

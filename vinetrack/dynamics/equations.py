@@ -1,8 +1,8 @@
 """The interface of the integrator to one model and one trial: compiled functions and the arrays that they use.
 
-`vinetrack.dynamics.kernel` writes the functions of one model and collects them in an `Equations`; the integrator
-(`radau`, `slack_tail`, `integrator`) takes it as first argument. For numba the `Equations` of every model are a type of
-their own (`EquationsType`), so that the integrator is compiled for each model and the calls can be inlined.
+`vinetrack.dynamics.kernel` writes the functions of one model and collects them in an `Equations`, the first argument of
+the integrator. For numba the `Equations` of every model are a type of their own (`EquationsType`), so that the
+integrator is compiled for each model and the calls can be inlined.
 
 The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
 """
@@ -42,11 +42,29 @@ class TrialArrays(NamedTuple):
     bends: Floats  #: rows of start, arc and radius, m, shape (n_bends, 3)
 
 
+RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
+
+
+@inlined
+def _never_slack(equations, trial, h, start, end):  # noqa: ARG001
+    return 2.0  # beyond the end of every step
+
+
+@inlined
+def _not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
+    return False
+
+
+@inlined
+def _no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
+    return TAUT, row, start, 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Equations:
     """The compiled functions of one model, called with `(time, x, v, chamber, trial)` unless stated. x, v are position
-    and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa. The last five are for tails
-    that may go slack; otherwise they are the placeholders at the end of this file.
+    and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa. The last five are of
+    `vinetrack.dynamics.integrator` and for them, where tails may go slack.
     """
 
     name: str  #: of the model, unique in a process: it distinguishes numba's types
@@ -57,11 +75,11 @@ class Equations:
     has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument
     row_delay: Callable  #: how much later rows are read by the metre, s/m, of (trial) alone
     averaged_over: Callable  #: square of the time that positions are averaged over, s², of (trial) alone
-    tip_tension: Callable  #: tension that the tip leaves for the tail, N, and rate of the chamber; one more argument
-    free_fall: Callable  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
-    slack_fraction: Callable  #: `vinetrack.dynamics.integrator.slack_fraction`
-    slack_at_rest: Callable  #: `vinetrack.dynamics.integrator.slack_at_rest`
-    follow_slack: Callable  #: `vinetrack.dynamics.integrator.follow_slack`
+    slack_fraction: Callable = _never_slack
+    slack_at_rest: Callable = _not_slack_at_rest
+    follow_slack: Callable = _no_slack_phase
+    tip_tension: Callable | None = None  #: tension left for the tail, N, and rate of the chamber; one more argument
+    free_fall: Callable | None = None  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
 
 
 class EquationsType(types.Opaque):
@@ -111,9 +129,6 @@ class Point(NamedTuple):
     chamber: float
 
 
-RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4  # Status of a trajectory
-
-
 @inlined
 def trace_at(time, trial):
     """The measured pressure: linear between its samples, constant before the first and after the last."""
@@ -154,60 +169,6 @@ def angle_passed(y, trial):
     for k in range(trial.bends.shape[0]):
         angle += min(max(y - trial.bends[k, 0], 0.0), trial.bends[k, 1]) / trial.bends[k, 2]
     return angle
-
-
-@inlined
-def with_chamber():
-    """Value of `has_chamber` for a model with an equation of the chamber: true, as an inlined function."""
-    return True
-
-
-@inlined
-def without_chamber():
-    """Value of `has_chamber` for a model without an equation of the chamber: false, as an inlined function."""
-    return False
-
-
-@inlined
-def not_averaged(trial):  # noqa: ARG001
-    """Placeholder for `averaged_over` if positions are not averaged in time."""
-    return 0.0
-
-
-@inlined
-def no_row_delay(trial):  # noqa: ARG001
-    """Placeholder for `row_delay` if all rows of a picture are read at once."""
-    return 0.0
-
-
-@inlined
-def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
-    """Placeholder for `tip_tension` if no tail may go slack."""
-    return 0.0, 0.0
-
-
-@inlined
-def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
-    """Placeholder for `free_fall` if no tail may go slack."""
-    return 0.0
-
-
-@inlined
-def never_slack(equations, trial, h, start, end):  # noqa: ARG001
-    """Placeholder for `slack_fraction` if no tail may go slack: beyond the end of every step."""
-    return 2.0
-
-
-@inlined
-def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
-    """Placeholder for `slack_at_rest` if no tail may go slack."""
-    return False
-
-
-@inlined
-def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
-    """Placeholder for `follow_slack` if no tail may go slack."""
-    return TAUT, row, start, 0.0
 
 
 # ------------------------------------------------------------------------------

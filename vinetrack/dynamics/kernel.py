@@ -29,7 +29,7 @@ from vinetrack.core.records import Floats
 from vinetrack.core.threads import available_cores, thread_pool
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted, shared_host
-from vinetrack.effects import Effect, State, TrialInputs
+from vinetrack.effects import Effect, State, TrialInputs, effect_sources
 
 # Files of the integrator, which are part of the compiled form of a model
 PARTS = ("equations.py", "integrator.py")
@@ -38,12 +38,8 @@ _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vi
 
 from numba import njit
 
-from vinetrack.dynamics.equations import (
-    Equations, angle_passed, inlined, never_slack, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
-    not_averaged, not_slack_at_rest, trace_at, with_chamber, without_chamber,
-)
-from vinetrack.dynamics.integrator import integrate_trials
-from vinetrack.dynamics.integrator import follow_slack, slack_at_rest, slack_fraction
+from vinetrack.dynamics.equations import Equations, angle_passed, inlined, trace_at
+from vinetrack.dynamics.integrator import follow_slack, integrate_trials, slack_at_rest, slack_fraction
 from vinetrack.effects import State, TrialInputs
 
 '''
@@ -82,8 +78,6 @@ _MOTION = "time, x, v, chamber, trial"
 _MOVING = """x, v = max(x, 0.0), max(v, 0.0)
     y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"""
 _AT_REST = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
-_TAIL_FREE = ("tip_tension", "free_fall", "slack_fraction", "slack_at_rest", "follow_slack")
-_TAIL_TAUT = ("no_tip_tension", "no_free_fall", "never_slack", "not_slack_at_rest", "no_slack_phase")
 _AT_RELEASE = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
 
 
@@ -168,11 +162,6 @@ class _Writer:
         )
 
 
-def _modules(effect: Effect) -> list[str]:
-    """Names of the modules that define the functions of an effect."""
-    return sorted({function.__module__ for function in effect.functions.values()})
-
-
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     """Source of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects. Mass that effects
     add moves with the tail but has no weight of its own, so it is added after the forces.
@@ -206,12 +195,9 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             [*writer.calls("gauge", "pressure = {call}"), "return pressure"],
         ),
     ]
-    if writer.has("row_delay"):
-        delays = ["delay = 0.0", *writer.calls("row_delay", "delay += {call}"), "return delay"]
-        functions += [writer.function("row_delay", "trial", _AT_RELEASE, delays)]
-    if writer.has("averaged_over"):
-        squares = ["square = 0.0", *writer.calls("averaged_over", "square += {call}"), "return square"]
-        functions += [writer.function("averaged_over", "trial", _AT_RELEASE, squares)]
+    for hook in ("row_delay", "averaged_over"):
+        summed = ["total = 0.0", *writer.calls(hook, "total += {call}"), "return total"]
+        functions += [writer.function(hook, "trial", _AT_RELEASE, summed)]
     if tail_free:
         resting = ["if resting:", *[f"    {line}" for line in rest_forces or ["pass"]]]
         functions += [
@@ -226,11 +212,9 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             ),
         ]
     names = ", ".join(effect.name for effect in effects)
-    fields = ["rates", "rest_acceleration", "observed", "first_chamber"]
-    fields += ["with_chamber" if writer.has("chamber_rate") else "without_chamber"]
-    fields += ["row_delay" if writer.has("row_delay") else "no_row_delay"]
-    fields += ["averaged_over" if writer.has("averaged_over") else "not_averaged"]
-    fields += _TAIL_FREE if tail_free else _TAIL_TAUT
+    functions += [f"@inlined\ndef has_chamber():\n    return {writer.has('chamber_rate')}\n"]
+    fields = ["rates", "rest_acceleration", "observed", "first_chamber", "has_chamber", "row_delay", "averaged_over"]
+    fields += ["slack_fraction", "slack_at_rest", "follow_slack", "tip_tension", "free_fall"] if tail_free else []
     foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
     return "\n".join((_HEAD.format(names=names), *writer.loads.values(), *functions, foot))
 
@@ -267,7 +251,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], units)]
     parts += [numba.__version__, sys.version]
     # The compiled form refers to the modules of the effects by name, so the names are part of the hash.
-    parts += [text for effect in effects for text in (effect.path.read_text(), *_modules(effect))]
+    parts += [function.__module__ for effect in effects for function in effect.functions.values()]
+    parts += [file.read_text(encoding="utf-8") for effect in effects for file in effect_sources(effect.path)]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     if digest in _LOADED:
         return _LOADED[digest]

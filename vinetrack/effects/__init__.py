@@ -11,6 +11,7 @@ from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs
 from vinetrack.effects._catalogue import (
     EffectError,
     catalogue,
+    effect_sources,
     explanation,
     find_effect,
     listing,
@@ -31,6 +32,7 @@ __all__ = [
     "TrialInputs",
     "Worked",
     "catalogue",
+    "effect_sources",
     "explanation",
     "find_effect",
     "listing",

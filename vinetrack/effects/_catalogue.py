@@ -15,8 +15,8 @@ import json
 import os
 import re
 import sys
-import warnings
-from collections.abc import Iterable, Mapping
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from numbers import Real
 from pathlib import Path
@@ -120,16 +120,42 @@ def _load_module(path: Path) -> ModuleType:
     return module
 
 
+def _imported(tree: ast.Module) -> Iterator[str]:
+    """Dotted names that a file imports, from wherever in it; what is imported from a module may be one too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            yield module
+            yield from (f"{module}{'' if module.endswith('.') else '.'}{alias.name}" for alias in node.names)
+
+
 def _is_independent_of_path(text: bytes) -> bool:
     """Whether an effect is independent of the location of its file: no local imports, no names such as `__file__`."""
     try:
-        nodes = list(ast.walk(ast.parse(text)))
+        tree = ast.parse(text)
     except (SyntaxError, ValueError):
         return False
-    imported = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    imported += ["." * node.level + (node.module or "") for node in nodes if isinstance(node, ast.ImportFrom)]
-    names = [node.id for node in nodes if isinstance(node, ast.Name)]
-    return {name.split(".")[0] for name in imported} <= _PLAIN_MODULES and not any(n.startswith("__") for n in names)
+    plain = {name.split(".")[0] for name in _imported(tree)} <= _PLAIN_MODULES
+    return plain and not any(isinstance(node, ast.Name) and node.id.startswith("__") for node in ast.walk(tree))
+
+
+def effect_sources(path: Path) -> list[Path]:
+    """The file of an effect, and those of the modules that it imports, directly or not, beside the installed ones."""
+    if path.is_relative_to(CATALOGUE):
+        return [path]
+    installed = [CATALOGUE, *(Path(folder) for folder in sysconfig.get_paths().values())]
+    found, waiting = [path], [(path, "")]
+    while waiting:
+        file, package = waiting.pop()
+        for name in _imported(ast.parse(file.read_bytes())):
+            module = sys.modules.get(importlib.util.resolve_name(name, package) if package else name)
+            origin = Path(getattr(module, "__file__", None) or "")
+            if origin.suffix == ".py" and origin not in found and not any(map(origin.is_relative_to, installed)):
+                found.append(origin)
+                waiting.append((origin, getattr(module, "__package__", "") or ""))
+    return found
 
 
 def load_effect(path: Path | str) -> Effect:
@@ -160,6 +186,9 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
     # From the source, because from Python 3.13 on `__doc__` loses the indentation that marks the formula.
     text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
+    breakpoints = of_rig = getattr(module, "breakpoints", None)
+    if of_rig is not None and len(inspect.signature(of_rig).parameters) == 1:
+        breakpoints = lambda rig, *_: of_rig(rig)  # noqa: E731
     return Effect(
         name=path.stem,
         kind=getattr(module, "KIND", "physical"),
@@ -175,20 +204,8 @@ def _effect_of(module: ModuleType, path: Path) -> Effect:
         replaces=tuple(getattr(module, "REPLACES", ())),
         order=int(getattr(module, "ORDER", 3)),
         finite=bool(getattr(module, "FINITE", False)),
-        breakpoints=_breakpoints(module),
+        breakpoints=breakpoints,
     )
-
-
-def _breakpoints(module: ModuleType) -> Any:
-    """The function `breakpoints` of rig and parameters in an effect's file, also under its former name `corners`. A
-    function of the rig alone does not depend on parameters.
-    """
-    if hasattr(module, "corners") and not hasattr(module, "breakpoints"):
-        warnings.warn(f"{module.__file__}: `corners` is now called `breakpoints`", FutureWarning, stacklevel=3)
-    function = getattr(module, "breakpoints", getattr(module, "corners", None))
-    if function is None or len(inspect.signature(function).parameters) > 1:
-        return function
-    return lambda rig, *_: function(rig)
 
 
 def _faults(effect: Effect) -> Iterable[str]:

@@ -10,46 +10,18 @@ from typing import Any
 from vinetrack.effects._base import Effect, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import EffectError, load_effect
 
+# A vine in motion, in which every effect can act
 _STATE = State(
-    time=0.05,
-    lead_position=0.1,
-    lead_velocity=1.5,
-    tail_position=0.2,
-    tail_velocity=3.0,
-    set_pressure=28e3,
-    pressure=27e3,
-    yield_pressure=3e3,
-    area=4.5e-4,
-    linear_density=0.018,
-    moving_mass=0.039,
-    damping_gain=1.1,
-    bend_angle=0.5,
-    tail_tension=2.0,
-    observed=0.101,
-)
+    time=0.05, lead_position=0.1, lead_velocity=1.5, tail_position=0.2, tail_velocity=3.0, set_pressure=28e3,
+    pressure=27e3, yield_pressure=3e3, area=4.5e-4, linear_density=0.018, moving_mass=0.039, damping_gain=1.1,
+    bend_angle=0.5, tail_tension=2.0, observed=0.101,
+)  # fmt: skip
 _RIG = TrialInputs(
-    set_pressure=28e3,
-    yield_pressure=3e3,
-    diameter=24e-3,
-    thickness=200e-6,
-    length=0.28,
-    area=4.5e-4,
-    linear_density=0.018,
-    mass_loss=0.009,
-    payload_mass=0.0356,
-    cos_angle=1.0,
-    travel_ratio=2.0,
-    ambient_pressure=101_325.0,
-    chamber_volume=3.7e-3,
-    inlet_area=2.8e-5,
-    least_mass=6e-5,
-    has_bends=1.0,
-    tail_on_reel=0.0,
-    bend_count=1.0,
-    bend_total=1.0,
-    as_printed=0.0,
-    tail_free=0.0,
-)
+    set_pressure=28e3, yield_pressure=3e3, diameter=24e-3, thickness=200e-6, length=0.28, area=4.5e-4,
+    linear_density=0.018, mass_loss=0.009, payload_mass=0.0356, cos_angle=1.0, travel_ratio=2.0,
+    ambient_pressure=101_325.0, chamber_volume=3.7e-3, inlet_area=2.8e-5, least_mass=6e-5, has_bends=1.0,
+    tail_on_reel=0.0, bend_count=1.0, bend_total=1.0, as_printed=0.0, tail_free=0.0,
+)  # fmt: skip
 
 # Values that functions must return in the state above where their effect vanishes
 UNCHANGED = {
