@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.experiment.settings import Charuco, Checkerboard
-from vinetrack.laboratory.scene import Camera, Sensor, preset
-from vinetrack.laboratory.targets import Target, render_target
+from vinetrack.laboratory.filming import render_target
+from vinetrack.laboratory.scene import Camera, Sensor, Target, preset
 from vinetrack.video.calibration import CalibrationError, calibrate_pictures
 
 PICTURES = ((960, 320), (1280, 720), (640, 640))

@@ -25,8 +25,8 @@ import numpy as np
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording

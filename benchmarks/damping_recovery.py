@@ -31,8 +31,16 @@ from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import fit_laws, mark_half_steady
 from vinetrack.kinematics.summary import summarise_trial
-from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
-from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_values, paper_damping
+from vinetrack.laboratory.tracks import (
+    BASE,
+    PAPER_B,
+    PAPER_N,
+    GroundTruth,
+    VirtualTrial,
+    damping_values,
+    grow,
+    paper_damping,
+)
 
 NATURES = {
     "plain": {},

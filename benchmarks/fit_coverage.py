@@ -33,8 +33,7 @@ from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.units import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
-from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, campaign, damping_values, grow, isometric_vine
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"

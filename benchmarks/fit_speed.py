@@ -18,8 +18,7 @@ import numpy as np
 import vinetrack as vt
 from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Track, Trial
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values, paper_damping
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, paper_damping
 
 SIZES = (12, 24, 48, 100, 200)
 EFFECT = "reservoir_depletion"

@@ -38,7 +38,7 @@ from vine_reference import G, masses, reference
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import base_model
 from vinetrack.dynamics.simulate import prepare, simulate, simulate_many
-from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, PAPER_B, PAPER_N, Vine, paper_damping, paper_payload
+from vinetrack.laboratory.tracks import CAPTURE_FPS, PAPER_B, PAPER_N, Vine, paper_damping, paper_payload
 
 FAST_B = 3.3
 RELATIVE = 10.0 ** np.arange(-4, -11.5, -0.5)

@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 
 ROOT = Path(__file__).resolve().parents[1]

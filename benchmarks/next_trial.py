@@ -34,8 +34,7 @@ from vinetrack.core.terminal import table
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import Vine, campaign
+from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 TUBE, DAMPING, EXPONENT, GUESSED_WRONG = Vine(24.0, 200.0, 280.0), 6.44, 0.37, 1.15

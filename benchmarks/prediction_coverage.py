@@ -27,8 +27,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
 from vinetrack.planning.input_sources import predictive_inputs
 from vinetrack.planning.prediction import run
 from vinetrack.planning.predictive_inputs import numbers_of

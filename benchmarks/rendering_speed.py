@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vinetrack.laboratory.render import FrameRenderer, render_recording
+from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.render import FrameRenderer
 from vinetrack.laboratory.scene import Ball, preset
 
 CAPTURE_FPS, N_FRAMES, SEED = 1069.0, 250, 11
@@ -26,7 +27,6 @@ CASES = (
     ("half_frame_exposure", ".mp4"),
     ("payload", ".mp4"),
     ("shake", ".mp4"),
-    ("distorted", ".mp4"),
     ("diagonal", ".mp4"),
     ("twelve_bit", ".mkv"),
     ("twelve_bit", ""),

@@ -31,7 +31,8 @@ from unittest import mock
 import numpy as np
 
 from vinetrack.core.records import Trial
-from vinetrack.laboratory.render import Truth, render_recording
+from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.video import track
 from vinetrack.video.axis import Axis, find_axis
@@ -235,7 +236,7 @@ def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
             tips = np.asarray(plan.from_px) + scene.edge_px[:, None] * direction
             n = len(scene.frames)
             truth = Truth(
-                np.arange(n), np.arange(n) / CAPTURE_FPS, scene.edge_px, scene.edge_px, tips[:, 0], tips[:, 1],
+                np.arange(n) / CAPTURE_FPS, scene.edge_px, scene.edge_px, tips[:, 0], tips[:, 1],
                 np.ones(n, bool), 1.0, 0.0, CAPTURE_FPS, plan.exposure / CAPTURE_FPS,
             )  # fmt: skip
             rows.append(measure(f"plain_{name}_{seed}", path, truth, 2.0)[0])

@@ -21,10 +21,9 @@ from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film, picture_target
 from vinetrack.laboratory.render import Truth
-from vinetrack.laboratory.targets import Target
+from vinetrack.laboratory.scene import Camera, Target
 from vinetrack.laboratory.tracks import GroundTruth, grow
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"

@@ -13,10 +13,15 @@ from hidden.campaigns import Hidden
 from hidden.folder import write_folder
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.laboratory.camera import Camera
-from vinetrack.laboratory.filming import FINE_STEPS, Filming, picture_target, recording_experiment, scene_of
-from vinetrack.laboratory.render import render_recording
-from vinetrack.laboratory.targets import Target
+from vinetrack.laboratory.filming import (
+    FINE_STEPS,
+    Filming,
+    picture_target,
+    recording_experiment,
+    render_recording,
+    scene_of,
+)
+from vinetrack.laboratory.scene import Camera, Target
 
 WIDTH_PX, HEIGHT_PX, MARGIN = 960, 320, 1.35
 """Of the picture, and how many times the longest vine it is wide."""

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.diagnosis import propose as fits
 from vinetrack.diagnosis.propose import add
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow, write_experiment
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
 from vinetrack.pipeline.workflow import command_for_results
 
 LADDER = (

@@ -21,8 +21,7 @@ from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
 from vinetrack.inference.position_errors import smooth_errors
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 B = "eversion_damping.B"
 Change = Callable[[Trial, int], float]

@@ -6,8 +6,7 @@ import numpy as np
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 
 def campaign(seed: int) -> Pairs:

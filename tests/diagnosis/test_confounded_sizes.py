@@ -21,8 +21,7 @@ from vinetrack.diagnosis.result import Confounder
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 from vinetrack.narrative.verdict_text import confounders_in_words
 
 DRAG, INLET = "air_drag.C_D", "inlet_loss.K"

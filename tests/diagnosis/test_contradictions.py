@@ -14,8 +14,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.selection import contradictions, displacement_m, is_within_position_errors
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 
 @pytest.fixture(scope="module")

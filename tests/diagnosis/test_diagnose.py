@@ -21,7 +21,7 @@ from vinetrack.core.records import Track
 from vinetrack.diagnosis.odd_trials import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import damping_values
 
 FEW = ("reservoir_depletion", "supply_refill", "tail_friction", "length_scale", "leak", "latch_release")
 

@@ -20,8 +20,7 @@ from vinetrack.diagnosis.score_test import fit_columns, informations_at, product
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.robust_covariance import Systematics, systematics_of
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 
 def careful(payload_g: float, seed: int) -> Pairs:

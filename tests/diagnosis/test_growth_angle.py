@@ -11,7 +11,7 @@ from grown import Pairs, grown, pairs_of
 import vinetrack as vt
 from vinetrack.diagnosis.result import NOT_TESTABLE, Diagnosis
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.vine_campaigns import Vine, campaign
+from vinetrack.laboratory.tracks import Vine, campaign
 
 RIVALS = ("growth_angle", "payload_friction", "pressure_gauge", "leak")
 

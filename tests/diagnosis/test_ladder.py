@@ -31,8 +31,7 @@ from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit import predict_prepared, predict_trials
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import BASE, GroundTruth, campaign, damping_values, grow, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 DEPLETION = "reservoir_depletion"

@@ -19,8 +19,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import Vine, campaign
+from vinetrack.laboratory.tracks import BASE, GroundTruth, Vine, campaign, grow
 from vinetrack.planning.predictive_inputs import damping_prior
 
 Pairs = list[tuple[Trial, Track]]

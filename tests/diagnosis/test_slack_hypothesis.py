@@ -15,8 +15,7 @@ from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, pushes, select_effects, slack_fit
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 
 def grown(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:

@@ -23,8 +23,7 @@ from vinetrack.diagnosis.misfit_tests import (
 )
 from vinetrack.experiment.schema import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import BASE, GroundTruth, campaign, damping_values, grow, isometric_vine
 
 WANDER_M = 2e-4
 

@@ -16,7 +16,7 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import simulate, simulate_many
 from vinetrack.effects import EffectError
-from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, PAPER_B, PAPER_N, paper_damping, paper_payload
+from vinetrack.laboratory.tracks import CAPTURE_FPS, PAPER_B, PAPER_N, paper_damping, paper_payload
 
 VINE = Trial(
     name="vine",

@@ -10,8 +10,16 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import BASE, GroundTruth, VirtualTrial, grow
-from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import (
+    BASE,
+    CAPTURE_FPS,
+    GroundTruth,
+    VirtualTrial,
+    campaign,
+    damping_values,
+    grow,
+    isometric_vine,
+)
 
 Pairs = list[tuple[Trial, Track]]
 FORCES = {

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.schema import with_names
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.tracks import BASE, GroundTruth, campaign, damping_values, grow, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 

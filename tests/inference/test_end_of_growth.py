@@ -18,8 +18,7 @@ from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, misfit_tests
 from vinetrack.dynamics.simulate import Trajectory
 from vinetrack.inference.sensitivity import position_change
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 TIMES_S = np.arange(0.0, 0.3, 1e-3)
 LENGTH_M = 0.4

@@ -21,9 +21,17 @@ from vinetrack.kinematics.summary import (
     redo_damping,
     summarise_trial,
 )
-from vinetrack.laboratory.tracks import BASE, GroundTruth, grow
-from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_pressures_kPa, damping_values, isometric_vine
-from vinetrack.laboratory.vine_campaigns import campaign as of_vine
+from vinetrack.laboratory.tracks import (
+    BASE,
+    PAPER_B,
+    PAPER_N,
+    GroundTruth,
+    damping_pressures_kPa,
+    damping_values,
+    grow,
+    isometric_vine,
+)
+from vinetrack.laboratory.tracks import campaign as of_vine
 
 SETTINGS = RunSettings.model_validate({"damping": {"resamples": 300}})
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.laboratory.render import FrameRenderer, frame_order, motion_function, tip_profiles
-from vinetrack.laboratory.scene import PRESETS, Ball, Camera, Door, Faults, Light, Scene, Sensor, Tube, preset
+from vinetrack.laboratory.render import FrameRenderer
+from vinetrack.laboratory.scene import Ball, Camera, Door, Light, Scene, Sensor, Tube, preset
 
 FPS = 1000.0
 CLEAN = preset("clean")
@@ -53,7 +53,7 @@ def length_from_area(levels: np.ndarray, rows: slice) -> float:
 # --- the leading edge
 
 
-@pytest.mark.parametrize("exposure_s", [1e-6, 2e-4, 5e-4, 9.9e-4])
+@pytest.mark.parametrize("exposure_s", [1e-6, 9.9e-4])
 def test_tip_is_where_the_area_says_at_any_exposure(exposure_s):
     scene = replace(CLEAN, camera=SMALL)
     shots = renderer(scene, steadily(2.0), exposure_s=exposure_s)
@@ -65,7 +65,7 @@ def test_tip_is_where_the_area_says_at_any_exposure(exposure_s):
         assert measured == pytest.approx(truth.tip_x_px[index], abs=0.01)
 
 
-@pytest.mark.parametrize("angle_deg", range(0, 360, 15))
+@pytest.mark.parametrize("angle_deg", [0, 37, 90, 215])
 def test_growth_in_any_direction_adds_the_tubes_width_times_its_travel(angle_deg):
     scene = replace(CLEAN, camera=Camera(width_px=360, height_px=360), growth_angle_deg=angle_deg)
     shots = renderer(scene, steadily(2.0), exposure_s=3e-4)
@@ -77,18 +77,6 @@ def test_growth_in_any_direction_adds_the_tubes_width_times_its_travel(angle_deg
     step = np.array([np.diff(truth.tip_x_px)[0], np.diff(truth.tip_y_px)[0]])
     angle = math.radians(angle_deg)
     assert step == pytest.approx(np.diff(truth.lead_px)[0] * np.array([math.cos(angle), math.sin(angle)]), abs=1e-9)
-
-
-def test_half_way_point_of_a_motion_blurred_step_is_the_tip_at_mid_exposure():
-    scene = replace(CLEAN, camera=SMALL)
-    shots = renderer(scene, steadily(6.0), exposure_s=9e-4, n_frames=20)
-    truth = shots.truth(np.array([12]))
-    profile = shots.frame(12)[axis_rows(scene)].mean(axis=0) / 65535
-    columns = np.flatnonzero((profile[:-1] >= 0.45) & (profile[1:] < 0.45))
-    k = columns[0]
-    crossing = k + (profile[k] - 0.45) / (profile[k] - profile[k + 1])
-    assert 6.0 * 9e-4 / scene.camera.m_per_px > 14  # the blur is many pixels wide
-    assert crossing == pytest.approx(truth.tip_x_px[0], abs=0.01)
 
 
 def test_truth_is_in_metres_along_the_growth_and_at_mid_exposure():
@@ -128,39 +116,10 @@ def test_distorted_and_tilted_tip_is_where_opencv_projects_it():
     assert np.column_stack([truth.tip_x_px, truth.tip_y_px]) == pytest.approx(expected[:, 0], abs=1e-6)
 
 
-def test_edge_in_a_distorted_picture_is_where_the_truth_says():
-    camera = Camera(width_px=480, height_px=128, focal_px=700, k1=-0.3, k2=0.1)
-    scene = replace(CLEAN, camera=camera)
-    shots = renderer(scene, exposure_s=1e-6)
-    truth = shots.truth(np.array([35]))
-    profile = shots.frame(35)[63:65].mean(axis=0) / 65535
-    k = np.flatnonzero((profile[:-1] >= 0.45) & (profile[1:] < 0.45))[0]
-    crossing = k + (profile[k] - 0.45) / (profile[k] - profile[k + 1])
-    assert abs(crossing - truth.lead_px[0] - scene.origin[0]) > 0.05  # distortion moves it
-    assert crossing == pytest.approx(truth.tip_x_px[0], abs=0.01)
-
-
 def test_camera_maps_there_and_back():
     camera = Camera(focal_px=900, k1=-0.3, k2=0.1, tilt_x_deg=6, tilt_y_deg=-9)
     points = np.random.default_rng(0).uniform([0, 0], [959, 319], (200, 2))
     assert camera.picture_from_plane(camera.plane_from_picture(points)) == pytest.approx(points, abs=1e-8)
-
-
-def test_tip_leaves_the_picture_and_the_truth_says_when():
-    scene = replace(CLEAN, camera=SMALL)
-    truth = renderer(scene, steadily(4.0)).truth(np.arange(60))
-    assert truth.in_frame[0]
-    assert not truth.in_frame[-1]
-    assert (truth.tip_x_px[truth.in_frame] < 479.5).all()
-    assert (truth.tip_x_px[~truth.in_frame] >= 479.5).all()
-
-
-def test_tip_outline_is_flat_on_the_axis_and_round_at_its_corners():
-    setback, _, side, _ = tip_profiles(Tube(tip_roundness=0.5), 32.0, 0.7)
-    half = (setback.size - 1) // 2
-    assert setback[half - 15 * 16 : half + 15 * 16].max() == 0
-    assert setback[half + 24 * 16] == pytest.approx(16 - math.sqrt(16**2 - 8**2))
-    assert side[half + 32 * 16] == pytest.approx(0.5)
 
 
 # --- what moves with what
@@ -189,16 +148,6 @@ def test_tail_moves_at_twice_the_speed_of_the_tip():
     assert shift == pytest.approx(2 * np.diff(truth.lead_px)[0], abs=0.3)
 
 
-def test_motion_blur_smears_the_tail_along_its_own_path():
-    tube = Tube(opacity=0, tail_opacity=0.9, brightness=0.4, tail_texture=0.4, texture=0, specular=0, length_m=0.16)
-    scene = replace(CLEAN, camera=SMALL, subject=tube)
-    sharp, smeared = (
-        renderer(scene, steadily(3.0), exposure_s=exposure_s).frame(30)[58:70, 190:300].astype(float)
-        for exposure_s in (1e-6, 9e-4)
-    )
-    assert np.diff(smeared, axis=1).std() < 0.5 * np.diff(sharp, axis=1).std()
-
-
 def test_payload_leaves_at_the_end_and_flies_on_at_the_speed_of_the_tail():
     tube = replace(CLEAN.subject, length_m=0.05, payload_diameter_m=0.008, payload_brightness=0.45)
     scene = replace(CLEAN, camera=SMALL, subject=tube)
@@ -221,16 +170,6 @@ def test_evenly_bright_ball_has_its_centroid_at_the_truth():
     extra = shots.frame(130).astype(float) - BEHIND
     row = (extra.sum(axis=1) @ np.arange(400)) / extra.sum()
     assert row == pytest.approx(truth.tip_y_px[0] - 0.0075 * 3000, abs=0.01)
-
-
-def test_texture_of_a_body_moves_with_it():
-    camera = Camera(width_px=160, height_px=400, m_per_px=1 / 3000)
-    scene = replace(CLEAN, camera=camera, subject=Ball(diameter_m=0.015, texture=0.4), growth_angle_deg=90)
-    moved_px = 12
-    shots = renderer(scene, steadily(moved_px / 3000 * FPS), n_frames=10, exposure_s=1e-6)
-    early, late = shots.frame(2).astype(float), shots.frame(3).astype(float)
-    assert np.abs(early[:-moved_px] - late[moved_px:]).max() < 0.02 * 65535
-    assert np.abs(early - late).max() > 0.3 * 65535
 
 
 def test_sway_moves_the_tip_sideways_as_the_truth_says():
@@ -273,14 +212,6 @@ def test_shake_moves_the_background_as_the_truth_says():
     assert truth.lead_position_m == pytest.approx([0, 0])
 
 
-def test_contrast_of_the_tube_changes_sign_along_the_way():
-    scene = replace(preset("contrast_reversal"), sensor=NO_NOISE)
-    shots = renderer(scene, lambda t: np.minimum(5.0 * np.asarray(t), 0.279), n_frames=60)
-    change = (shots.frame(58).astype(float) - shots.frame(0))[145:175].mean(axis=0)
-    assert change[150:250].mean() > 0.03 * 65535
-    assert change[650:750].mean() < -0.03 * 65535
-
-
 # --- light and sensor
 
 
@@ -295,17 +226,6 @@ def test_noise_has_the_variance_of_shot_and_read_noise():
     assert frames.var(axis=0, ddof=1).mean() == pytest.approx(expected, rel=0.01)
 
 
-def test_noise_of_neighbouring_pixels_rows_and_frames_is_unrelated():
-    scene = replace(CLEAN, sensor=Sensor(fixed_pattern=0, bit_depth=16))
-    shots = renderer(scene, still)
-    noise = np.array([shots.frame(index)[:100, 300:900] for index in range(2)], dtype=float)
-    noise -= noise.mean()
-    for other in (noise[:, :, 1:], noise[:, :, 4:], noise[:, 1:, :]):
-        one = noise[:, : other.shape[1], : other.shape[2]]
-        assert abs((one * other).mean() / noise.var()) < 4 / math.sqrt(one.size)
-    assert abs((noise[0] * noise[1]).mean() / noise.var()) < 4 / math.sqrt(noise[0].size)
-
-
 def test_lamps_flicker_by_what_is_left_after_the_exposure():
     light = Light(flicker=0.2, flicker_Hz=100.0, vignetting=0)
     shots = renderer(replace(CLEAN, light=light), still, exposure_s=9e-4, n_frames=100)
@@ -315,28 +235,6 @@ def test_lamps_flicker_by_what_is_left_after_the_exposure():
     left = abs(np.exp(2j * np.pi * 100 * begin_s).mean())
     assert spectrum[10] == pytest.approx(0.2 * left, rel=1e-3)
     assert np.delete(spectrum, 10).max() < 1e-3
-
-
-def test_corners_are_darker_by_the_vignetting():
-    shots = renderer(replace(CLEAN, light=Light(vignetting=0.3)), still)
-    levels = shots.frame(0) / 6553.5
-    assert levels[-1, -1] == pytest.approx(0.7, abs=1e-3)
-    assert levels[160, 480] == pytest.approx(1.0, abs=1e-3)
-
-
-def test_gamma_lifts_the_levels():
-    sensor = replace(NO_NOISE, gamma=2.2)
-    assert renderer(replace(CLEAN, sensor=sensor), still).frame(0)[20, 600] / 65535 == pytest.approx(
-        0.1 ** (1 / 2.2), abs=1e-3
-    )
-
-
-@pytest.mark.parametrize("bit_depth", [8, 10, 12, 16])
-def test_full_scale_is_the_highest_level_of_the_bit_depth(bit_depth):
-    scene = replace(CLEAN, sensor=replace(NO_NOISE, bit_depth=bit_depth), subject=replace(CLEAN.subject, brightness=3))
-    levels = renderer(scene, still).frame(0)
-    assert levels.max() == 2**bit_depth - 1
-    assert levels.dtype == (np.uint8 if bit_depth == 8 else np.uint16)
 
 
 def test_ticks_of_the_ruler_are_a_millimetre_apart():
@@ -371,50 +269,3 @@ def test_a_frame_does_not_depend_on_which_were_rendered_before():
     for index in range(5):
         shots.frame(index)
     assert (shots.frame(30) == alone).all()
-
-
-def test_frames_missed_and_written_twice():
-    scene = replace(CLEAN, faults=Faults(dropped=(3,), repeated=(5,)))
-    assert frame_order(scene, 8).tolist() == [0, 1, 2, 4, 5, 5, 6, 7]
-
-
-def test_wrong_second_and_corrupt_first_frame():
-    scene = replace(CLEAN, faults=Faults(wrong_second_frame=True, corrupt_first_frame=True))
-    order = frame_order(scene, 9)
-    assert order[0] == -1
-    assert order[1] == 6
-    assert order[2:].tolist() == list(range(2, 9))
-
-
-def test_frame_that_shows_nothing_has_no_position():
-    truth = renderer(CLEAN).truth(np.array([-1, 5]))
-    assert np.isnan(truth.lead_position_m[0])
-    assert np.isnan(truth.tip_x_px[0])
-    assert not truth.in_frame[0]
-    assert np.isfinite(truth.lead_position_m[1])
-
-
-def test_samples_are_held_before_and_after():
-    position = motion_function((np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.01, 0.04])))
-    assert position(np.array([0.0, 0.2, 1.0])) == pytest.approx([0.0, 0.01, 0.04])
-
-
-def test_exposure_longer_than_a_frame_is_refused():
-    with pytest.raises(ValueError, match="does not fit between frames at 1000 a second; choose a shorter one"):
-        renderer(CLEAN, exposure_s=2e-3)
-
-
-def test_unknown_preset_is_refused_with_the_names_there_are():
-    with pytest.raises(ValueError, match="choose one of clean, demo"):
-        preset("dmeo")
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_shows_its_subject_moving(name):
-    scene = preset(name)
-    shots = renderer(scene, lambda t: np.minimum(2.5 * np.asarray(t), 0.1), n_frames=40)
-    first, last = shots.frame(0).astype(float), shots.frame(39).astype(float)
-    assert first.shape == (scene.camera.height_px, scene.camera.width_px)
-    full = 2**scene.sensor.bit_depth - 1
-    assert first.mean() > 0.01 * full
-    assert (np.abs(last - first) > 0.03 * full).sum() > 500

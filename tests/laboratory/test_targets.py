@@ -10,10 +10,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from vinetrack.laboratory.camera import Camera
+from vinetrack.laboratory.filming import render_target
 from vinetrack.laboratory.render import FrameRenderer
-from vinetrack.laboratory.scene import Sensor, preset
-from vinetrack.laboratory.targets import Target, render_target
+from vinetrack.laboratory.scene import Camera, Sensor, Target, preset
 
 CAMERA = Camera(focal_px=1300, k1=-0.25, k2=0.08, tilt_x_deg=7, tilt_y_deg=-9)
 SCENE = replace(preset("demo"), camera=CAMERA, sensor=Sensor(noise=False, fixed_pattern=0, bit_depth=16))

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from vinetrack.experiment.settings import Charuco, Checkerboard, MmPerPx, TwoPoints
-from vinetrack.laboratory.render import render_recording
-from vinetrack.laboratory.scene import Camera, Encoding, Light, Sensor, Tube, preset
-from vinetrack.laboratory.targets import Target, render_calibration_clip, render_target
+from vinetrack.laboratory.filming import render_calibration_clip, render_recording, render_target
+from vinetrack.laboratory.scene import Camera, Encoding, Light, Sensor, Target, Tube, preset
 from vinetrack.video.calibration import CalibrationError, PlaneMap, calibrate, calibrate_pictures, fit_planes
 
 DEMO = preset("demo")

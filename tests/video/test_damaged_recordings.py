@@ -16,9 +16,9 @@ import pytest
 
 from vinetrack.core.records import Correction, Trial
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film
 from vinetrack.laboratory.render import Truth
+from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge import outline, track_edge

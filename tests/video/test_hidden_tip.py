@@ -11,7 +11,7 @@ from plain_scene import Plan, Scene, plain_scene
 from tracking_accuracy import along_axis, film
 
 from vinetrack.core.records import Track, Trial, with_flag
-from vinetrack.laboratory.render import render_recording
+from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import Camera, Door, preset
 from vinetrack.video.frames import Frames, Recording, inspect_recording, read_frames
 from vinetrack.video.track import track_frames, track_recording

@@ -12,7 +12,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.settings import run_settings
-from vinetrack.laboratory.render import render_recording
+from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import Tube, preset
 from vinetrack.pipeline.recordings_stage import analyse_recording
 from vinetrack.results.folder_layout import Results, read_json

@@ -10,8 +10,8 @@ import pytest
 from scipy.special import ndtr
 
 from vinetrack.experiment.settings import Charuco, Checkerboard
-from vinetrack.laboratory.scene import Camera, Light, Sensor, preset
-from vinetrack.laboratory.targets import Target, render_target
+from vinetrack.laboratory.filming import render_target
+from vinetrack.laboratory.scene import Camera, Light, Sensor, Target, preset
 from vinetrack.video.target_corners import (
     CornersError,
     charuco_corners,

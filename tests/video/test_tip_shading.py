@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Trial
-from vinetrack.laboratory.render import render_recording
+from vinetrack.laboratory.filming import render_recording
 from vinetrack.laboratory.scene import preset
 from vinetrack.video.frames import read_frames
 from vinetrack.video.track import track_frames

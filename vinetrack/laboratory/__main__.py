@@ -1,13 +1,12 @@
 """Simulate the trials of an experiment folder and write the recordings or tracks that its sheet names.
 
-    python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE] [--processes N]
+    python -m vinetrack.laboratory data/demo [--nature FILE] [--processes N]
     python -m vinetrack.laboratory data/paper --film FOLDER [--only PATTERN]
 
 Trials with a `video` are filmed, with the calibration picture that `experiment.yaml` names; those with a `track` are
 measured. The sheet defines the trials, and `--nature` the ground truth (default: the file of this package with the name
 of the experiment's folder, else that of the demonstration). `--film` makes an experiment of recordings from one of
-tracks, with all its trials or those whose names match a pattern such as 'fig4_*'. The truth is written only to the file
-that `--truth` names, never inside the experiment.
+tracks, with all its trials or those whose names match a pattern such as 'fig4_*'.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import yaml
 
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target, recording_experiment
-from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth, write_tracks, write_truth
+from vinetrack.laboratory.tracks import VirtualTrial, grow, read_ground_truth, write_tracks
 
 DEMO = Path(__file__).with_name("demo.yaml")
 
@@ -33,7 +32,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m vinetrack.laboratory", description="Grow the trials of a sheet.")
     parser.add_argument("experiment", type=Path)
     parser.add_argument("--nature", type=Path)
-    parser.add_argument("--truth", type=Path)
     parser.add_argument("--film", type=Path, metavar="FOLDER")
     parser.add_argument("--only", default="*", metavar="PATTERN")
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
@@ -65,8 +63,6 @@ def main(arguments: list[str] | None = None) -> None:
             flush=True,
         )
         _film(experiment, filmed, filming, truth.seed, given.processes)
-    if given.truth is not None:
-        write_truth(grown, truth, given.truth)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
 

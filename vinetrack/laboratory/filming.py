@@ -1,31 +1,188 @@
-"""Simulated recordings of a campaign, and a picture of the calibration target.
+"""Recordings: rendered frames written to files, simulated campaigns before a camera, and pictures of the target.
 
-The campaign is simulated first (`tracks.grow`), and its true motion is then filmed, so that the results of a tracker
+A campaign is simulated first (`tracks.grow`), and its true motion is then filmed, so that the results of a tracker
 can be compared with it. An experiment of tracks is turned into one of recordings with the same sheet, a camera and a
-target.
+target. Files are H.264 as in cameras, FFV1 without loss, or a folder of PNG pictures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.tables import replacing, write_csv, write_text
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.laboratory.camera import Camera
-from vinetrack.laboratory.render import Truth, render_recording
-from vinetrack.laboratory.scene import Scene, Tube, preset
-from vinetrack.laboratory.targets import Target, render_target
+from vinetrack.laboratory.render import FrameRenderer, Motion, Truth, lay_target, plane_seen
+from vinetrack.laboratory.scene import Camera, Scene, Target, Tube, preset
 from vinetrack.laboratory.tracks import VirtualTrial
+
+Frame = NDArray[np.uint8 | np.uint16]
+
+CODECS = {"h264": "libx264", "ffv1": "ffv1"}
+GREY_FORMATS = {8: "gray", 12: "gray12le", 16: "gray16le"}
+CONTAINER_FPS = 60  # Frames per second that a file of a high-speed camera claims (chosen)
+LIMITED_RANGE = 1  # Code of the H.264 stream for levels of 16…235 (defined)
+TINT = (12, -8)  # Offsets (U, V) of a colour recording from grey: a warm wall and bluish film under LED lamps (chosen)
+
+
+def render_recording(
+    scene: Scene,
+    motion: Motion,
+    *,
+    n_frames: int,
+    capture_fps: float,
+    out_path: Path,
+    exposure_s: float | None = None,
+    seed: int = 0,
+) -> Truth:
+    """Film `motion` in `scene` and write the recording to `out_path`: with an ending a film with the scene's codec,
+    without one a folder of numbered PNG pictures.
+    """
+    renderer = FrameRenderer(
+        scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=exposure_s, seed=seed
+    )
+    write_recording(renderer.frame, n_frames, scene, Path(out_path))
+    return renderer.truth(np.arange(n_frames))
+
+
+def write_recording(frame: Callable[..., Frame], n_frames: int, scene: Scene, path: Path) -> None:
+    """Write `n_frames` frames of `frame(index, low=…, span=…)`, completely or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name("part-" + path.name)
+    if path.suffix:
+        _write_video(frame, n_frames, scene, draft)
+    else:
+        _write_pictures(frame, n_frames, draft)
+    if path.is_dir():
+        shutil.rmtree(path)
+    draft.replace(path)
+
+
+def _write_pictures(frame: Callable[..., Frame], n_frames: int, folder: Path) -> None:
+    import cv2
+
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for index in range(n_frames):
+        path = folder / f"frame_{index:06d}.png"
+        if not cv2.imwrite(str(path), frame(index), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise OSError(f"{path}: the picture could not be written; is the disk full?")
+
+
+def _write_video(frame: Callable[..., Frame], n_frames: int, scene: Scene, path: Path) -> None:
+    import av
+
+    encoding, depth = scene.encoding, scene.sensor.bit_depth
+    is_h264 = encoding.codec == "h264"
+    pixel_format = ("yuv420p" if depth == 8 else None) if is_h264 else GREY_FORMATS.get(depth)
+    if pixel_format is None:
+        raise ValueError(f"{encoding.codec} here does not hold {depth} bits.")
+    levels = {"low": 16.0, "span": 219.0} if is_h264 else {}
+    chroma = _chroma(scene)
+    options = {"movflags": "+faststart"} if path.suffix.lower() in (".mp4", ".mov") else {}
+    with av.open(str(path), "w", options=options) as container:
+        stream: Any = container.add_stream(CODECS[encoding.codec], rate=Fraction(CONTAINER_FPS))
+        stream.width, stream.height, stream.pix_fmt = scene.camera.width_px, scene.camera.height_px, pixel_format
+        stream.codec_context.thread_count = 1
+        if is_h264:
+            stream.options = {"preset": "superfast", "bf": "0", "sc_threshold": "0", **_rate(scene)}
+            stream.gop_size = encoding.gop
+            stream.codec_context.color_range = LIMITED_RANGE
+        for index in range(n_frames):
+            picture = av.VideoFrame(scene.camera.width_px, scene.camera.height_px, pixel_format)
+            for plane, values in zip(picture.planes, (frame(index, **levels), *chroma), strict=False):
+                _fill(plane, values)
+            picture.pts = index
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def _rate(scene: Scene) -> dict[str, str]:
+    if scene.encoding.bitrate_Mbit_s is None:
+        return {"crf": str(scene.encoding.crf)}
+    rate = f"{scene.encoding.bitrate_Mbit_s * 1000:.0f}k"
+    return {"b": rate, "maxrate": rate, "bufsize": rate}
+
+
+def _chroma(scene: Scene) -> tuple[Frame, Frame]:
+    """The two colour planes at half resolution, constant in time, since film is transparent; even for a grey scene."""
+    rows, columns = (scene.camera.height_px + 1) // 2, (scene.camera.width_px + 1) // 2
+    fade = np.linspace(0, 1, columns)[None, :] + 0.2 * np.linspace(0, 1, rows)[:, None]
+    u, v = TINT if scene.sensor.colour else (0, 0)
+    return (128 - u * fade).astype(np.uint8), (128 - v * fade).astype(np.uint8)
+
+
+def _fill(plane: Any, values: Frame) -> None:
+    row = plane.line_size // values.itemsize
+    target = np.frombuffer(plane, dtype=values.dtype)[: row * values.shape[0]].reshape(values.shape[0], row)
+    target[:, : values.shape[1]] = values
+
+
+# ------------------------------------------------------------------------------
+# Pictures and clips of a calibration target.
+
+
+def render_target(target: Target, scene: Scene, *, seed: int = 0, ramp: float = 0.25) -> Frame:
+    """Render one picture of a target through the camera of a scene, with its noise. The truth is `scene.camera`:
+    `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks. The light rises by `ramp` across
+    the picture. Shape (height, width).
+    """
+    empty = _empty(scene, seed)
+    return empty.expose(_with_target(empty, target, scene.camera, ramp), 0)
+
+
+def render_calibration_clip(
+    target: Target,
+    scene: Scene,
+    n_frames: int,
+    out_path: Path,
+    *,
+    seed: int = 0,
+    moves: Sequence[dict[str, Any]] = (),
+) -> None:
+    """Write a clip (or, by the path's ending, a folder of pictures) of a target. `moves` lists, for each frame, what
+    changes: fields of `Target` such as `{"centre_m": (0.01, 0)}` or of `Camera` such as `{"tilt_x_deg": 10}`.
+    """
+    empty = _empty(scene, seed)
+    lights = [_with_target(empty, target, scene.camera)] if not moves else []
+    for changes in moves:
+        on_target = {key: value for key, value in changes.items() if hasattr(target, key)}
+        on_camera = {key: value for key, value in changes.items() if key not in on_target}
+        lights.append(_with_target(empty, replace(target, **on_target), replace(scene.camera, **on_camera)))
+
+    def frame(index: int, **levels: float) -> Frame:
+        return empty.expose(lights[min(index, len(lights) - 1)], index, **levels)
+
+    write_recording(frame, n_frames, empty.scene, Path(out_path))
+
+
+def _empty(scene: Scene, seed: int) -> FrameRenderer:
+    """The scene without launcher, door, ruler and clutter, at rest."""
+    backdrop = replace(scene.backdrop, launcher=False, ruler=False, clutter=False)
+    scene = replace(scene, backdrop=backdrop, door=None)
+    return FrameRenderer(scene, np.zeros_like, n_frames=1, capture_fps=60.0, exposure_s=1e-3, seed=seed)
+
+
+def _with_target(empty: FrameRenderer, target: Target, camera: Camera, ramp: float = 0.25) -> NDArray[np.float32]:
+    light = lay_target(empty.backdrop(), target, plane_seen(camera), empty.scene.psf_px)
+    slope = 1 + ramp * (np.linspace(0, 1, light.shape[1], dtype=np.float32)[None, :] - 0.5)
+    return np.asarray(light * slope, dtype=np.float32)
+
+
+# ------------------------------------------------------------------------------
+# Campaigns before a camera.
 
 FINE_STEPS = 8  # Samples per frame of the true motion (chosen)
 

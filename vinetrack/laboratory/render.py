@@ -13,15 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
-from vinetrack.laboratory.targets import lay_target, plane_seen
+from vinetrack.laboratory.scene import PATTERN_PX, Ball, Camera, Door, Scene, Target, Tube
+
+Image = NDArray[np.float32]
 
 # ------------------------------------------------------------------------------
 # Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film,
@@ -264,6 +264,71 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
 
 
 # ------------------------------------------------------------------------------
+# A calibration target in the plane of growth, projected exactly.
+#
+# Every pixel is sampled at POINTS points, each traced through lens and tilt to the plane, where it is black or white:
+# corners are exactly where geometry puts them.
+
+POINTS, LATTICE = 89, 55  # Points in a pixel, on a Fibonacci lattice (derived)
+
+
+@njit(cache=True)
+def _paint_board(
+    board: Floats, step_x: Floats, step_y: Floats, pattern: NDArray[np.uint8], per_square: int, margin: float,
+    black: float, white: float, light: Image, share: Image,
+) -> None:  # fmt: skip
+    """Radiance of the board times its share of each pixel, and that share, into `light` and `share`. `board` are
+    squares counted at each pixel's middle, shape (height, width, 2); `step_x`, `step_y` their change over a pixel,
+    which is even enough within one: lens and tilt bend it by 10⁻⁵ px at most.
+    """
+    rows, columns = pattern.shape
+    across, down = columns / per_square, rows / per_square
+    for y in range(board.shape[0]):
+        for x in range(board.shape[1]):
+            seen, on = 0.0, 0
+            for i in range(POINTS):
+                dx = (i + 0.5) / POINTS - 0.5
+                dy = ((i * LATTICE) % POINTS + 0.5) / POINTS - 0.5
+                bx = board[y, x, 0] + dx * step_x[y, x, 0] + dy * step_y[y, x, 0]
+                by = board[y, x, 1] + dx * step_x[y, x, 1] + dy * step_y[y, x, 1]
+                if bx < -margin or by < -margin or bx >= across + margin or by >= down + margin:
+                    continue
+                on += 1
+                inside = 0 <= bx < across and 0 <= by < down
+                if inside and pattern[int(by * per_square), int(bx * per_square)] == 0:
+                    seen += black
+                else:
+                    seen += white
+            light[y, x] = seen / POINTS
+            share[y, x] = on / POINTS
+
+
+def plane_seen(camera: Camera) -> Floats:
+    """Return the point of the plane at the centre of each pixel, relative to the optical axis; (height, width, 2), m.
+    Shape (height, width, 2).
+    """
+    grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
+    return np.asarray((camera.plane_from_picture(grid) - np.array(camera.centre_px)) * camera.m_per_px)
+
+
+def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> Image:
+    """Lay a target over a picture where pixels see it, blurred by the optics. Shapes: light (height, width); plane_m
+    (height, width, 2) → (height, width).
+    """
+    import cv2
+
+    painted, share = np.zeros(light.shape, np.float32), np.zeros(light.shape, np.float32)
+    board = target.board_squares(plane_m)
+    step_y, step_x = np.gradient(board, axis=0), np.gradient(board, axis=1)
+    per_square = PATTERN_PX if target.kind == "charuco" else 1
+    _paint_board(
+        board, step_x, step_y, target.pattern(), per_square, target.margin, target.black, target.white, painted, share
+    )
+    painted, share = (np.asarray(cv2.GaussianBlur(part, (0, 0), psf_px), np.float32) for part in (painted, share))
+    return np.asarray(light * (1 - share) + painted, dtype=np.float32)
+
+
+# ------------------------------------------------------------------------------
 # Compiled loops of the renderer: tube, ball and sensor, one pass each over the pixels that it touches.
 
 Whole = NDArray[np.int64]
@@ -445,18 +510,15 @@ def _mixed(z: np.uint64) -> np.uint64:
 @njit(cache=True, fastmath=True, nogil=True)
 def expose(
     light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
-    normals: Image, tone: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
+    normals: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
 ) -> None:  # fmt: skip
-    """Convert radiance to grey levels with shot and read noise, into `out`. Level = low + span · tone(signal); the
-    noise of a signal s has standard deviation √(s·well + read²)/well. Shapes: light, gain, out (height, width); normals
-    (2^NORMAL_BITS,).
+    """Convert radiance to grey levels, low + span · signal, with shot and read noise, into `out`. The noise of a signal
+    s has standard deviation √(s·well + read²)/well. Shapes: light, gain, out (height, width); normals (2^NORMAL_BITS,).
     """
     rows, columns = out.shape
     mask = np.uint64((1 << NORMAL_BITS) - 1)
-    steps = tone.size - 1
     per_well = np.float32(1.0 / full_well_e) if full_well_e > 0 else np.float32(0.0)
     read2 = np.float32((read_noise_e * per_well) ** 2)
-    linear = steps < 2
     lamp32 = np.float32(lamp)
     for y in range(rows):
         state = _mixed(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + _mixed(np.uint64(frame * 65536 + y + 1)))
@@ -473,10 +535,6 @@ def expose(
                 bits >>= np.uint64(16)
                 signal += deviate * np.sqrt(signal * per_well + read2)
             signal = min(max(signal, np.float32(0.0)), np.float32(1.0))
-            if not linear:
-                place = signal * steps
-                k = min(int(place), steps - 1)
-                signal = tone[k] + (place - k) * (tone[k + 1] - tone[k])
             out[y, x] = np.int64(low + span * signal + 0.5)
 
 
@@ -835,19 +893,12 @@ class DoorLayer:
         region += cover * (np.float32(brightness) - region)
 
 
-Image = NDArray[np.float32]
-
-TONE_STEPS = 4096  # Entries of the lookup table of a sensor's gamma (derived)
-
-
 @dataclass(frozen=True)
 class Truth:
-    """True positions in a recording. Arrays have shape (n_frames,), one entry per frame of the file, in order.
-    `source_frame` is the frame of the undisturbed recording that is shown, `time_s` its mid-exposure; `in_frame` tells
-    whether the tip is inside the picture. Frames that show nothing have −1 and NaN.
+    """True positions in a recording, one entry per frame, shape (n_frames,). `time_s` is mid-exposure; `in_frame` tells
+    whether the tip is inside the picture.
     """
 
-    source_frame: NDArray[np.int_]
     time_s: Floats
     lead_position_m: Floats
     lead_px: Floats
@@ -858,16 +909,6 @@ class Truth:
     release_s: float
     capture_fps: float
     exposure_s: float
-
-    def write_csv(self, path: Path) -> None:
-        """Write one row per frame."""
-        names = ("source_frame", "time_s", "lead_position_m", "lead_px", "tip_x_px", "tip_y_px", "in_frame")
-        table = np.column_stack([np.asarray(getattr(self, name), dtype=float) for name in names])
-        formats = ["%d", "%.9f", "%.9f", "%.6f", "%.6f", "%.6f", "%d"]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(path.name + ".part")
-        np.savetxt(draft, table, fmt=formats, delimiter=",", header=",".join(names), comments="")
-        draft.replace(path)
 
 
 class FrameRenderer:
@@ -927,7 +968,7 @@ class FrameRenderer:
             self._still = lay_target(self._still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
-        """Prepare the gain of every pixel (vignetting, fixed pattern), normal deviates and the gamma table."""
+        """Prepare the gain of every pixel (vignetting, fixed pattern), and normal deviates."""
         from scipy.special import ndtri
 
         rng = np.random.default_rng([self.seed, 3])
@@ -941,8 +982,6 @@ class FrameRenderer:
         cells = 1 << NORMAL_BITS
         quantiles = ndtri((np.arange(cells) + 0.5) / cells)
         self._normals = (quantiles / quantiles.std()).astype(np.float32)
-        steps = 1 if sensor.gamma == 1 else TONE_STEPS
-        self._tone = (np.linspace(0, 1, steps + 1) ** (1 / sensor.gamma)).astype(np.float32)
 
     def radiance(self, frame: int) -> Image:
         """Return the radiance at the sensor, before lamps, gain and noise. Shape (height, width)."""
@@ -976,73 +1015,25 @@ class FrameRenderer:
         full = float(2**sensor.bit_depth - 1 if span is None else span)
         expose(
             light, self._gain, self.scene_motion.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
-            self._normals, self._tone, low, full, out,
+            self._normals, low, full, out,
         )  # fmt: skip
         return out
 
-    def truth(self, source_frame: NDArray[np.int_]) -> Truth:
-        """Return the true positions in given frames. Shapes: source_frame (n,)."""
-        shown = source_frame >= 0
-        blank = np.where(shown, 0.0, np.nan)
-        time_s = self.scene_motion.mid_exposure_s(np.maximum(source_frame, 0))
+    def truth(self, frames: NDArray[np.int_]) -> Truth:
+        """Return the true positions in these frames. Shapes: frames (n,)."""
+        time_s = self.scene_motion.mid_exposure_s(frames)
         along = self.scene_motion.lead_px(time_s)
         camera = self.scene.camera
         tip = camera.picture_from_plane(self.scene_motion.tip_plane_px(time_s))
-        inside = ((tip >= -0.5) & (tip <= np.array([camera.width_px, camera.height_px]) - 0.5)).all(axis=1)
         return Truth(
-            source_frame=np.asarray(source_frame),
-            time_s=time_s + blank,
-            lead_position_m=along * camera.m_per_px - self.scene.start_m + blank,
-            lead_px=along + blank,
-            tip_x_px=tip[:, 0] + blank,
-            tip_y_px=tip[:, 1] + blank,
-            in_frame=inside & shown,
+            time_s=time_s,
+            lead_position_m=along * camera.m_per_px - self.scene.start_m,
+            lead_px=along,
+            tip_x_px=tip[:, 0],
+            tip_y_px=tip[:, 1],
+            in_frame=np.all((tip >= -0.5) & (tip <= np.array([camera.width_px, camera.height_px]) - 0.5), axis=1),
             m_per_px=camera.m_per_px,
             release_s=self.scene_motion.release_s,
             capture_fps=self.capture_fps,
             exposure_s=self.exposure_s,
         )
-
-
-def frame_order(scene: Scene, n_frames: int) -> NDArray[np.int_]:
-    """Return the frame of the undisturbed recording that each frame of the file shows; −1 for a corrupt frame. Shape
-    (n_frames of the file,).
-    """
-    faults = scene.faults
-    order: list[int] = []
-    for index in range(n_frames):
-        if index not in faults.dropped:
-            order += [index] * (2 if index in faults.repeated else 1)
-    if faults.wrong_second_frame and len(order) > 2:
-        order[1] = order[(2 * len(order)) // 3]
-    if faults.corrupt_first_frame and order:
-        order[0] = -1
-    return np.array(order, dtype=int)
-
-
-def render_recording(
-    scene: Scene,
-    motion: Motion,
-    *,
-    n_frames: int,
-    capture_fps: float,
-    out_path: Path,
-    exposure_s: float | None = None,
-    seed: int = 0,
-    truth_path: Path | None = None,
-) -> Truth:
-    """Film `motion` in `scene` and write the recording to `out_path`. The ending sets the form: .mp4, .mov, .mkv, .avi
-    a film with the scene's codec; .tif, .tiff one stack; no ending a folder of numbered images (see
-    `encode.write_recording`).
-    """
-    from vinetrack.laboratory.encode import write_recording
-
-    renderer = FrameRenderer(
-        scene, motion, n_frames=n_frames, capture_fps=capture_fps, exposure_s=exposure_s, seed=seed
-    )
-    order = frame_order(scene, n_frames)
-    write_recording(renderer, order, Path(out_path))
-    truth = renderer.truth(order)
-    if truth_path is not None:
-        truth.write_csv(Path(truth_path))
-    return truth

@@ -1,7 +1,9 @@
-"""Settings and presets of a scene in the virtual laboratory: objects, light, camera, sensor, recording.
+"""What is filmed and how: camera, calibration target, objects, light, sensor, encoding; scenes by name.
 
-Brightness is radiance as a fraction of the sensor's full scale. Lengths ending in `_px` are in plane pixels (see
-`camera`). `preset(name)` makes a preset; `dataclasses.replace` changes it.
+A pinhole with radial distortion looks at a plane that may be tilted. Pixel centres have whole-number coordinates, x to
+the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the origin of the plane at the
+centre of the picture: without tilt and distortion they are the pixels of the picture. Lengths ending in `_px` are in
+plane pixels, brightness is radiance as a fraction of the sensor's full scale.
 """
 
 from __future__ import annotations
@@ -9,8 +11,131 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from vinetrack.laboratory.camera import Camera
-from vinetrack.laboratory.targets import Target
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+
+UNDISTORT_STEPS = 10  # Newton steps of the inverse of the distortion (chosen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Size of the picture, scale, lens and pose. `m_per_px` is the scale at the picture's centre before tilt; the
+    camera stands `focal_px · m_per_px` away from the plane of growth.
+    """
+
+    width_px: int = 960
+    height_px: int = 320
+    m_per_px: float = 1 / 2750
+    focal_px: float = 2600.0
+    k1: float = 0.0
+    k2: float = 0.0
+    tilt_x_deg: float = 0.0
+    tilt_y_deg: float = 0.0
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Principal point, the centre of the picture, px."""
+        return (self.width_px - 1) / 2, (self.height_px - 1) / 2
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether plane pixels and picture pixels are the same."""
+        return self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
+
+    @property
+    def matrix(self) -> Floats:
+        """Camera matrix, shape (3, 3), px."""
+        cx, cy = self.centre_px
+        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]], dtype=float)
+
+    @property
+    def rotation(self) -> Floats:
+        """Rotation of the plane against the picture, shape (3, 3)."""
+        ax, ay = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
+        about_x = np.array([[1, 0, 0], [0, math.cos(ax), -math.sin(ax)], [0, math.sin(ax), math.cos(ax)]])
+        about_y = np.array([[math.cos(ay), 0, math.sin(ay)], [0, 1, 0], [-math.sin(ay), 0, math.cos(ay)]])
+        return np.asarray(about_y @ about_x, dtype=float)
+
+    def picture_from_plane(self, plane_px: Floats) -> Floats:
+        """Map points of the plane of growth to the picture. Shapes: plane_px (..., 2) → (..., 2)."""
+        offset = np.asarray(plane_px, dtype=float) - self.centre_px
+        spatial = offset @ self.rotation[:, :2].T + np.array([0.0, 0.0, self.focal_px])
+        ray = spatial[..., :2] / spatial[..., 2:]
+        radius2 = (ray**2).sum(axis=-1, keepdims=True)
+        distorted = ray * (1 + self.k1 * radius2 + self.k2 * radius2**2)
+        return np.asarray(distorted * self.focal_px + self.centre_px)
+
+    def plane_from_picture(self, picture_px: Floats) -> Floats:
+        """Map points of the picture to the plane of growth. Shapes: picture_px (..., 2) → (..., 2)."""
+        distorted = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
+        ray = np.concatenate([self._undistorted(distorted), np.ones((*distorted.shape[:-1], 1))], axis=-1)
+        normal = self.rotation[:, 2]
+        depth = normal[2] * self.focal_px / (ray @ normal)
+        spatial = ray * depth[..., None] - np.array([0.0, 0.0, self.focal_px])
+        return np.asarray(spatial @ self.rotation[:, :2] + self.centre_px)
+
+    def _undistorted(self, distorted: Floats) -> Floats:
+        """Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent."""
+        distorted_radius = np.sqrt((distorted**2).sum(axis=-1, keepdims=True))
+        radius = distorted_radius.copy()
+        for _ in range(UNDISTORT_STEPS):
+            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - distorted_radius
+            radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
+        return distorted * np.divide(radius, distorted_radius, out=np.ones_like(radius), where=distorted_radius > 0)
+
+    def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Plane pixel of each picture pixel: x and y, each of shape (height_px, width_px)."""
+        grid = np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
+        plane = grid if self.is_plain else self.plane_from_picture(grid)
+        return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)
+
+
+PATTERN_PX = 120  # Side of a square in the stored pattern of a ChArUco board (chosen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A board in the plane of growth."""
+
+    kind: str = "charuco"
+    squares: tuple[int, int] = (12, 5)
+    square_m: float = 0.020
+    marker_m: float = 0.015
+    dictionary: str = "DICT_4X4_100"
+    centre_m: tuple[float, float] = (0.0, 0.0)
+    angle_deg: float = 0.0
+    margin: float = 0.5
+    black: float = 0.06
+    white: float = 0.70
+
+    def corners_m(self) -> Floats:
+        """Inner corners in the plane (x, y), row by row from the board's top left, shape (n, 2), m."""
+        across, down = np.meshgrid(np.arange(1, self.squares[0]), np.arange(1, self.squares[1]))
+        board = np.column_stack([across.ravel(), down.ravel()]) - np.array(self.squares) / 2
+        return np.asarray(board * self.square_m @ self._turn().T + np.array(self.centre_m))
+
+    def board_squares(self, plane_m: Floats) -> Floats:
+        """Express points of the plane in squares of the board. Shapes: plane_m (..., 2) → (..., 2)."""
+        along_board = (plane_m - np.array(self.centre_m)) @ self._turn()
+        return np.asarray(along_board / self.square_m + np.array(self.squares) / 2)
+
+    def pattern(self) -> NDArray[np.uint8]:
+        """Printed pattern, 1 where white: PATTERN_PX per square for a ChArUco board, 1 for a checkerboard."""
+        import cv2
+
+        if self.kind != "charuco":
+            rows, columns = np.mgrid[: self.squares[1], : self.squares[0]]
+            return ((rows + columns) % 2).astype(np.uint8)
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        board = cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, words)
+        size = (self.squares[0] * PATTERN_PX, self.squares[1] * PATTERN_PX)
+        return np.asarray(board.generateImage(size, marginSize=0, borderBits=1) > 127).astype(np.uint8)
+
+    def _turn(self) -> Floats:
+        angle = math.radians(self.angle_deg)
+        return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,43 +209,26 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """Noise and quantisation. `fixed_pattern`: relative scatter of pixel gains; `gamma` 1: linear levels."""
+    """Noise and quantisation. `fixed_pattern`: relative scatter of pixel gains."""
 
     full_well_e: float = 9000.0
     read_noise_e: float = 28.0
     fixed_pattern: float = 0.004
     bit_depth: int = 8
-    gamma: float = 1.0
     colour: bool = False
     noise: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class Encoding:
-    """How the file is written; the ending of the path sets the container or image format. `codec`: h264, ffv1, mjpeg or
-    raw. With `bitrate_Mbit_s` the bit rate is held near that value at `container_fps`, as in cameras; without it `crf`
-    applies. `limited_range` maps full scale to 16…235, as is usual for video.
+    """How the file is written: `codec` h264 (levels of 16…235) or ffv1 (without loss). With `bitrate_Mbit_s` the bit
+    rate is held near that value at 60 frames per second, as in cameras; without it `crf` applies.
     """
 
     codec: str = "h264"
     bitrate_Mbit_s: float | None = None
     crf: int = 18
     gop: int = 30
-    preset: str = "superfast"
-    container_fps: int = 60
-    limited_range: bool = True
-
-
-@dataclass(frozen=True, kw_only=True)
-class Faults:
-    """Faults of a recording."""
-
-    dropped: tuple[int, ...] = ()
-    repeated: tuple[int, ...] = ()
-    wrong_second_frame: bool = False
-    corrupt_first_frame: bool = False
-    keep_fraction: float = 1.0
-    damaged_fraction: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +245,6 @@ class Scene:
     light: Light = field(default_factory=Light)
     sensor: Sensor = field(default_factory=Sensor)
     encoding: Encoding = field(default_factory=Encoding)
-    faults: Faults = field(default_factory=Faults)
     growth_angle_deg: float = 0.0
     origin_px: tuple[float, float] | None = None
     start_m: float = 0.012
@@ -212,8 +319,6 @@ def _presets() -> dict[str, Scene]:
         "reflections": replace(hard, subject=replace(tube, specular=0.5, reflection=0.3)),
         "noisy": replace(hard, sensor=Sensor(full_well_e=1500, read_noise_e=35)),
         "strong_tail": replace(hard, subject=replace(tube, tail_texture=0.6, tail_opacity=0.6, opacity=0.3)),
-        "distorted": replace(hard, camera=Camera(focal_px=1400, k1=-0.25, k2=0.08)),
-        "tilted": replace(hard, camera=Camera(tilt_x_deg=2.0, tilt_y_deg=-4.0, k1=-0.15)),
         "diagonal": _camera_like(replace(demo, camera=square, growth_angle_deg=37.0)),
         "downward": _camera_like(replace(demo, camera=Camera(width_px=320, height_px=960), growth_angle_deg=90.0)),
         "payload": replace(hard, subject=replace(tube, payload_diameter_m=0.014)),

@@ -6,10 +6,9 @@ what is hidden from the analysis: physics, scatter, noise, faults.
 
 from __future__ import annotations
 
-import math
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,218 +16,18 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from vinetrack.core import published
 from vinetrack.core.records import Floats, Track, Trial, plain_track
-from vinetrack.core.tables import write_csv, write_json, write_text
+from vinetrack.core.tables import write_csv, write_text
 from vinetrack.core.units import BASE_EFFECTS
 from vinetrack.dynamics.audit import pressure_along
 from vinetrack.dynamics.model import Model, Value, make_model
-from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.dynamics.simulate import simulate_many
+from vinetrack.experiment.schema import with_names
 from vinetrack.tracks.position_noise import ar1_noise
 
-
-@dataclass(frozen=True)
-class VirtualTrial:
-    """One simulated trial and its measurement. `stated` is the trial as the sheet states it, `true` as it was, `model`
-    the true model. `track` is what the analysis gets; its zeros are arbitrary. The rest is the truth at the track's
-    rows, SI; `release_s` is on the track's clock.
-    """
-
-    stated: Trial
-    true: Trial
-    model: Model
-    damping: float
-    track: Track
-    release_s: float
-    origin_m: float
-    true_lead_position_m: Floats
-    true_lead_velocity_m_s: Floats
-    true_pressure_Pa: Floats
-    dropped: tuple[int, ...]
-    repeated: tuple[int, ...]
-
-
-def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
-    """Simulate and measure trials; the same seed gives the same numbers."""
-    model = truth.model()
-    draws = [_draw(truth.seed, 0, trial.name) for trial in trials]
-    errors = _yield_errors(trials, truth)
-    true, damping = [], []
-    theta = np.array([model.parameters_of(trial) for trial in trials])
-    column = model.parameter_names.index("eversion_damping.B") if "eversion_damping" in model else None
-    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
-        set_Pa = trial.pressure_Pa * (1 + truth.pressure_scatter * draw.standard_normal())
-        factor = 1 + truth.damping_scatter * draw.standard_normal()
-        true.append(replace(trial, pressure_Pa=set_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
-        if column is not None:
-            theta[i, column] *= factor
-        damping.append(float(theta[i, column]) if column is not None else math.nan)
-    times, release = zip(
-        *(_frame_times(trial, truth, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True
-    )
-    moved = simulate_many(model, true, [t - t0 for t, t0 in zip(times, release, strict=True)], parameters=theta)
-    grown = []
-    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
-        trial_model = model.with_values(dict(zip(model.parameter_names, theta[i].tolist(), strict=True)))
-        pressure_Pa = pressure_along(
-            trial_model, true[i], times[i] - release[i], moved[i].lead_position_m, moved[i].lead_velocity_m_s
-        )
-        grown.append(
-            _measure(trial, true[i], trial_model, damping[i], times[i], release[i], moved[i], pressure_Pa, truth, draw)
-        )
-    return grown
-
-
-def _yield_errors(trials: Sequence[Trial], truth: GroundTruth) -> dict[str, float]:
-    """True minus stated yield pressure of each vine, Pa."""
-    vines = dict.fromkeys(trial.vine for trial in trials)
-    return {vine: 1e3 * truth.yield_error_kPa * _draw(truth.seed, 1, vine).standard_normal() for vine in vines}
-
-
-def _draw(seed: int, kind: int, name: str) -> np.random.Generator:
-    """The random generator of one trial (kind 0) or vine (kind 1), by its name."""
-    return np.random.default_rng([seed, kind, zlib.crc32(name.encode())])
-
-
-def _frame_times(trial: Trial, truth: GroundTruth, draw: np.random.Generator) -> tuple[Floats, float]:
-    """Times of all possible frames, and the time of release on the same clock, s."""
-    step_s = 1 / trial.capture_fps
-    resting = draw.integers(truth.release_frames[0], truth.release_frames[1], endpoint=True)
-    release_s = (resting - 1 + draw.uniform()) * step_s
-    return np.arange(truth.longest_frames, dtype=float) * step_s, float(release_s)
-
-
-def _measure(
-    trial: Trial,
-    true: Trial,
-    model: Model,
-    damping: float,
-    time_s: Floats,
-    release_s: float,
-    moved: Trajectory,
-    pressure_Pa: Floats,
-    truth: GroundTruth,
-    draw: np.random.Generator,
-) -> VirtualTrial:
-    """Measure a trajectory: noise, an arbitrary origin, dropped and repeated frames, gauge readings."""
-    stop = time_s.size
-    if moved.status == "ended":
-        stop = min(stop, int(np.searchsorted(time_s - release_s, moved.end_time_s)) + truth.frames_after_end)
-    origin_m = draw.uniform(*truth.origin_m)
-    noise = ar1_noise(stop, truth.noise_m, truth.noise_correlation, draw)
-    shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], truth, draw)
-    measured = (origin_m + moved.observed_position_m[:stop] + noise)[shown]
-    gauge = None
-    if truth.trace_sigma_kPa is not None:
-        gauge = pressure_Pa[shown] + 1e3 * truth.trace_sigma_kPa * draw.standard_normal(shown.size)
-    sigma_m = np.full(shown.size, truth.noise_m) if truth.stated_sigma else None
-    track = plain_track(time_s[index], measured, sigma_m=sigma_m, pressure_Pa=gauge)
-    return VirtualTrial(
-        stated=trial,
-        true=true,
-        model=model,
-        damping=damping,
-        track=track,
-        release_s=release_s,
-        origin_m=origin_m,
-        true_lead_position_m=moved.lead_position_m[shown],
-        true_lead_velocity_m_s=moved.lead_velocity_m_s[shown],
-        true_pressure_Pa=pressure_Pa[shown],
-        dropped=dropped,
-        repeated=repeated,
-    )
-
-
-def _faults(
-    velocity_m_s: Floats, truth: GroundTruth, draw: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], tuple[int, ...]]:
-    """True frame that each row shows, and the frame number it claims; then dropped frames and repeated rows. A dropped
-    frame is missing without notice, so all later rows claim a time one frame too early. A repeated frame shows its
-    predecessor instead of itself.
-    """
-    moving = velocity_m_s > 0
-    dropped = moving & (draw.uniform(size=velocity_m_s.size) < truth.dropped)
-    shown = np.flatnonzero(~dropped)
-    stale = moving[shown] & (draw.uniform(size=shown.size) < truth.repeated)
-    stale[0] = False
-    # Consecutive repeated rows all show the last new frame.
-    shown = shown[np.maximum.accumulate(np.where(stale, 0, np.arange(shown.size)))]
-    rows = np.flatnonzero(stale)
-    return shown, np.arange(shown.size), tuple(np.flatnonzero(dropped).tolist()), tuple(rows.tolist())
-
-
-def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
-    """Write the track of each trial to `folder/<trial>.csv`."""
-    for trial in grown:
-        columns = {"time_s": trial.track.time_s.round(9), "position_m": trial.track.lead_position_m.round(8)}
-        if np.isfinite(trial.track.lead_position_sigma_m).any():
-            columns["sigma_m"] = trial.track.lead_position_sigma_m
-        if trial.track.pressure_Pa is not None:
-            columns["pressure_kPa"] = (trial.track.pressure_Pa / 1e3).round(5)
-        write_csv(folder / f"{trial.stated.name}.csv", pd.DataFrame(columns))
-
-
-SHEET_COLUMNS = (
-    "trial",
-    "track",
-    "capture_fps",
-    "diameter_mm",
-    "thickness_um",
-    "length_mm",
-    "pressure_kPa",
-    "yield_pressure_kPa",
-    "payload_g",
-)
-
-
-def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
-    """Return the trial sheet of a campaign whose tracks lie in `tracks/`."""
-    rows = [
-        (
-            trial.name,
-            f"tracks/{trial.name}.csv",
-            trial.capture_fps,
-            round(trial.diameter_m * 1e3, 6),
-            round(trial.thickness_m * 1e6, 6),
-            round(trial.length_m * 1e3, 6),
-            round(trial.pressure_Pa / 1e3, 6),
-            round(trial.yield_pressure_Pa / 1e3, 6),
-            round(trial.payload_kg * 1e3, 6),
-        )
-        for trial in trials
-    ]
-    return pd.DataFrame(rows, columns=list(SHEET_COLUMNS))
-
-
-def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
-    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
-    write_tracks(grown, folder / "tracks")
-    write_csv(folder / "trials.csv", sheet([trial.stated for trial in grown]))
-    if settings:
-        write_text(folder / "experiment.yaml", settings)
-
-
-def write_truth(grown: Sequence[VirtualTrial], truth: GroundTruth, path: Path) -> None:
-    """Write the ground truth to a JSON file."""
-    for parent in path.absolute().parents:
-        if (parent / "trials.csv").exists():
-            raise ValueError(f"{path}: the truth must not lie inside the experiment {parent}")
-    trials = {
-        trial.stated.name: {
-            "pressure_Pa": trial.true.pressure_Pa,
-            "yield_pressure_Pa": trial.true.yield_pressure_Pa,
-            "B": trial.damping,
-            "release_s": trial.release_s,
-            "origin_m": trial.origin_m,
-            "dropped": trial.dropped,
-            "repeated": trial.repeated,
-            "true_lead_position_m": trial.true_lead_position_m.tolist(),
-        }
-        for trial in grown
-    }
-    write_json(path, {"nature": asdict(truth), "trials": trials})
-
-
 BASE = BASE_EFFECTS
+DAMPING = "eversion_damping.B"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,10 +48,7 @@ class GroundTruth:
     frames_after_end: int = 4
     longest_frames: int = 12_000
     origin_m: tuple[float, float] = (-0.05, 0.05)
-    dropped: float = 0.0
-    repeated: float = 0.0
     trace_sigma_kPa: float | None = None
-    stated_sigma: bool = False
     seed: int = 0
 
     def model(self) -> Model:
@@ -270,3 +66,203 @@ def read_ground_truth(path: Path) -> GroundTruth:
         if key in content:
             content[key] = tuple(content[key])
     return GroundTruth(**content)
+
+
+@dataclass(frozen=True)
+class VirtualTrial:
+    """One simulated trial and its measurement. `stated` is the trial as the sheet states it, `true` as it was, `model`
+    the true model with this trial's B. `track` is what the analysis gets; its zeros are arbitrary. The rest is the
+    truth, SI; `release_s` is on the track's clock.
+    """
+
+    stated: Trial
+    true: Trial
+    model: Model
+    track: Track
+    release_s: float
+    origin_m: float
+    true_lead_position_m: Floats
+
+
+def grow(trials: Sequence[Trial], truth: GroundTruth) -> list[VirtualTrial]:
+    """Simulate and measure trials; the same seed gives the same numbers."""
+    model = truth.model()
+    draws = [_draw(truth.seed, 0, trial.name) for trial in trials]
+    vines = dict.fromkeys(trial.vine for trial in trials)
+    errors = {vine: 1e3 * truth.yield_error_kPa * _draw(truth.seed, 1, vine).standard_normal() for vine in vines}
+    true, times, release = [], [], []
+    theta = np.array([model.parameters_of(trial) for trial in trials])
+    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
+        set_Pa = trial.pressure_Pa * (1 + truth.pressure_scatter * draw.standard_normal())
+        factor = 1 + truth.damping_scatter * draw.standard_normal()
+        true.append(replace(trial, pressure_Pa=set_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
+        if DAMPING in model.parameter_names:
+            theta[i, model.parameter_names.index(DAMPING)] *= factor
+        step_s = 1 / trial.capture_fps
+        resting = draw.integers(truth.release_frames[0], truth.release_frames[1], endpoint=True)
+        release.append(float((resting - 1 + draw.uniform()) * step_s))
+        times.append(np.arange(truth.longest_frames, dtype=float) * step_s)
+    moved = simulate_many(model, true, [t - t0 for t, t0 in zip(times, release, strict=True)], parameters=theta)
+    grown = []
+    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
+        stop = times[i].size
+        if moved[i].status == "ended":
+            stop = min(stop, int(np.searchsorted(times[i] - release[i], moved[i].end_time_s)) + truth.frames_after_end)
+        own_model = model.with_values(dict(zip(model.parameter_names, theta[i].tolist(), strict=True)))
+        origin_m = draw.uniform(*truth.origin_m)
+        noise_m = ar1_noise(stop, truth.noise_m, truth.noise_correlation, draw)
+        time_s, lead_m = times[i][:stop], moved[i].lead_position_m[:stop]
+        gauge_Pa = None
+        if truth.trace_sigma_kPa is not None:
+            velocity_m_s = moved[i].lead_velocity_m_s[:stop]
+            gauge_Pa = pressure_along(own_model, true[i], time_s - release[i], lead_m, velocity_m_s)
+            gauge_Pa = gauge_Pa + 1e3 * truth.trace_sigma_kPa * draw.standard_normal(stop)
+        grown.append(
+            VirtualTrial(
+                stated=trial,
+                true=true[i],
+                model=own_model,
+                track=plain_track(
+                    time_s, origin_m + moved[i].observed_position_m[:stop] + noise_m, pressure_Pa=gauge_Pa
+                ),
+                release_s=release[i],
+                origin_m=origin_m,
+                true_lead_position_m=lead_m,
+            )
+        )
+    return grown
+
+
+def _draw(seed: int, kind: int, name: str) -> np.random.Generator:
+    """The random generator of one trial (kind 0) or vine (kind 1), by its name."""
+    return np.random.default_rng([seed, kind, zlib.crc32(name.encode())])
+
+
+def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
+    """Write the track of each trial to `folder/<trial>.csv`."""
+    for trial in grown:
+        columns = {"time_s": trial.track.time_s.round(9), "position_m": trial.track.lead_position_m.round(8)}
+        if trial.track.pressure_Pa is not None:
+            columns["pressure_kPa"] = (trial.track.pressure_Pa / 1e3).round(5)
+        write_csv(folder / f"{trial.stated.name}.csv", pd.DataFrame(columns))
+
+
+def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
+    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
+    write_tracks(grown, folder / "tracks")
+    trials = [one.stated for one in grown]
+    sheet = {
+        "trial": [trial.name for trial in trials],
+        "track": [f"tracks/{trial.name}.csv" for trial in trials],
+        "capture_fps": [trial.capture_fps for trial in trials],
+        "diameter_mm": [round(trial.diameter_m * 1e3, 6) for trial in trials],
+        "thickness_um": [round(trial.thickness_m * 1e6, 6) for trial in trials],
+        "length_mm": [round(trial.length_m * 1e3, 6) for trial in trials],
+        "pressure_kPa": [round(trial.pressure_Pa / 1e3, 6) for trial in trials],
+        "yield_pressure_kPa": [round(trial.yield_pressure_Pa / 1e3, 6) for trial in trials],
+        "payload_g": [round(trial.payload_kg * 1e3, 6) for trial in trials],
+    }
+    write_csv(folder / "trials.csv", pd.DataFrame(sheet))
+    if settings:
+        write_text(folder / "experiment.yaml", settings)
+
+
+# ------------------------------------------------------------------------------
+# Campaigns: vines, pressures, payloads and number of replicates. Numbers that the paper does not give (lengths other
+# than 280 and 400 mm, the pressures themselves, payloads other than 35.6 g) are stated here.
+
+CAPTURE_FPS = published.CAPTURE_FPS
+PAPER_B = published.DAMPING_B
+PAPER_N = published.EXPONENT
+PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
+
+
+@dataclass(frozen=True)
+class Vine:
+    """A vine of a campaign, in the units of a trial sheet."""
+
+    diameter_mm: float
+    thickness_um: float
+    length_mm: float
+    yield_pressure_kPa: float = 3.0
+
+    def trial(self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = CAPTURE_FPS) -> Trial:
+        """Make one trial with this vine."""
+        return Trial(
+            name=name,
+            capture_fps=capture_fps,
+            diameter_m=self.diameter_mm / 1e3,
+            thickness_m=self.thickness_um / 1e6,
+            length_m=self.length_mm / 1e3,
+            pressure_Pa=pressure_kPa * 1e3,
+            pressure_sigma_Pa=10.0 * pressure_kPa,
+            yield_pressure_Pa=self.yield_pressure_kPa * 1e3,
+            yield_pressure_sigma_Pa=200.0,
+            payload_kg=payload_g / 1e3,
+        )
+
+
+def isometric_vine(scale: int) -> Vine:
+    """The paper's vine of scale R = 1…4: 50R µm, 6R mm and, isometric with the 280 mm of R = 4, 70R mm."""
+    return Vine(6.0 * scale, 50.0 * scale, 70.0 * scale)
+
+
+def campaign(
+    vine: Vine, pressures_kPa: Iterable[float], replicates: int, payload_g: float = 0.0, prefix: str = ""
+) -> list[Trial]:
+    """Make trials of every pressure, `replicates` times, with one vine and payload."""
+    return [
+        vine.trial(f"{prefix}{pressure_kPa:g}kPa_{k + 1}".replace(".", "p"), pressure_kPa, payload_g)
+        for pressure_kPa in pressures_kPa
+        for k in range(replicates)
+    ]
+
+
+def damping_pressures_kPa(scale: int, count: int = 10) -> Floats:
+    """Return pressures of the damping protocol for one scale, kPa, shape (count,), rounded to 0.1: the paper raises the
+    pressure as long as speeds get steady within the length of the vine.
+    """
+    vine, B = isometric_vine(scale).trial("", 1.0), PAPER_B[scale]
+    film_kg = vine.linear_density_kg_m * vine.length_m
+    slowest = 0.25
+    # x/x_relax = 2L / (v τ) with τ = m / (½ n B v^(n−1)), solved for v at 3.2.
+    fastest = (vine.length_m * PAPER_N * B / (3.2 * film_kg)) ** (1 / (2 - PAPER_N))
+    drive_Pa = B * np.array([slowest, fastest]) ** PAPER_N / vine.area_m2
+    lowest, highest = (vine.yield_pressure_Pa + drive_Pa).tolist()
+    return np.asarray(np.round(np.linspace(lowest, highest, count) / 1e3, 1))
+
+
+def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
+    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload."""
+    trials = [
+        trial
+        for scale in PAPER_B
+        for trial in campaign(
+            isometric_vine(scale), damping_pressures_kPa(scale, count), replicates, prefix=f"R{scale}_"
+        )
+    ]
+    return list(with_names(trials))
+
+
+def paper_payload(replicates: int = 4) -> list[Trial]:
+    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
+    payload = published.PAYLOAD_G
+    trials = campaign(isometric_vine(4), published.POSITION_RMS_CM, replicates, payload_g=payload, prefix="fig4_")
+    thinner = replace(isometric_vine(4), thickness_um=published.FINAL_SPEED_THICKNESS_UM)
+    for payload_g in PAYLOADS_G:
+        trials += campaign(
+            thinner,
+            published.FINAL_SPEED_RMS_M_S,
+            replicates,
+            payload_g=payload_g,
+            prefix=f"fig5_{payload_g:g}g_".replace(".", "p"),
+        )
+    return list(with_names(trials))
+
+
+def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
+    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n. Returns values
+    as `GroundTruth.values` takes them; B in N·(s/m)ⁿ.
+    """
+    by_vine = {trial.vine: PAPER_B[round(trial.diameter_m / 6e-3)] for trial in trials}
+    return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
