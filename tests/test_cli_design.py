@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,18 @@ def test_the_injectors_chamber_loses_5_per_cent_of_gauge_and_not_1_7(tmp_path: P
     assert "sweeps 0.0614 mL" in done.output
     assert "speed" not in done.output
     assert (tmp_path / "a.png").exists()
+
+
+def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path: Path) -> None:
+    run("reservoir", *INJECTOR, "--json", tmp_path / "r.json")
+    asked = next(e for e in json.loads((tmp_path / "r.json").read_text())["chambers"] if e["chamber"] == "asked about")
+    assert asked["volume_l"] == pytest.approx(0.003534)
+    assert list(asked["loss_of_gauge_pressure"].values()) == pytest.approx([0.053, 0.074], abs=5e-4)
+    run("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--json", tmp_path / "v.json")
+    best = json.loads((tmp_path / "v.json").read_text())["films"][0]
+    assert (best["thickness_um"], best["diameter_mm"]) == pytest.approx((100, 25), rel=0.01)
+    speed = best["final_speed_m_s"]
+    assert speed["low_90"] < speed["median"] < speed["high_90"]
 
 
 def test_with_a_wall_speeds_are_told_and_a_supply_helps() -> None:

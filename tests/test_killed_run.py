@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 from test_pipeline import ROOT, write_campaign
 
-from vinetrack.pipeline.workflow import OWNER_FILE
+from vinetrack.pipeline.workflow import LOCK_REMOVED
 
 
 @pytest.mark.pipeline
+@pytest.mark.slow
 def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None:
     write_campaign(tmp_path / "vines")
     results = tmp_path / "results" / "vines"
@@ -34,7 +35,5 @@ def test_the_same_snakemake_command_goes_on_after_kill_9(tmp_path: Path) -> None
     assert list((tmp_path / ".snakemake" / "locks").glob("*.lock"))
     again = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert again.returncode == 0, again.stdout + again.stderr
-    assert f"interrupted run (process {first.pid})" in again.stdout
+    assert LOCK_REMOVED in again.stdout
     assert (results / "trials.csv").exists()
-    assert not (results / OWNER_FILE).exists()
-    assert not list(tmp_path.rglob(".tmp-*"))

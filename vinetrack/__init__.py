@@ -13,7 +13,6 @@ Whatever is named here is loaded when it is first used.
 
 from __future__ import annotations
 
-import warnings
 from importlib import import_module
 from typing import Any
 
@@ -42,18 +41,12 @@ _HOMES = {
     "tracks_from_frame": "vinetrack.interface.data_frames",
 }
 
-# Names of version 0.1 that are still read, with a warning, until the next release
-_RENAMED = {"Said": "StatedValues", "believe": "predictive_inputs", "foresee": "predict_vine"}
-
 __all__ = ["__version__", "effects", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
     if name == "effects":
         return import_module("vinetrack.effects")
-    if name in _RENAMED:
-        warnings.warn(f"vinetrack.{name} is now vinetrack.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
-        name = _RENAMED[name]
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'vinetrack' has no attribute {name!r}")

@@ -149,7 +149,9 @@ def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> 
     trial = read_experiment(tmp_path).trial("a")
     time_s = np.arange(20) / 1000
     table = pd.DataFrame({"frame": range(20), "time_s": time_s, "edge_px": np.nan, "lead_position_m": time_s / 10})
-    track = read_stored_track(trial, table.assign(lead_position_sigma_m=np.nan, flag=""))
+    track = read_stored_track(
+        trial, table.assign(lead_position_sigma_m=np.nan, flag="", lead_position_systematic_m=np.nan)
+    )
     assert track.pressure_Pa is not None
     np.testing.assert_allclose(track.pressure_Pa, 1e3 * (20 - np.arange(20) / 10))
 

@@ -27,9 +27,12 @@ def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3,0\n") -> Path:
     return folder
 
 
-def test_results_lie_beside_the_experiment_or_under_the_folder_named(tmp_path: Path) -> None:
+def test_results_lie_where_snakemake_puts_them_or_under_the_folder_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = experiment(tmp_path / "week" / "vines")
-    assert run_paths(folder, None) == RunPaths(folder, tmp_path / "week" / "results" / "vines")
+    monkeypatch.chdir(tmp_path)
+    assert run_paths(folder, None) == RunPaths(folder, tmp_path / make_plan({"experiment": folder}, tmp_path).results)
     assert run_paths(folder, tmp_path / "out").results == tmp_path / "out" / "vines"
 
 
@@ -41,7 +44,7 @@ def test_the_command_that_renews_results_writes_them_where_they_are(
     given = folder.relative_to(tmp_path)
     for base, command in (
         (None, "vinetrack run 'week/my vines'"),
-        (Path("results"), "vinetrack run 'week/my vines' --results results"),
+        (Path("out"), "vinetrack run 'week/my vines' --results out"),
     ):
         results = run_paths(given, base).results
         assert command_for_results(given, results) == command
@@ -53,7 +56,7 @@ def test_the_command_that_renews_results_writes_them_where_they_are(
 def test_the_folder_one_is_in_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = experiment(tmp_path / "vines")
     monkeypatch.chdir(folder)
-    assert run_paths(Path(), None) == RunPaths(folder, tmp_path / "results" / "vines")
+    assert run_paths(Path(), None) == RunPaths(folder, folder / "results" / "vines")
 
 
 def test_experiments_of_one_name_never_share_results(tmp_path: Path) -> None:

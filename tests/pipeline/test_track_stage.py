@@ -58,7 +58,9 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
 
 
 def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_path: Path) -> None:
-    done = track(clip, "--fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25, "--out", tmp_path, "--json", "-")
+    done = track(
+        clip, "--capture-fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25, "--out", tmp_path, "--json", "-"
+    )
     content = json.loads(done.stdout)
     assert content["duration_s"] == pytest.approx(len(scene.frames) / 2000)
     assert content["mm_per_px"] == 0.25
@@ -83,7 +85,7 @@ def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> 
     folder = write_images(tmp_path / "shots", scene.frames)
     done = track(folder, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
-    assert "Capture rate unknown: without --fps there are no times" in done.stdout
+    assert "Capture rate unknown: without --capture-fps there are no times" in done.stdout
 
 
 def test_a_wrong_path_is_told_with_the_nearest_name(clip: Path) -> None:

@@ -230,3 +230,18 @@ def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) 
     assert plan.track_files(parts["tracks_2"]) == []
     assert plan.parts("tracks", names[:3]) == {"tracks": names[:3]}
     assert plan.parts("tracks", []) == {}
+
+
+def test_a_module_that_an_own_effect_may_import_is_an_input_too(tmp_path: Path) -> None:
+    folder = experiment(tmp_path / "v")
+    (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
+    for name in ("brush.py", "beside.py"):
+        (folder / name).write_text("")
+    effects = make_plan({"experiment": str(folder)}, tmp_path).own_effects
+    assert effects == [(folder / name).as_posix() for name in ("brush.py", "beside.py")]
+
+
+def test_the_report_always_has_the_figures_that_it_holds(tmp_path: Path) -> None:
+    folder = str(experiment(tmp_path / "v"))
+    formats = make_plan({"experiment": folder, "figures": {"formats": ["png"]}}, tmp_path).settings.figures.formats
+    assert formats == ("png", "svg")

@@ -163,7 +163,8 @@ def _vine(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        lines = fit_heading(request) + design_vine(
+        heading = fit_heading(request)
+        lines, films_content = design_vine(
             request,
             films=films,
             diameter=diameter,
@@ -175,7 +176,7 @@ def _vine(
             at_fraction=at_fraction,
             figure=figure,
         )
-        print_result(lines, {"lines": lines}, json_file)
+        print_result([*heading, *lines], {"warnings": heading, "films": films_content}, json_file)
 
 
 @column_options(
@@ -231,11 +232,11 @@ def _reservoir(
             B=math.nan if B is None else B,
             n=math.nan if n is None else n,
         )
-        lines = fit_heading(request)
-        lines += design_reservoir(
+        heading = fit_heading(request)
+        lines, chambers = design_reservoir(
             request, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure
         )
-        print_result(lines, {"lines": lines}, json_file)
+        print_result([*heading, *lines], {"warnings": heading, "chambers": chambers}, json_file)
 
 
 design_app = typer.Typer(

@@ -147,7 +147,7 @@ def _tracks_only(folder: Path) -> Experiment:
     if experiment.trials and all(trial.track is None for trial in experiment.trials):
         raise ResultsError(
             f"{folder}: its trials are recordings, which must be tracked first: vinetrack run {folder} tracks and "
-            f"diagnoses them; after that, vinetrack diagnose {folder.parent / 'results' / experiment.name}"
+            f"diagnoses them; after that, vinetrack diagnose {Path('results') / experiment.name}"
         )
     return experiment
 

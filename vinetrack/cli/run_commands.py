@@ -43,7 +43,7 @@ def _run(
         Path | None,
         typer.Option(
             "--results", metavar="DIR", show_default=False,
-            help="Results go to DIR/NAME of the experiment; by default to results/NAME beside it.",
+            help="Results go to DIR/NAME of the experiment; by default to results/NAME of this folder.",
         ),
     ] = None,
     json_file: JsonFile = None,

@@ -48,8 +48,8 @@ def _setup(
 
 def _track(
     recording: Annotated[Path, typer.Argument(help="A film, a stack, or a folder of pictures.", metavar="RECORDING")],
-    fps: Annotated[
-        float | None, typer.Option("--fps", min=1e-6, help="Capture rate, frames per second.", show_default=False)
+    capture_fps: Annotated[
+        float | None, typer.Option("--capture-fps", min=1e-6, help="Frames per second at capture.", show_default=False)
     ] = None,
     exposure_us: Annotated[
         float | None, typer.Option("--exposure-us", min=0, help="Exposure of a frame, µs.", show_default=False)
@@ -83,7 +83,8 @@ def _track(
         from vinetrack.pipeline.overlays_stage import TrackOptions, track_file
 
         options = TrackOptions(
-            fps=or_nan(fps), exposure_us=or_nan(exposure_us), mm_per_px=or_nan(mm_per_px), calibration=calibration,
+            capture_fps=or_nan(capture_fps), exposure_us=or_nan(exposure_us), mm_per_px=or_nan(mm_per_px),
+            calibration=calibration,
             axis=_cell("axis", axis, "--axis"), frames_used=_cell("frames_used", frames, "--frames"),
             body=body, out=out,
         )  # fmt: skip

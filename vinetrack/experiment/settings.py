@@ -372,16 +372,16 @@ class FigureSettings(_Strict):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
-    """Formats of every figure."""
+    """Formats of every figure; svg is always among them, since the report holds it."""
     dpi: Annotated[Count, Field(ge=50, le=1200)] = 150
     """Resolution of png files, dots per inch."""
 
     @field_validator("formats")
     @classmethod
-    def _at_least_one(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+    def _with_svg(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
             raise ValueError("is empty: name at least one of png, svg, pdf")
-        return formats
+        return tuple(dict.fromkeys([*formats, "svg"]))
 
 
 class OverlaySettings(_Strict):

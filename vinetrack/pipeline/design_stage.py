@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.experiment.schema import option
@@ -80,8 +80,8 @@ def design_vine(
     seed: int,
     at_fraction: float,
     figure: Path | None = None,
-) -> list[str]:
-    """Find the fastest vine of every film; draw the choice if requested."""
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Find the fastest vine of every film; draw the choice if requested. Returns lines, and numbers of each film."""
     from vinetrack.core.terminal import waiting
     from vinetrack.dynamics.simulate import SimulationError
     from vinetrack.effects import EffectError
@@ -112,7 +112,26 @@ def design_vine(
     if figure is not None:
         write_figure(_vine_picture(choices), figure)
         lines.append(f"Figure: {figure}")
-    return lines
+    return lines, [_choice_entry(choice) for choice in choices]
+
+
+def _choice_entry(choice: Choice) -> dict[str, Any]:
+    """Return the fastest vine of one film as JSON content, units in the keys."""
+    trial, final = choice.prediction.inputs.trial, choice.prediction.final
+    return {
+        "thickness_um": 1e6 * trial.thickness_m,
+        "diameter_mm": 1e3 * trial.diameter_m,
+        "length_mm": 1e3 * trial.length_m,
+        "pressure_kPa": trial.pressure_Pa / 1e3,
+        "final_speed_m_s": {
+            "y_over_L": final.y_over_L,
+            "median": final.median,
+            "low_90": final.low,
+            "high_90": final.high,
+        },
+        "fastest_in_share_of_draws": choice.odds,
+        "limited_by": list(choice.limits),
+    }
 
 
 def _check_films(room: Room, films: str, diameter: str) -> None:
@@ -213,12 +232,13 @@ def design_reservoir(
     supply_s: float | None,
     at_fraction: float,
     figure: Path | None = None,
-) -> list[str]:
+) -> tuple[list[str], list[dict[str, Any]]]:
     """Find the chamber that limits the loss of gauge pressure; draw the loss against volume if requested. Speeds are
-    predicted if the wall thickness is given.
+    predicted if the wall thickness is given. Returns lines, and numbers of each chamber.
     """
     from vinetrack.core.terminal import waiting
     from vinetrack.effects import EffectError
+    from vinetrack.planning.fastest_vine import chambers
 
     check_figure(figure)
     basis = read_basis(request, needed=REQUIRED_FOR_RESERVOIR)
@@ -237,7 +257,11 @@ def design_reservoir(
     if figure is not None:
         write_figure(_reservoir_picture(trial, loss), figure)
         lines.append(f"Figure: {figure}")
-    return lines
+    entries = [
+        {"chamber": chamber.name, "volume_l": 1e3 * chamber.volume_m3, "loss_of_gauge_pressure": chamber.losses}
+        for chamber in chambers(trial, loss)
+    ]
+    return lines, entries
 
 
 def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:

@@ -32,12 +32,10 @@ log = logging.getLogger(__name__)
 
 
 def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
-    """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv`,
-    `audit.csv` and `payload_model.csv`, the modelled final speed against payload. Returns `fit.json` as written;
-    `refused` is None or the reason.
+    """Fit the model in use to all trials. Writes `fit.json`, `comparison.csv`, `comparison/`, `model_check.csv` and
+    `audit.csv`. Returns `fit.json` as written; `refused` is None or the reason.
     """
     from vinetrack.diagnosis.ladder import COMPARISON_COLUMNS
-    from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
     from vinetrack.inference.fit_result import CHECK_COLUMNS
     from vinetrack.inference.fit_summary import FitSummary, summary_of
@@ -47,7 +45,6 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     damping = read_json(results.damping)
     pairs, kinematics = measured_trials(experiment, results)
     tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
-    tables[results.payload_model] = CURVE_COLUMNS
     written: dict[Path, pd.DataFrame] = {}
     content: dict[str, Any] = {}
     trajectories: dict[str, pd.DataFrame] = {}
@@ -55,7 +52,6 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
         fit, comparison = _fit_and_compare(experiment, pairs, kinematics, settings)
         damping_check, check_message = _damping_check(fit, damping)
         audited = _audit(fit, comparison, pairs, kinematics)
-        curves = payload_curves(fit, settings.final_at_fraction)
     except Exception as error:
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
     else:
@@ -65,7 +61,6 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
             results.model_check: damping_check,
             results.audit: audited.table,
         }
-        written[results.payload_model] = curves
         trajectories = dict(comparison.trajectories)
     for path, columns in tables.items():
         write_csv(path, written.get(path, empty_table(columns)))
@@ -100,14 +95,14 @@ def read_stored_track(trial: Trial, table: pd.DataFrame) -> Track:
     """
     from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
 
-    systematic_m = table.get("lead_position_systematic_m")  # results of 0.1.0 have no such column
+    systematic_m = table["lead_position_systematic_m"].to_numpy(dtype=float)
     track = Track(
         time_s=table["time_s"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
         lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
         flag=table["flag"].to_numpy(dtype=str),
         edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_systematic_m=None if systematic_m is None else systematic_m.to_numpy(dtype=float),
+        lead_position_systematic_m=systematic_m if np.isfinite(systematic_m).any() else None,
     )
     try:
         if trial.pressure_trace is not None:

@@ -269,12 +269,12 @@ TABLE, STRIP, CLIP = "track.csv", "strip.png", "overlay.mp4"  # Names of the out
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions:
-    """Options of the command; NaN and None for those not given. `fps` is the capture rate, `exposure_us` the exposure
+    """Options of the command; NaN and None for those not given. `capture_fps` is the rate, `exposure_us` the exposure
     of a frame. The scale is `mm_per_px`, or the `calibration:` of the settings file `calibration`. `body`: the object
     moves as a whole. `out` is the output folder.
     """
 
-    fps: float = math.nan
+    capture_fps: float = math.nan
     exposure_us: float = math.nan
     mm_per_px: float = math.nan
     calibration: Path | None = None
@@ -373,11 +373,11 @@ def _capture_fps(recording: Recording, options: TrackOptions) -> float:
     """Capture rate, Hz: that stated by the file, else that given by the user; NaN if neither is known."""
     stated_fps = recording.capture_fps
     if stated_fps is None:
-        return options.fps
-    if math.isfinite(options.fps) and abs(options.fps / stated_fps - 1) > 1e-3:
+        return options.capture_fps
+    if math.isfinite(options.capture_fps) and abs(options.capture_fps / stated_fps - 1) > 1e-3:
         raise UserError(
-            f"{recording.path.name}: --fps is {options.fps:g}, but the file states a capture rate of {stated_fps:g}; "
-            "leave --fps out"
+            f"{recording.path.name}: --capture-fps is {options.capture_fps:g}, but the file states a capture rate of "
+            f"{stated_fps:g}; leave --capture-fps out"
         )
     return stated_fps
 
@@ -411,7 +411,7 @@ def _recording_lines(facts: dict[str, Any]) -> list[str]:
             second += f"; exposure {facts['exposure_us']:g} µs"
     else:
         playback = f"; it plays at {playback_fps:.4g} per second" if playback_fps else ""
-        second = f"Capture rate unknown{playback}: without --fps there are no times"
+        second = f"Capture rate unknown{playback}: without --capture-fps there are no times"
     return [f"{first}.", f"{second}."]
 
 

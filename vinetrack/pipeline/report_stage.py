@@ -113,7 +113,6 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     """Read the data of all figures of a whole experiment. Returns arguments of the drawing function by name of the
     figure, for figures with content.
     """
-    from vinetrack.figures.damping_figures import PAYLOAD_LINE
     from vinetrack.figures.overlay import MIN_EDGES, subpixel_positions
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
     from vinetrack.narrative.diagnosis_text import METHOD_NAMES
@@ -130,18 +129,20 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosis_tables(results, described)
-    payload, line = read_result(results.payload_model), PAYLOAD_LINE
+    conditions = read_result(results.conditions)
+    reached = conditions[conditions["final_lead_velocity_m_s"] > 0]
+    grown = reached[["vine", "pressure_kPa", "payload_g"]].drop_duplicates()
+    several_payloads = grown.duplicated(["vine", "pressure_kPa"]).any()
     diagnosis = read_diagnosis(results)
     if diagnosis is not None and diagnosis.refutes:
         compared = compared.assign(model="refuted initial model: " + compared["model"])
-        line = f"refuted initial model, {PAYLOAD_LINE.partition(' and ')[2]}"
     inputs: dict[str, tuple[Any, ...]] = {
         "damping_law": (points, damping) if len(points) else (),
         "exponents": (damping,) if in_fit else (),
         "scaling": (scaling,) if scaling["isometric"] or scaling["thickness"] else (),
         "speed_scaling": (scaling,) if scaling["steady_speed"] else (),
         "efficiency": (scaling,) if scaling["efficiency"] else (),
-        "payload_speed": (read_result(results.conditions), payload, "", line) if len(payload) else (),
+        "payload_speed": (conditions, conditions.iloc[:0]) if several_payloads else (),
         "overview": (described, moved) if moved else (),
         "pixel_places": (places,) if len(places) >= MIN_EDGES else (),
         "model_comparison": (compared, with_final_model(trajectories, diagnosed)) if len(compared) else (),
@@ -397,7 +398,7 @@ _SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
 _DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
 # Addition to the caption of a figure that shows the initial model, if that is refuted
 OF_INITIAL_MODEL = {
-    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _SHOWS_REFUTED),
+    **dict.fromkeys(("model_residuals", "missing_force", "learned_force"), _SHOWS_REFUTED),
     **dict.fromkeys(("model_comparison", "before_after"), _DASHED_REFUTED),
 }
 

@@ -22,7 +22,6 @@ from vinetrack.pipeline.workflow import (
     LOCK_REMOVED,
     PACKAGE,
     SNAKEFILE,
-    claim_results,
     find_experiment,
     find_ground_truth,
     refuse_running,
@@ -153,7 +152,7 @@ def run_paths(folder: Path, base: Path | None) -> RunPaths:
     """Return the folders of a run."""
     experiment = Path(os.path.normpath(find_experiment(folder).absolute()))
     name = experiment.name or "experiment"
-    results = (experiment.parent / "results" if base is None else base.absolute()) / name
+    results = (base or Path("results")).absolute() / name
     refuse_shared_results(results, experiment)
     return RunPaths(experiment, results)
 
@@ -178,7 +177,6 @@ def check_before_run(experiment: Path, say: Say) -> None:
 def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     """Run Snakemake on an experiment; show a progress bar on a terminal, and one line per stage elsewhere."""
     refuse_running(paths.results)
-    claim_results(paths.results, paths.experiment)
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     # Snakemake parses values of --config as YAML, where ` #2` in the name of a folder would be a comment.

@@ -8,17 +8,15 @@ from __future__ import annotations
 import atexit
 import contextlib
 import difflib
-import fnmatch
 import hashlib
 import json
 import os
 import re
 import shlex
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +26,8 @@ from vinetrack.core.tables import is_readable, write_text
 from vinetrack.figures.registry import PAPER_FIGURES
 
 if TYPE_CHECKING:
+    from filelock import FileLock
+
     from vinetrack.experiment.settings import RunSettings
 
 
@@ -69,8 +69,8 @@ def command_for_results(experiment: Path, results: Path) -> str:
     if where.name != name:
         return shlex.join(["snakemake", "--config", f"experiment={experiment}", f"results={results}"])
     command = ["vinetrack", "run", str(experiment)]
-    beside = experiment.absolute().parent / "results"
-    return shlex.join(command if where.parent == beside else [*command, "--results", _shown(where.parent)])
+    usual = where.parent == Path("results").absolute()
+    return shlex.join(command if usual else [*command, "--results", _shown(where.parent)])
 
 
 def find_ground_truth(folder: Path, base: Path) -> Path | None:
@@ -101,10 +101,19 @@ def refuse_shared_results(results: Path, experiment: Path) -> None:
 
 
 def claim_results(results: Path, experiment: Path) -> None:
-    """Record to which experiment a results folder belongs, before the first result is written."""
-    from vinetrack.core.tables import write_json
+    """Record to which experiment a results folder belongs, before the first result is written, and who writes it."""
+    write_text(
+        results / CLAIM_FILE, json.dumps({"experiment": experiment.absolute().as_posix(), "process": os.getpid()})
+    )
 
-    write_json(results / CLAIM_FILE, {"experiment": experiment.absolute().as_posix()})
+
+def _claim(results: Path) -> dict[str, Any]:
+    """Read what `claim_results` has written; empty where there is nothing readable."""
+    try:
+        content = json.loads((results / CLAIM_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def path_problems(*folders: Path) -> list[Problem]:
@@ -127,106 +136,69 @@ def has_wildcard(path: Path) -> bool:
 # ------------------------------------------------------------------------------
 # Ownership of a results folder: only one run writes it at a time, and a killed run does not block the next one.
 #
-# Snakemake locks the files of a run, but cannot tell later whether that run is still alive. Each run therefore records
-# its process and the start time of that process in its results; a process id alone may be reused by another program.
+# A run holds a lock of the operating system as long as its process lives. Snakemake's own locks are files, which stay
+# when a run is killed: those that are found where nobody holds the lock of the results are left over.
 
-START_TOLERANCE_S = 1.0  # Largest difference between two readings of the start time of one process (derived)
-MIN_UNFINISHED_AGE_S = 60.0  # Age from which an unfinished file in the experiment folder counts as abandoned (chosen)
-OWNER_FILE = ".run.json"  # File of a results folder that names the process writing it
+MIN_UNFINISHED_AGE_S = 60.0  # Age from which an unfinished file counts as abandoned; others may be written now (chosen)
+RUN_LOCK = ".run.lock"
 
 LOCK_REMOVED = "Removed the lock of an interrupted run"
 # Temporary names of files that are being written
 UNFINISHED_FILES = re.compile(r"\.tmp-[0-9a-f]{32}(\.\w+)?|\.part-.+")
 
-
-# Options of Snakemake with which it executes no jobs
-NON_EXECUTING_OPTIONS = re.compile(
-    r"-[a-zA-Z]*[nlhDS][a-zA-Z]*|--(dry-?run|unlock|lint|report|summary|detailed-summary|dag|rulegraph|filegraph|d3dag|list.*|help|"
-    r"version|archive|print-compilation|cleanup-.*|delete-.*|containerize)(=.*)?"
-)
-
-
-@dataclass(frozen=True)
-class RunOwner:
-    """A process that runs a workflow: its id, its start time (s since 1970), and its computer."""
-
-    pid: int
-    started_s: float
-    host: str
-
-    @property
-    def is_here(self) -> bool:
-        """Whether it belongs to this computer, so that its state can be determined."""
-        return self.host == socket.gethostname()
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether it is still running; a process of another computer is assumed to be."""
-        if not self.is_here:
-            return True
-        started_s = _process_start_s(self.pid)
-        return started_s is not None and abs(started_s - self.started_s) < START_TOLERANCE_S
+# Options of Snakemake with which it executes no jobs, as its own parser names them
+NON_EXECUTING_OPTIONS = (
+    "dryrun", "unlock", "lint", "report", "summary", "detailed_summary", "dag", "rulegraph", "filegraph", "d3dag",
+    "list_rules", "list_target_rules", "list_changes", "list_input_changes", "list_params_changes",
+    "list_code_changes", "list_untracked", "archive", "cleanup_metadata", "cleanup_shadow", "delete_all_output",
+    "delete_temp_output", "containerize", "print_compilation",
+)  # fmt: skip
 
 
-def executes_nothing(options: Iterable[str]) -> bool:
+def executes_nothing(options: Sequence[str]) -> bool:
     """Whether Snakemake executes no jobs with these options, as in a dry run, a listing, or an unlock."""
-    return any(NON_EXECUTING_OPTIONS.fullmatch(option) for option in options)
+    from snakemake.cli import get_argument_parser
+
+    given, _ = get_argument_parser().parse_known_args(list(options))
+    return any(getattr(given, name, None) not in (None, False) for name in NON_EXECUTING_OPTIONS)
 
 
 def refuse_running(results: Path) -> None:
     """Refuse a results folder that another running process writes."""
-    owner = _read_owner(results / OWNER_FILE)
-    if owner is not None and owner.pid != os.getpid() and owner.is_alive:
-        raise ExperimentError([_refusal(owner, results)])
+    if results.is_dir():
+        _locked(results).release()
 
 
-def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str], None]) -> None:
-    """Make this process the owner of a results folder, and clean up after a killed run. Removes the locks and the
-    unfinished files of a run that has ended. The ownership ends with this process.
-    """
-    refuse_running(results)
-    owner_file = (results / OWNER_FILE).absolute()  # Snakemake may change the working directory before it exits
-    owner = _read_owner(owner_file)
-    if owner is not None and owner.pid != os.getpid() and _remove_locks(working, results):
-        say(f"{LOCK_REMOVED} (process {owner.pid}); the results that it finished are kept.")
-    started_s = _process_start_s(os.getpid()) or time.time()
-    write_text(owner_file, json.dumps(asdict(RunOwner(os.getpid(), started_s, socket.gethostname()))))
-    atexit.register(_remove_owner_file, owner_file, os.getpid())
-    clear_unfinished(results.rglob("*"))
-    clear_unfinished(experiment.glob("*"), older_than_s=MIN_UNFINISHED_AGE_S)
+def _locked(results: Path) -> FileLock:
+    """Return the lock of a results folder, held by this process."""
+    from filelock import FileLock, Timeout
 
-
-def clear_unfinished(paths: Iterable[Path], older_than_s: float = 0.0) -> None:
-    """Remove unfinished files of a program that was killed."""
-    for path in [path for path in paths if UNFINISHED_FILES.fullmatch(path.name)]:
-        with contextlib.suppress(OSError):
-            if path.is_file() and time.time() - path.stat().st_mtime >= older_than_s:
-                path.unlink()
-
-
-def _remove_owner_file(owner_file: Path, pid: int) -> None:
-    """Remove the owner file at exit, in the process that wrote it only, not in a fork of it."""
-    if os.getpid() == pid:
-        with contextlib.suppress(OSError):
-            owner_file.unlink(missing_ok=True)
-
-
-def _refusal(owner: RunOwner, results: Path) -> Problem:
-    message = f"is being written by another run, process {owner.pid}"
-    remedy = "wait until it ends, or stop it"
-    if not owner.is_here:
-        message += f" on the computer {owner.host}"
-        remedy = f"wait until it ends; if it is no longer running, delete {results / OWNER_FILE}"
-    since = time.strftime("%H:%M on %d %B", time.localtime(owner.started_s))
-    return Problem(message=f"{message}, started at {since}", file=str(results), remedy=remedy)
-
-
-def _read_owner(owner_file: Path) -> RunOwner | None:
-    """Read the recorded owner; None if there is none, or the file cannot be read."""
+    results.mkdir(parents=True, exist_ok=True)
     try:
-        return RunOwner(**json.loads(owner_file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return None
+        lock = FileLock(results.absolute() / RUN_LOCK, timeout=0)
+        lock.acquire()
+    except Timeout:
+        process = _claim(results).get("process", "unknown")
+        problem = Problem(
+            message=f"is being written by another run, process {process}",
+            file=str(results),
+            remedy="wait until it ends, or stop it",
+        )
+        raise ExperimentError([problem]) from None
+    return lock
+
+
+def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str], None]) -> FileLock:
+    """Make this process the owner of a results folder until it ends, and clean up after a killed run."""
+    lock = _locked(results)
+    claim_results(results, experiment)
+    if _remove_locks(working, results):
+        say(f"{LOCK_REMOVED}; the results that it finished are kept.")
+    for path in [*results.rglob("*"), *experiment.glob("*")]:
+        with contextlib.suppress(OSError):
+            if UNFINISHED_FILES.fullmatch(path.name) and time.time() - path.stat().st_mtime >= MIN_UNFINISHED_AGE_S:
+                path.unlink()
+    return lock
 
 
 def _remove_locks(working: Path, results: Path) -> int:
@@ -242,154 +214,18 @@ def _remove_locks(working: Path, results: Path) -> int:
     return removed
 
 
-def _process_start_s(pid: int) -> float | None:
-    """Start time of a process, s since 1970; None if it does not exist or is a zombie."""
-    import psutil
-
-    try:
-        process = psutil.Process(pid)
-        return None if process.status() == psutil.STATUS_ZOMBIE else float(process.create_time())
-    except psutil.Error:
-        return None
-
-
 # ------------------------------------------------------------------------------
-# The code that a stage of the workflow depends on, found from its imports, so that an edit reruns outdated stages.
-#
-# Starting from the modules that a stage's command calls, every import of a vinetrack module is followed, including
-# those
-# inside functions but not those for the type checker only. A module also depends on files beside it that it names in a
-# string: effects (`"*.py"`), templates, style sheets, YAML files.
-#
-# The sources are scanned with regular expressions: parsing 300 files takes 1.3 s, scanning those of all stages 0.15 s,
-# and Snakemake waits for it at every start. A test compares the scan with the syntax trees of all files.
-
-_EXPERIMENT_READERS = ("experiment.folder", "experiment.settings")
-# Modules that the command of each stage calls
-STAGE_MODULES = {
-    "laboratory": ("laboratory.__main__",),
-    "recording": ("pipeline.recordings_stage", *_EXPERIMENT_READERS),
-    "tracks": ("pipeline.tracks_stage", *_EXPERIMENT_READERS),
-    "gather": ("pipeline.tracks_stage", *_EXPERIMENT_READERS),
-    "damping": ("pipeline.damping_stage", *_EXPERIMENT_READERS),
-    "model": ("pipeline.model_stage", *_EXPERIMENT_READERS),
-    "diagnosis": ("pipeline.diagnosis_stage", *_EXPERIMENT_READERS),
-    "figures": ("pipeline.figures_stage", *_EXPERIMENT_READERS),
-    "paper": ("pipeline.paper_stage", *_EXPERIMENT_READERS),
-    "overlays": ("pipeline.overlays_stage", *_EXPERIMENT_READERS),
-    "report": ("pipeline.report_stage", *_EXPERIMENT_READERS),
-}
-
-_TYPE_CHECKING_BLOCK = re.compile(r"^if TYPE_CHECKING:\n(?:(?:[ \t]+[^\n]*)?\n)+", re.MULTILINE)
-_FROM = re.compile(r"^[ \t]*from (vinetrack[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
-_IMPORT = re.compile(r"^[ \t]*import (vinetrack[\w.]*)", re.MULTILINE)
-_RESOURCES = re.compile(r"""\bfiles\("(vinetrack[\w.]*)"\)""")
-_STRING = re.compile(r'"([^"\n]+)"')
-_PLACEHOLDER = re.compile(r"\{[^}]*\}")
+# What the Snakefile asks: the plan of a run with its inputs and outputs.
 
 
-def code_hash(stage: str, package: Path = PACKAGE) -> str:
-    """Return a hash of the code of a stage, which as a parameter of its rule makes Snakemake rerun it after an edit."""
+@lru_cache(maxsize=1)
+def code_hash(package: Path = PACKAGE) -> str:
+    """Return a hash of the package, which as a parameter of every rule makes Snakemake rerun it after an edit."""
     digest = hashlib.sha256()
-    for path in stage_files(stage, package):
-        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + _content(path))
+    for path in sorted(package.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def stage_files(stage: str, package: Path = PACKAGE) -> list[Path]:
-    """Return all files of the package that a stage runs or reads, sorted."""
-    waiting = [path for name in STAGE_MODULES[stage] for path in _module_files(name, package)]
-    reached: set[Path] = set()
-    while waiting:
-        path = waiting.pop()
-        if path not in reached:
-            reached.add(path)
-            waiting.extend(_files_used(path, package))
-    return sorted(reached)
-
-
-@lru_cache(maxsize=1024)
-def _files_used(path: Path, package: Path) -> tuple[Path, ...]:
-    """Files of the package that one file imports or names; each file is scanned once per process."""
-    if path.suffix != ".py":
-        return ()
-    text = _content(path).decode("utf-8")
-    names = imported_names(text)
-    modules = [file for name in names for file in _module_files(name, package)]
-    resources = [file for name in _RESOURCES.findall(text) for file in _data_files(_folder(name, package))]
-    return tuple(dict.fromkeys([*modules, *resources, *_named_beside(path, text)]))
-
-
-def imported_names(text: str) -> set[str]:
-    r"""Return the dotted names below `vinetrack` that a source imports at run time: modules and their members. `from
-    vinetrack.core import published` gives `core` and `core.published`: the text alone does not tell whether `published`
-    is a module.
-    """
-    text = _TYPE_CHECKING_BLOCK.sub("", text)
-    names = set(_IMPORT.findall(text))
-    for module, imported in _FROM.findall(text):
-        names.add(module)
-        names.update(f"{module}.{name}" for name in re.findall(r"(\w+)(?: as \w+)?", imported))
-    return {name.removeprefix("vinetrack").lstrip(".") for name in names}
-
-
-@lru_cache(maxsize=4096)
-def _module_files(name: str, package: Path) -> tuple[Path, ...]:
-    """File of a module and the `__init__.py` that Python runs before it; empty if the name is not a module. The
-    `__init__.py` of vinetrack itself counts only if something is imported from it: it loads nothing.
-    """
-    if not name:
-        return (package / "__init__.py",)
-    folder = package.joinpath(*name.split("."))
-    file = folder.with_suffix(".py")
-    if file.is_file():
-        init_file = file.with_name("__init__.py")
-        return (file, init_file) if file.parent != package and init_file.is_file() else (file,)
-    return (folder / "__init__.py",) if (folder / "__init__.py").is_file() else ()
-
-
-def _folder(name: str, package: Path) -> Path:
-    return package.joinpath(*name.split(".")[1:])
-
-
-def _named_beside(path: Path, text: str) -> list[Path]:
-    """Files beside a module, or folders of them, that it names in a string; `*` and `{…}` match any text."""
-    neighbours = {entry.name: entry for entry in _entries(path.parent)}
-    named: list[Path] = []
-    for string in dict.fromkeys(_STRING.findall(text)):
-        if string in neighbours:
-            named.append(neighbours[string])
-        elif "." in string and ("*" in string or "{" in string):
-            pattern = _PLACEHOLDER.sub("*", string)
-            # A pattern without a definite suffix (`*.*`, `*`) refers to files elsewhere.
-            if re.search(r"\.\w+$", pattern):
-                named += [neighbours[name] for name in fnmatch.filter(neighbours, pattern)]
-    return [file for entry in named for file in (_data_files(entry) if entry.is_dir() else [entry])]
-
-
-@lru_cache(maxsize=256)
-def _entries(folder: Path) -> tuple[Path, ...]:
-    """Files of a folder, and its subfolders that are not packages."""
-    entries = [entry for entry in sorted(folder.iterdir()) if entry.name != "__pycache__"]
-    return tuple(entry for entry in entries if entry.is_file() or not (entry / "__init__.py").exists())
-
-
-def _data_files(folder: Path) -> list[Path]:
-    """All files below a folder; of a package, only those that are not modules."""
-    is_package = (folder / "__init__.py").exists()
-    files: Iterable[Path] = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
-    return [path for path in files if not (is_package and path.suffix == ".py")]
-
-
-@lru_cache(maxsize=1024)
-def _content(path: Path) -> bytes:
-    return path.read_bytes()
-
-
-def forget_scans() -> None:
-    """Clear all caches, for a process in which the sources change."""
-    for cached in (_files_used, _module_files, _entries, _content):
-        cached.cache_clear()
 
 
 # Additional tables of an experiment that is compared with published numbers
@@ -430,6 +266,11 @@ class WorkflowPlan:
     settings: RunSettings
     ground_truth: Path | None
     published: bool
+
+    @property
+    def code(self) -> str:
+        """Hash of the package: an edit of its code reruns everything."""
+        return code_hash()
 
     @property
     def sheets(self) -> list[str]:
@@ -538,7 +379,9 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_virtual or is_readable(path)))
-    effect_files = (folder / path for path in experiment.settings.effects)
+    # An own effect may import what lies beside it.
+    effects = [folder / path for path in experiment.settings.effects]
+    effect_files = dict.fromkeys([*effects, *(file for path in effects for file in sorted(path.parent.glob("*.py")))])
     shared = [path for path in (*(folder / name for name in SHARED_FILES), *effect_files) if is_readable(path)]
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
@@ -599,21 +442,22 @@ def begin_run_or_exit(plan: WorkflowPlan) -> None:
     if executes_nothing(sys.argv[1:]):
         return
     try:
-        begin_run(plan.results, plan.experiment, Path.cwd(), lambda line: print(line, flush=True))
+        lock = begin_run(plan.results, plan.experiment, Path.cwd(), lambda line: print(line, flush=True))
     except ExperimentError as error:
         print("\n".join(format_problems(error.problems)), file=sys.stderr, flush=True)
         raise SystemExit(1) from None
+    # At exit, since `onsuccess` runs before Snakemake's closing lines, and not at all if there was nothing to do.
+    atexit.register(_print_report_path, plan)
+    atexit.register(lock.release)
 
 
-def print_report_path_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
-    """Print the path of the report as the last line of this process, if the report is newer than all inputs.
-    Snakemake's `onsuccess` runs before its closing lines, and not at all if there was nothing to do.
-    """
-    if not quiet:
-        atexit.register(_print_report_path, plan)
+def keep_report_path_back() -> None:
+    """Do not print the path of the report of an earlier run at the end of one that failed."""
+    atexit.unregister(_print_report_path)
 
 
 def _print_report_path(plan: WorkflowPlan) -> None:
+    """Print the path of the report as the last line of this process, if it is newer than all inputs."""
     path = plan.results / "report.html"
     if not path.exists():
         return

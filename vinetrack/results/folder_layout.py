@@ -191,11 +191,6 @@ class Results:
         return self.folder / "audit.csv"
 
     @property
-    def payload_model(self) -> Path:
-        """Final speed against payload by the model in use."""
-        return self.folder / "payload_model.csv"
-
-    @property
     def fit(self) -> Path:
         """The model in use, fitted to the trajectories."""
         return self.folder / "fit.json"
@@ -322,9 +317,6 @@ def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
 # ------------------------------------------------------------------------------
 # Reading the fit of a results folder as a typed object; the only reader of `fit.json`.
 #
-# The diagnosis has a module of its own, `stored_diagnosis`, because the stage of the model reads fits and must not
-# rerun
-# when the text of a diagnosis changes.
 
 
 def read_fit(results: Results) -> FitSummary:
