@@ -38,13 +38,6 @@ if TYPE_CHECKING:
 
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
-# Formats that are not read, and what they are: no vendor documentation was available to check a reader against
-UNSUPPORTED_FORMATS = {
-    ".raw": "raw pixels without a header, as a Chronos writes them; nothing says their size, depth and rate",
-    ".r3d": "a recording in RED's own format",
-    ".braw": "a recording in Blackmagic's own format",
-    ".seq": "a sequence of StreamPix",
-}
 # Formats under which FFmpeg renders any text as a picture of its letters
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
 
@@ -268,10 +261,8 @@ def _why_unreadable(path: Path, messages: list[str], error: str) -> str:
     text = " ".join([*messages, error])
     if "moov atom not found" in text and _looks_like_mp4(path):
         return f"{path.name}: cut short: the index that is written last is missing; copy the file again, or repair it"
-    if path.suffix.lower() in UNSUPPORTED_FORMATS:
-        return f"{path.name}: {UNSUPPORTED_FORMATS[path.suffix.lower()]}; save it from the camera as DNG, TIFF or mp4"
     if path.suffix.lower() not in CONTAINERS:
-        return f"{path.name}: not a video that can be read; use mp4, mov, avi, mkv, or a folder of images"
+        return f"{path.name}: not a video that can be read; save it from the camera as mp4, mov, avi, mkv, DNG or TIFF"
     return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
 
 

@@ -118,15 +118,13 @@ def inspect_cine(path: Path) -> Recording:
             )
             if kind != b"CI":
                 raise RecordingError(f"{name}: not a Phantom cine; name a film, or a folder of pictures")
-            if version != 1:
-                raise RecordingError(f"{name}: a cine of version {version} is not read; save it anew in version 1")
             end = table + 8 * count
             if min(bitmap, setup, table) < 44 or count == 0 or end > size:
                 raise RecordingError(f"{name}: cut short, or its header is damaged; copy it from the camera again")
             stream.seek(0)
             header = stream.read(max(end, setup + SETUP_BYTES))
             offsets = tuple(int(at) for at in np.frombuffer(header, "<i8", count, table))
-            frames = _cine_frames(path, stream, header, (compression, bitmap, setup), offsets, size)
+            frames = _cine_frames(path, stream, header, (version, compression, bitmap, setup), offsets, size)
         setup_bytes = header[setup:]
         rate, exposure_s, times_s, notes = _cine_clock(name, setup_bytes, _tagged_blocks(header[:table], setup), count)
     except (struct.error, ValueError, OSError) as error:
@@ -142,26 +140,22 @@ def inspect_cine(path: Path) -> Recording:
 
 
 def _cine_frames(
-    path: Path, stream: BinaryIO, header: bytes, places: tuple[int, int, int], offsets: tuple[int, ...], size: int
+    path: Path, stream: BinaryIO, header: bytes, places: tuple[int, int, int, int], offsets: tuple[int, ...], size: int
 ) -> RawFrames:
     """Offsets of the frames and how they are packed; refuses what cannot be read."""
     name = path.name
-    compression, bitmap, setup = places
+    version, compression, bitmap, setup = places
     _, width, height, _, bits, packing = struct.unpack_from("<IiiHHI", header, bitmap)
     mark, length = struct.unpack_from("<2sH", header, setup + MARK_AT)
     if mark != b"ST" or length < REAL_BITS_AT + 4:
         raise RecordingError(f"{name}: its camera's settings are missing or of an unknown kind; save it anew")
     filters = struct.unpack_from("<I", header, setup + COLOUR_FILTER_AT)[0]
-    if compression == 1:
-        raise RecordingError(f"{name}: a compressed cine (JPEG) is not read; save it uncompressed")
-    if compression not in (0, 2) or packing not in PACKED_BITS:
+    grey = compression == 0 or (compression == 2 and filters in {0} | BAYER_CODES)
+    if not (version == 1 and grey and packing in PACKED_BITS and bits in (8, 16)):
         raise RecordingError(
-            f"{name}: a cine of compression {compression}, packing {packing} is not read; save it as raw cine"
+            f"{name}: a cine of version {version}, compression {compression}, packing {packing}, {bits} bits, "
+            f"colour filter {filters:#x} is not read; save it as raw cine or AVI"
         )
-    if bits not in (8, 16):
-        raise RecordingError(f"{name}: {bits} bits a pixel, colours interleaved, are not read; save it as raw cine")
-    if compression == 2 and (filters >> 8 or filters not in {0} | BAYER_CODES):
-        raise RecordingError(f"{name}: a sensor with colour filters of code {filters:#x} is not read; save it as AVI")
     packed = PACKED_BITS[packing]
     frames = RawFrames(
         path, (), width, abs(height), packed or bits, bottom_up=packed is None and height > 0,
@@ -246,12 +240,12 @@ def inspect_mraw(path: Path) -> Recording:
     facts = read_side_file(side)
     if data is None:
         raise RecordingError(f"{path.name}: its .mraw is missing, which holds the pictures; put it in the same folder")
-    if facts.file_format.lower() != "mraw":
-        raise RecordingError(f"{side.name}: describes {facts.file_format or 'unknown'} pictures, not {data.name}")
-    if not facts.colour.lower().startswith("mono") and facts.colour:
-        raise RecordingError(f"{data.name}: colour ({facts.colour}) is not read; save it as AVI or TIFF")
-    if facts.stored_bits not in (8, 12, 16):
-        raise RecordingError(f"{data.name}: {facts.stored_bits} bits a pixel are not read; save it with 8, 12 or 16")
+    grey = not facts.colour or facts.colour.lower().startswith("mono")
+    if not (facts.file_format.lower() == "mraw" and grey and facts.stored_bits in (8, 12, 16)):
+        raise RecordingError(
+            f"{side.name}: {facts.file_format or 'unknown'} pictures of {facts.stored_bits} bits ({facts.colour}) are "
+            "not read; save them as MRAW with 8, 12 or 16 bits of grey, or as AVI or TIFF"
+        )
     frames = RawFrames(data, (), facts.width, facts.height, facts.stored_bits)
     if min(facts.width, facts.height, facts.n_frames) < 1 or (facts.width * facts.height * facts.stored_bits) % 8:
         raise RecordingError(f"{side.name}: size or number of frames is missing; copy it from the camera again")
