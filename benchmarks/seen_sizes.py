@@ -2,9 +2,8 @@
 
     python benchmarks/seen_sizes.py [--seeds tune|score] [--each N] [--keep DIR]
 
-One row a recording of the virtual laboratory, two sizes like the demonstration's and every harder preset: the look
-before any work (`vinetrack.video.survey`) and the tracker. Ratios are seen over true. Allowances in
-`vinetrack.video.survey` were set on seeds 20900 and up (tune).
+One row a recording of the virtual laboratory, two sizes like the demonstration's and every harder preset. Ratios are
+seen over true. Allowances in `vinetrack.video.survey` were set on seeds 20900 and up (tune).
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from tracking_accuracy import CAPTURE_FPS, HARD, film
 
 from vinetrack.core.records import Trial
 from vinetrack.laboratory.scene import Scene, Tube, preset
-from vinetrack.video.frames import RecordingError, inspect_recording
-from vinetrack.video.survey import look_at
+from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording
 
 FIRST = {"tune": 20900, "score": 30900}
@@ -43,7 +41,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=1, help="recordings of each scene")
     parser.add_argument("--keep", type=Path, help="folder for the rendered recordings, to use them again")
     chosen = parser.parse_args()
-    print(f"{'recording':32s}{'width, look':>12s}{'width, track':>13s}{'growth, look':>13s}{'growth, track':>14s}")
+    print(f"{'recording':32s}{'width':>12s}{'growth':>12s}")
     ratios = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = chosen.keep or Path(scratch)
@@ -55,12 +53,11 @@ def main() -> None:
 
 
 def row(name: str, path: Path, scene: Scene) -> list[float]:
-    """Print and return the four ratios of one recording, NaN where a size is not seen."""
+    """Print and return the two ratios of one recording, NaN where a size is not seen."""
     tube = scene.subject
     assert isinstance(tube, Tube)
     m_per_px = scene.camera.m_per_px
     trial = Trial(name=name, video=path, capture_fps=CAPTURE_FPS, m_per_px=m_per_px)
-    look = look_at(inspect_recording(path), trial, None, None)
     try:
         tracking = track_recording(trial)
         y = tracking.track.lead_position_m[tracking.track.usable]
@@ -68,9 +65,8 @@ def row(name: str, path: Path, scene: Scene) -> list[float]:
     except RecordingError as error:
         print(f"{name:32s} {error}")
         tracked = np.nan, np.nan
-    seen = look.tube_width_px * m_per_px / tube.diameter_m, look.growth_px * m_per_px / tube.length_m
-    print(f"{name:32s}{seen[0]:12.3f}{tracked[0]:13.3f}{seen[1]:13.3f}{tracked[1]:14.3f}", flush=True)
-    return [seen[0], tracked[0], seen[1], tracked[1]]
+    print(f"{name:32s}{tracked[0]:12.3f}{tracked[1]:12.3f}", flush=True)
+    return list(tracked)
 
 
 if __name__ == "__main__":

@@ -408,7 +408,8 @@ def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]])
     """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
     column.
     """
-    from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
+    from vinetrack.planning.pressure_plausibility import pressure_problems
+    from vinetrack.tracks.frame_timing import mean_speed
 
     noted: dict[str, list[tuple[str, str]]] = {}
     for trial, _ in pairs:
@@ -419,7 +420,7 @@ def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]])
         + (f" (and {len(of_trial) - 1} more trial{'s' if len(of_trial) > 2 else ''})" if len(of_trial) > 1 else "")
         for column, of_trial in noted.items()
     }
-    speeds = [(trial, track_speed(track)) for trial, track in pairs]
+    speeds = [(trial, mean_speed(track)) for trial, track in pairs]
     return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 
 

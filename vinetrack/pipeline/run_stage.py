@@ -62,7 +62,8 @@ def check_folder(folder: Path) -> CheckReport:
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.pipeline.workflow import path_problems
-    from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
+    from vinetrack.planning.pressure_plausibility import pressure_problems
+    from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.tracks.position_noise import common_rounding_noise
     from vinetrack.tracks.smoothed_positions import detect_smoothing
@@ -82,7 +83,7 @@ def check_folder(folder: Path) -> CheckReport:
         if trial.track is not None:
             with contextlib.suppress(TrackError):
                 tracks.append((trial, load_track(trial)))
-    speeds += [(trial, track_speed(track)) for trial, track in tracks]
+    speeds += [(trial, mean_speed(track)) for trial, track in tracks]
     # The plausibility of a pressure depends on the sizes, so it is tested only if these have no errors.
     if not any(problem.severity == "error" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS

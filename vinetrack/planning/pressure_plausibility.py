@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.core import published
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Trial
 from vinetrack.core.units import convert, number
 from vinetrack.planning.predictive_inputs import damping_prior
 
@@ -32,17 +32,6 @@ def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield
         return math.nan
     damping = drive_N / (trial.travel_ratio * mean_speed_m_s) ** published.EXPONENT
     return damping / damping_prior(trial.diameter_m, trial.thickness_m)
-
-
-def track_speed(track: Track) -> float:
-    """Return the mean speed of the leading edge over the middle of its travel."""
-    time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
-    travel_m = np.maximum.accumulate(position_m - position_m[0]) if position_m.size else position_m
-    if travel_m.size < 5 or not travel_m[-1] > 0:
-        return math.nan
-    early, late = (int(np.searchsorted(travel_m, part * travel_m[-1])) for part in (0.2, 0.9))
-    duration_s = float(time_s[late] - time_s[early])
-    return float(travel_m[late] - travel_m[early]) / duration_s if duration_s > 0 else math.nan
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:

@@ -430,3 +430,14 @@ def count_missing(
         else:
             notes.append(f"a step of {ratio:.1f} times its neighbours before frame {number[i]}: frames may be missing")
     return MissingFrames(counted, gap, retimed, tuple(notes))
+
+
+def mean_speed(track: Track) -> float:
+    """Mean speed of the leading edge over the middle of its travel, m/s; NaN without travel."""
+    time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
+    travel_m = np.maximum.accumulate(position_m - position_m[0]) if position_m.size else position_m
+    if travel_m.size < 5 or not travel_m[-1] > 0:
+        return np.nan
+    early, late = (int(np.searchsorted(travel_m, part * travel_m[-1])) for part in (0.2, 0.9))
+    duration_s = float(time_s[late] - time_s[early])
+    return float(travel_m[late] - travel_m[early]) / duration_s if duration_s > 0 else np.nan

@@ -311,16 +311,6 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     return Outline(intercept, slope, median_width / 2 + 1.5, median_width, sigma, path, passed, place, centre)
 
 
-def rough_growth(strip: Strip) -> tuple[float, float]:
-    """Estimate growth and speed from the initial path of the front, without fitting. Returns number of columns that the
-    front passes, px, and its mean speed over the middle of them, px per frame.
-    """
-    path, passed = front_path_by_change(strip)
-    growth = float(passed[1] - passed[0])
-    early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
-    return growth, 0.7 * growth / max(late - early, 1)
-
-
 def _max_sum_run(excess: Floats) -> tuple[float, float]:
     """Return the ends of the run with the greatest sum, interpolated to a fraction of a row (maximum-subarray search).
     Short gaps do not end the run and isolated glints do not extend it.

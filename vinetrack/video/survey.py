@@ -2,15 +2,15 @@
 
 Every recording is opened and its header read; its frames are counted where the file's index, or a walk through its
 packets, gives the number without decoding. The calibration is read once for each picture size. One recording of each
-condition is looked into, and what it shows is compared with the sheet.
+condition is tracked, by the function that tracks for `run`, and what it shows is compared with the sheet.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress, table
 from vinetrack.core.units import number
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
+from vinetrack.tracks.frame_timing import mean_speed
 from vinetrack.video.axis import Axis, askew_trials, slope_deg
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.curved_axis import (
@@ -32,11 +33,10 @@ from vinetrack.video.curved_axis import (
     find_growth_axis,
     front_share_function,
 )
-from vinetrack.video.edge import rough_growth
-from vinetrack.video.frames import Recording, RecordingError, inspect_recording, iterate_frames
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.images import capture_exposure, capture_rate
 from vinetrack.video.small_pictures import SmallPictures, read_event
-from vinetrack.video.track import FEWEST_FRAMES, Tracking, locate_axis, track_frames, tube_strip
+from vinetrack.video.track import FEWEST_FRAMES, Tracking, track_frames, tube_strip
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -73,8 +73,15 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
+    capture_rate(trial, recording)
+    return measure(trial, settings, recording, calibration_of(trial, settings, folder, recording))
+
+
+def measure(
+    trial: Trial, settings: ExperimentSettings, recording: Recording, calibration: PlaneCalibration | None
+) -> Measurement:
+    """Track the recording of one trial by a calibration, or by the trial's own scale: the one look into a recording."""
     capture_fps = capture_rate(trial, recording)
-    calibration = calibration_of(trial, settings, folder, recording)
     if calibration is None and not math.isfinite(trial.m_per_px):
         raise RecordingError(
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
@@ -121,51 +128,6 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     return axis_through((shared.from_px, *(shared.via_px or ()), shared.to_px), width_px)
 
 
-# ------------------------------------------------------------------------------
-# Look into a recording before any work: axis, width of the tube and growth, from about a hundred of its frames.
-#
-# It takes a second a recording and fits no edge: the widths agree with those of the tracker, growth is known to some
-# per
-# cent.
-
-FRAMES_LOOKED_AT = 100  # Frames of a recording that are looked at (chosen)
-MOST_BYTES = 200_000_000  # Memory for those frames (chosen)
-MOST_DECODED = 4000  # Most frames that are decoded, some three seconds' work (chosen)
-
-
-@dataclass(frozen=True)
-class Look:
-    """What a quick look shows; NaN where not seen. `growth_px` is NaN as well where the recording is longer than what
-    was looked at; `px_per_frame` is the mean speed over the middle of the growth.
-    """
-
-    axis: Axis | None = None
-    tube_width_px: float = math.nan
-    tube_width_sigma_px: float = math.nan
-    growth_px: float = math.nan
-    px_per_frame: float = math.nan
-
-
-def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | None) -> Look:
-    """Look for the axis, the width of the tube and its growth. The sheet's diameter is not used: what it will be
-    compared with must not depend on it.
-    """
-    most = int(np.clip(MOST_BYTES // (recording.width * recording.height), FRAMES_LOOKED_AT // 4, FRAMES_LOOKED_AT))
-    every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
-    luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
-    try:
-        located, front_share_of = locate_axis(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
-        outlined = tube_strip(luma, located, front_share_of) if trial.travel_ratio == 2 else None
-        if outlined is None:
-            return Look(located)
-        strip, tube = outlined
-        growth_px, px_per_frame = rough_growth(strip)
-    except (RecordingError, ValueError):
-        return Look()
-    whole = count is None or count <= MOST_DECODED
-    return Look(strip.axis, tube.width_px, tube.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every)
-
-
 def proposed_axis(luma: NDArray[Any]) -> Axis:
     """Propose the growth axis that the motion shows, along the middle of the tube where one front passes once. Shapes:
     luma (n_frames, height, width).
@@ -184,11 +146,10 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
 #
 # A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
 # as
-# physics. `vinetrack.video.survey` measures width and growth before any work; the tracker measures them better.
+# physics.
 
 WIDTH_TOLERANCE = 0.08  # Relative difference of width and diameter that is allowed beyond the stated error (measured)
-# Relative excess of growth over length that is allowed, with growth from the tracker (True) or a quick look (measured)
-GROWTH_TOLERANCE = {True: 0.06, False: 0.12}
+GROWTH_TOLERANCE = 0.06  # Relative excess of growth over length that is allowed (measured)
 EXPOSURE_TOLERANCE_PX = 3.0  # Difference of the blur lengths of stated and seen exposure that is allowed (measured)
 ERROR_FACTOR = 1.5  # Factor between picture and sheet above which the difference is an error (chosen)
 SIGMAS = 3.0  # Standard errors of the width that are allowed for
@@ -201,9 +162,8 @@ OR_SKIP_COMPARISON = "or write compare_sizes: no where only part of the tube is 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFacts:
-    """Facts of one recording; NaN (None) where not known. `tracked` says whether width and growth come from the tracker
-    or from a quick look; `picture_mm` is the width of the picture; `mean_speed_m_s` is that of the leading edge over
-    the middle of its growth.
+    """Facts of one recording; NaN (None) where not known, as width, growth and speed of one that was not tracked.
+    `picture_mm` is the width of the picture; `mean_speed_m_s` that of the leading edge over the middle of its growth.
     """
 
     trial: str
@@ -218,7 +178,6 @@ class RecordingFacts:
     tube_width_sigma_mm: float = math.nan
     growth_mm: float = math.nan
     mean_speed_m_s: float = math.nan
-    tracked: bool = False
 
     @property
     def duration_s(self) -> float:
@@ -242,7 +201,7 @@ def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
         tube_width_mm=mm_per_px * tracking.tube_width_px,
         tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
         growth_mm=1e3 * measurement.growth_m,
-        tracked=True,
+        mean_speed_m_s=mean_speed(tracking.track),
     )
 
 
@@ -256,7 +215,7 @@ def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
     width, growth = facts.tube_width_mm / diameter_mm, facts.growth_mm / length_mm
     sigma = math.hypot(facts.tube_width_sigma_mm / diameter_mm, float(np.nan_to_num(facts.scale_rel_sigma)))
     width_off = abs(width - 1) > WIDTH_TOLERANCE + SIGMAS * sigma
-    growth_too_long = growth > 1 + GROWTH_TOLERANCE[facts.tracked]
+    growth_too_long = growth > 1 + GROWTH_TOLERANCE
     width_text = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
     growth_text = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
     remedy = f"check it, its unit and the scale, {OR_SKIP_COMPARISON}"
@@ -423,12 +382,12 @@ SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000  # Largest file without an index that is read to its end to count its frames (chosen)
 
 
-MOST_LOOKS = 12  # Most recordings that are looked into, about a second each (chosen)
+MOST_LOOKS = 12  # Most recordings that are tracked, a second or two each (chosen)
 
 
 class Surveyor:
     """Opens the recordings of an experiment and keeps the facts of each in `facts`, by trial. `looked_into` are the
-    trials whose frames were looked at.
+    trials whose recordings were tracked.
     """
 
     def __init__(self) -> None:
@@ -453,8 +412,13 @@ class Surveyor:
         self.looked_into = _one_per_condition(sound)
         for trial in progress(sound, "looking into recordings", unit="recording"):
             scale = calibrations.get((opened[trial].width, opened[trial].height))
-            facts = _recording_facts(trial, experiment.settings, opened[trial], scale, trial in self.looked_into)
-            problems += [replace(problem, trial=trial.name) for problem in size_problems(trial, facts)]
+            facts, of_trial = _stated_facts(trial, experiment.settings, opened[trial], scale), []
+            if trial in self.looked_into:
+                with contextlib.suppress(RecordingError):
+                    measurement = measure(trial, experiment.settings, opened[trial], scale)
+                    facts = tracked_facts(trial, measurement)
+                    of_trial = [*size_problems(trial, facts), *exposure_problems(trial, measurement.tracking)]
+            problems += [replace(problem, trial=trial.name) for problem in of_trial]
             self.facts[trial] = facts
         return problems + of_scale
 
@@ -476,40 +440,23 @@ def _one_per_condition(trials: list[Trial]) -> list[Trial]:
     return [*vines, *others][:MOST_LOOKS]
 
 
-def _recording_facts(
-    trial: Trial, settings: ExperimentSettings, recording: Recording, scale: PlaneCalibration | None, look: bool
+def _stated_facts(
+    trial: Trial, settings: ExperimentSettings, recording: Recording, scale: PlaneCalibration | None
 ) -> RecordingFacts:
-    """Facts of one recording; with `look`, also those that a quick look at its frames gives."""
+    """Facts of one recording that its header and the sheet state."""
     m_per_px, rel_sigma = trial.m_per_px, math.nan
     if not math.isfinite(m_per_px) and scale is not None:
         m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
-    axis = given_axis(trial, settings, m_per_px)
     count = _frames_present(recording)
-    count = recording.declared_frames if count is None else count
-    view = look_at(recording, trial, axis, count) if look else None
-    if scale is not None and view is not None and view.axis is not None and not math.isfinite(trial.m_per_px):
-        along = scale.along(view.axis.from_px, view.axis.to_px)
-        m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
-    capture_fps = capture_rate(trial, recording)
-    facts = RecordingFacts(
+    return RecordingFacts(
         trial=trial.name,
-        n_frames=count,
-        capture_fps=capture_fps,
+        n_frames=recording.declared_frames if count is None else count,
+        capture_fps=capture_rate(trial, recording),
         playback_fps=recording.playback_fps,
         mm_per_px=1e3 * m_per_px,
         scale_rel_sigma=rel_sigma,
         picture_mm=1e3 * m_per_px * recording.width,
-        axis=axis,
-    )
-    if view is None:
-        return facts
-    return replace(
-        facts,
-        axis=view.axis or axis,
-        tube_width_mm=1e3 * m_per_px * view.tube_width_px,
-        tube_width_sigma_mm=1e3 * m_per_px * view.tube_width_sigma_px,
-        growth_mm=1e3 * m_per_px * view.growth_px,
-        mean_speed_m_s=m_per_px * view.px_per_frame * capture_fps,
+        axis=given_axis(trial, settings, m_per_px),
     )
 
 
@@ -620,8 +567,6 @@ def _calibration_problems(
     settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]], calibrations: Calibrations
 ) -> list[Problem]:
     """Read the calibration for each picture size into `calibrations`; only the first problem is reported."""
-    from vinetrack.video.calibration import CalibrationError, calibrate
-
     image = getattr(settings.calibration, "image", None)
     if settings.calibration is None or (image is not None and not (folder / image).exists()):
         return []
