@@ -14,13 +14,14 @@ import re
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from hidden.kinds import OUTSIDERS, kinds
+from hidden.kinds import kinds
 from hidden.laboratory_rows import ROWS
 from numba.core import event
 from tracking_accuracy import BODIES, HARD
@@ -95,7 +96,9 @@ def diagnosed(kind: str, seed: int, folder: Path, known: Sequence[float] | None)
     last = answer.final_answer if len(answer.final_answer) == 1 else ()
     if known is None:
         known = list(_visibility(said.fits[0], said.fits[-1], truth).values())
-    row |= {name: asked[name] for name in ("verdict", "effects", "answer", "final", "final_answer", "n_trials")}
+    row |= {
+        name: asked[name] for name in ("hidden", "verdict", "effects", "answer", "final", "final_answer", "n_trials")
+    }
     row |= {name: bool(judged[name]) for name in ("called", "right", "wrong_name", "fault_as_physics")}
     row |= {"set_size": len(answer.answer_set), "all": hidden <= found, "sigma": known[0], "sigma_second": known[1]}
     row["none_invented"] = {*answer.effects, *last} <= hidden
@@ -105,22 +108,14 @@ def diagnosed(kind: str, seed: int, folder: Path, known: Sequence[float] | None)
     intervals = {key: (low, high) for key, (_, low, high) in row["numbers"].items() if pd.notna([low, high]).all()}
     true = {key: size for key, size in dict(truth.values).items() if key in intervals}
     row["sizes"] = {key: bool(intervals[key][0] <= size <= intervals[key][1]) for key, size in true.items()}
-    return [row | _learned(campaign, said, content)]
+    return [row]
 
 
-def _learned(campaign, said, content: Row) -> Row:
-    """What was learned of a force that is in no list: its variables, and how much of it is within 10 %."""
+def learned(name: str, seed: int, folder: Path, known: object) -> list[Row]:  # noqa: ARG001
+    """What is learned of a force that is in no list: over which variables, and how well."""
     import learned_laws
 
-    law = campaign.kind.removeprefix("outsider:")
-    learned = (content["missing_force"] or {}).get("learned")
-    if law not in learned_laws.LAWS:
-        return {}
-    if learned is None:
-        return {"variables": "", "in_set": False}
-    variables = "+".join(learned["variables"])
-    row: Row = {"variables": variables, "in_set": learned_laws.LAWS[law] in (variables, *learned["not_excluded"])}
-    return row | learned_laws.errors(campaign, said.missing_force.learned)
+    return [learned_laws.ask(seed, with_law=False)]
 
 
 def laboratory(name: str, seed: int, folder: Path, known: object) -> list[Row]:  # noqa: ARG001
@@ -150,7 +145,7 @@ def tracking(name: str, seed: int, folder: Path, known: object) -> list[Row]:  #
         import long_doors
 
         line, refused, askew, wrong = long_doors.judged(seed, folder)
-        return [{"line": line, "refused": refused, "askew": askew, "wrong": wrong}]
+        return [{"clips": _checksum(folder), "line": line, "refused": refused, "askew": askew, "wrong": wrong}]
     if name == "demo-like":
         rows = tracking_accuracy.demo_rows(list(range(seed, seed + 8)), folder)
     elif name == "other renderer":
@@ -159,7 +154,13 @@ def tracking(name: str, seed: int, folder: Path, known: object) -> list[Row]:  #
         rows = tracking_accuracy.bent_rows([seed], folder)["curve found"]
     else:
         rows = tracking_accuracy.hard_rows([seed], folder, (name.removeprefix("hard "),))
-    return [vars(row) | {"ms_per_frame": 0.0, "pull": row.pull} for row in rows]
+    clips = _checksum(folder)
+    return [vars(row) | {"clips": clips, "ms_per_frame": 0.0, "pull": row.pull} for row in rows]
+
+
+def _checksum(folder: Path) -> int:
+    """Of all recordings in a folder: where it differs, the clips are others, and so are the tracks."""
+    return zlib.crc32(b"".join(path.read_bytes() for path in sorted(folder.glob("*.m*"))))
 
 
 def real(name: str, seed: int, folder: Path, known: object) -> list[Row]:  # noqa: ARG001
@@ -299,8 +300,6 @@ CLIPS = (
     *("other renderer", "bent"),
     *("long door",) * 9,
 )
-LEARNED = ("outsider:slip", "outsider:chirp", "outsider:squeeze")
-OTHERS = tuple(f"outsider:{name}" for name in OUTSIDERS if f"outsider:{name}" not in LEARNED)
 
 GROUPS: dict[str, Group] = {
     "size": Group(house, ("code",), 1, 1),
@@ -308,7 +307,8 @@ GROUPS: dict[str, Group] = {
     "null": Group(diagnosed, _shuffled(kinds("nulls")), 8, 20),
     "effect": Group(diagnosed, _shuffled(kinds("effects")), 9, 29),
     "pair": Group(diagnosed, _shuffled(kinds("pairs")), 1, 5),
-    "outsider": Group(diagnosed, (*LEARNED, *_shuffled(OTHERS)), 1, 5),
+    "outsider": Group(diagnosed, _shuffled(kinds("outsiders")), 1, 4),
+    "learned": Group(learned, ("law",) * 6, 0, 3),
     "laboratory": Group(laboratory, _shuffled(ROWS), 14, len(ROWS)),
     "coverage": Group(coverage, ("fit",) * 60, 20, 60),
     "few": Group(coverage, ("few", "drops") * 24, 12, 48),
