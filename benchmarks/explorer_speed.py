@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 from chrome import Chrome
 from served import Served, Visitor
 
-from vinetrack.explorer.campaign import choice_in_use, errors_m, simulate_curves, sized_model
+from vinetrack.explorer.campaign import choice_in_use, predict_choice
 from vinetrack.explorer.server import open_campaign
 
 SIZE = "size_reservoir_depletion.gamma"
@@ -38,11 +38,10 @@ def computed_ms(results: Path) -> tuple[int, float]:
     """Number of trials, and the median time to compute all curves and errors."""
     campaign = open_campaign(results)
     start = choice_in_use(campaign).with_effect("reservoir_depletion")
-    curves, spent = None, []
+    spent = []
     for k in range(22):
         started = time.perf_counter()
-        curves = simulate_curves(campaign, sized_model(campaign, start.with_size(SIZE[5:], 1.1 + 0.01 * k)), curves)
-        errors_m(campaign, curves)
+        predict_choice(campaign, start.with_size(SIZE[5:], 1.1 + 0.01 * k))
         spent.append(1e3 * (time.perf_counter() - started))
     return len(campaign.trials), statistics.median(spent[2:])
 

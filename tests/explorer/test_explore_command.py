@@ -1,4 +1,4 @@
-"""The command: functions without the page, refusals, and a local server that Ctrl-C ends."""
+"""The command: refusals, and a local server that Ctrl-C ends."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from explorer_campaign import SETTINGS, run
 from served import Served
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
@@ -19,10 +18,9 @@ from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.server import address as where
-from vinetrack.explorer.server import start_server
+from vinetrack.explorer.server import open_campaign, start_server
 
 
 def refused(*arguments: object) -> str:
@@ -32,49 +30,12 @@ def refused(*arguments: object) -> str:
     return done.output
 
 
-@pytest.fixture
-def copied(campaign: Campaign, tmp_path: Path) -> tuple[Path, Path]:
-    """Experiment and results that a test may write to."""
-    shutil.copytree(campaign.experiment.folder, tmp_path / "vines")
+def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign, tmp_path: Path) -> None:
     shutil.copytree(campaign.folder, tmp_path / "results")
     (tmp_path / "results" / "provenance.json").write_text(json.dumps({"experiment": str(tmp_path / "vines")}))
-    return tmp_path / "vines", tmp_path / "results"
-
-
-def test_sizes_are_tried_and_written_without_a_page(copied: tuple[Path, Path], tmp_path: Path) -> None:
-    files = [tmp_path / f"curves.{form}" for form in ("csv", "svg", "png")]
-    exports = [word for path in files for word in ("--export", path)]
-    said = run("explore", copied[1], "--set", "reservoir_depletion.gamma=1.4", *exports)
-    lines = said.splitlines()
-    assert lines[0] == "base model + reservoir depletion"
-    assert lines[1].split() == ["condition", "model", "in", "use", "now", "replicates"]
-    assert lines[2].split() == ["mm", "mm", "mm"]
-    assert lines[6].startswith("all ")
-    assert all(path.stat().st_size > 1000 for path in files)
-    assert read_experiment_settings(copied[0] / "experiment.yaml").model[-1] == "yield_pressure"
-
-
-def test_a_refit_prints_what_it_found_and_save_writes_the_model(copied: tuple[Path, Path]) -> None:
-    said = run("explore", copied[1], "--add", "reservoir_depletion", "--refit", "--save")
-    assert "reservoir_depletion, fitted to 6 trials" in said
-    assert "−2 ln L fell by" in said
-    settings = copied[0] / "experiment.yaml"
-    assert f"Saved: {settings}" in said
-    assert settings.read_text(encoding="utf-8").startswith(SETTINGS)
-    assert read_experiment_settings(settings).model[-1] == "reservoir_depletion"
-    run("explore", copied[1], "--drop", "reservoir_depletion", "--save")
-    assert read_experiment_settings(settings).model[-1] == "yield_pressure"
-
-
-def test_an_impossible_request_is_refused_in_one_sentence(copied: tuple[Path, Path], tmp_path: Path) -> None:
-    experiment, results = copied
-    assert "is not a folder" in refused("explore", tmp_path / "nowhere")
-    assert "did you mean air_drag?" in refused("explore", results, "--add", "air_drg", "--save")
-    assert "is one of the base effects" in refused("explore", results, "--drop", "gravity", "--save")
-    assert "is no export format" in refused("explore", results, "--export", tmp_path / "a.doc")
-    experiment.rename(tmp_path / "moved")
-    assert "does not exist any more: give its new path with --experiment" in refused("explore", results, "--save")
-    assert "Saved" in run("explore", results, "--experiment", tmp_path / "moved", "--save")
+    refused("explore", tmp_path / "nowhere")
+    assert "--experiment" in refused("explore", tmp_path / "results")
+    assert open_campaign(tmp_path / "results", campaign.experiment.folder).conditions == campaign.conditions
 
 
 def test_a_port_in_use_is_reported(campaign: Campaign) -> None:

@@ -62,7 +62,7 @@ def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campa
     number = found.number(GAMMA)
     assert number is not None
     assert number.low <= 1.4
-    after, before = (overall_m(one.errors_m, campaign.conditions) for one in (found, first))
+    after, before = (overall_m(one.prediction.errors_m, campaign.conditions) for one in (found, first))
     floor = overall_m(campaign.floors_m, campaign.conditions)
     assert after < 0.5 * before
     assert after < 1.3 * floor
@@ -70,7 +70,7 @@ def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campa
     assert "fell" in likelihood_change_text(first.fit, found.fit)
     back = fit_choice(campaign, found.fit, found.choice.with_effect("reservoir_depletion", False))
     assert "rose" in likelihood_change_text(found.fit, back.fit)
-    assert overall_m(back.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
+    assert overall_m(back.prediction.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
 
 
 def test_a_bad_start_is_replaced_by_the_default(campaign: Campaign, first: Fitted) -> None:
@@ -154,7 +154,7 @@ def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
     background.begin().wait(120)
     assert background.failure == ""
     assert not background.running
-    assert background.curves is not None
+    assert background.prediction is not None
     assert background.fitted is not None
     assert background.step is not None
     assert len(news) > 2

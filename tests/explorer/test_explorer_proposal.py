@@ -90,7 +90,7 @@ def test_the_proposed_effect_is_opened_fitted_and_saved_with_its_file(
     settings = read_experiment_settings(folder / "experiment.yaml")
     assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
     assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
-    assert "spring_line" in open_campaign(unexplained.folder, folder).in_use
+    assert "spring_line" in open_campaign(unexplained.folder, folder).saved
 
 
 def _fitted_commands(page: Browser) -> str:

@@ -31,7 +31,7 @@ with the whole catalogue."""
 SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
 
 
-def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = SETTINGS) -> Path:
+def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = SETTINGS, nature: Path = DEMO) -> Path:
     """The demonstration's trials, or those named, measured instead of filmed."""
     folder.mkdir(parents=True)
     with DEMO_SHEET.open(encoding="utf-8", newline="") as file:
@@ -41,7 +41,7 @@ def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = S
     lines += [",".join([row["trial"], f"tracks/{row['trial']}.csv", *(row[c] for c in columns)]) for row in rows]
     (folder / "trials.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
-    grow([str(folder), "--nature", str(DEMO)])
+    grow([str(folder), "--nature", str(nature)])
     return folder
 
 

@@ -18,7 +18,10 @@ from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.setup_page.page_server import start_server
 from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry
 
-pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium"),
+]
 
 SHARED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
 NAME = "a.getAttribute('aria-label') || a.labels?.[0]?.textContent || a.textContent.slice(0, 40) || a.tagName"

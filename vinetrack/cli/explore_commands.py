@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from vinetrack.cli.command_frame import START, errors_as_sentences
+from vinetrack.core.problems import UserError
 
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
-Names = Annotated[list[str] | None, typer.Option("--add", help="Add this effect (may be repeated).")]
-Drops = Annotated[list[str] | None, typer.Option("--drop", help="Remove this effect (may be repeated).")]
-Sizes = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="A size, NAME=VALUE in SI units, such as air_drag.C_D=0.8 (may be repeated)."),
-]
-Exports = Annotated[
-    list[Path] | None,
-    typer.Option("--export", help="Write curves (.csv) or figure (.svg, .png, .pdf) without opening a page."),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -29,12 +21,6 @@ def register(app: typer.Typer) -> None:
 
 def _explore(
     results: ResultsPath,
-    add: Names = None,
-    drop: Drops = None,
-    sizes: Sizes = None,
-    refit: Annotated[bool, typer.Option("--refit", help="Fit, print the result, and open no page.")] = False,
-    export: Exports = None,
-    save: Annotated[bool, typer.Option("--save", help="Write the model to experiment.yaml; opens no page.")] = False,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="Where the experiment is, if it has moved.")
     ] = None,
@@ -46,7 +32,8 @@ def _explore(
 ) -> None:
     """Open a local page that shows where the model fails, to try effects, refit, and compare errors."""
     with errors_as_sentences(log):
-        from vinetrack.explorer.server import ExploreOptions, explore
+        if importlib.util.find_spec("bokeh") is None:
+            raise UserError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
+        from vinetrack.explorer.server import explore
 
-        options = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
-        explore(results, experiment, options, typer.echo)
+        explore(results, experiment, typer.echo, port, browser=browser)

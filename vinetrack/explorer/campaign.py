@@ -6,7 +6,7 @@ It is read once and never changed; the choice of the user is in `choice`, its cu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
 from vinetrack.core.units import SLIDER_UNITS, display_unit
-from vinetrack.dynamics.kernel import Trace
+from vinetrack.diagnosis.ladder import compare
+from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.dynamics.model import Model, Value, check_needs, host_for
-from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, Parameter, catalogue
-from vinetrack.inference.fit import LEAST_EIGENVALUE, rest_is_seen, scaled_least_squares
+from vinetrack.inference.fit import predict_from_rest, rest_is_seen
 from vinetrack.inference.fit_data import FitTrial, prepare
+from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, group_names
 from vinetrack.inference.sensitivity import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured_trials
@@ -36,14 +36,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExplorerTrial:
-    """One trial with its release and origin, which align it with the common clock and ruler of all trials.
-    `origin_known` tells whether the vine was filmed at rest; if not, the origin is fitted with a model.
-    """
+    """One trial with its release and origin, which align it with the common clock and ruler of all trials."""
 
     data: FitTrial
     release_s: float
     origin_m: float
-    origin_known: bool
 
     @property
     def name(self) -> str:
@@ -65,12 +62,12 @@ class ExplorerTrial:
         """Position from the origin, m, shape (n_points,)."""
         return self.data.lead_position_m - self.origin_m
 
-    def first_counted_frame(self, release_s: float) -> int:
-        """Return the first frame that counts for errors: where model or measurement moves, since rest
-        dilutes an error.
-        """
-        released = int(np.searchsorted(self.data.time_s, release_s))
-        return min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
+    @cached_property
+    def first_drawn(self) -> int:
+        """The first frame to draw: a little before the release, since rest would take most of a figure."""
+        released = int(np.searchsorted(self.data.time_s, self.release_s))
+        first = min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
+        return max(first - max((self.data.time_s.size - first) // 20, 2), 0)
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,7 @@ class ReplicateBand:
 class Campaign:
     """A results folder with its experiment, read by `read_campaign`. `numbers` are the estimates of the fit in
     `fit.json`, by name, SI; empty if the fit was refused, with the reason in `refused`. `log_likelihood` is that of the
-    same fit, NaN if it was refused.
+    same fit, NaN if it was refused. `in_use` are the effects of the model that the results are of.
     """
 
     name: str
@@ -103,10 +100,11 @@ class Campaign:
     refused: str
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
+    in_use: tuple[str, ...]
 
     @property
-    def in_use(self) -> tuple[str, ...]:
-        """Names of the effects in use: `model:` of the experiment."""
+    def saved(self) -> tuple[str, ...]:
+        """The effects of `model:` in the settings, which differ from those in use until the next run."""
         return tuple(self.experiment.settings.model)
 
     @cached_property
@@ -157,7 +155,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     """Read the results folder of an experiment."""
     results = Results(folder)
     pairs, kinematics = measured_trials(experiment, results)
-    data, left_out = prepare(pairs)
+    data, left_out = prepare(pairs, weighted=False)
     if not data:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
         raise ResultsError(f"{folder} has no trial to explore: {why}")
@@ -181,6 +179,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         log_likelihood=fitted.log_likelihood,
         refused=refused,
         effects=effects,
+        in_use=fitted.names if fitted.names and set(fitted.names) <= set(effects) else tuple(experiment.settings.model),
         unusable=_unusable(effects.values(), [trial_data.trial for trial_data in data]),
     )
 
@@ -209,7 +208,7 @@ def _align_trials(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
             origin_m = float(trial_data.lead_position_m[0] - rows["lead_position_m"].iloc[0])
         if at_rest[i]:
             origin_m = trial_data.rest_origin_m
-        trials.append(ExplorerTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
+        trials.append(ExplorerTrial(trial_data, release_s, origin_m))
     return trials
 
 
@@ -281,23 +280,46 @@ def _settings(trial: Trial) -> dict[str, str]:
 
 
 # ------------------------------------------------------------------------------
-# Curves of a model with given sizes for every trial, fast enough for a slider.
-#
-# As in a comparison, a prediction is aligned only by the trial's own release and origin. The origin is the rest
-# position
-# of the vine; the release, and the origin if no rest was filmed, minimise the mean square residual. Each trial is
-# simulated once on a grid, which is then shifted. A motion under a recorded pressure is tied to the clock of that
-# pressure and cannot be shifted: its release remains that of the comparison.
+# What a model with given sizes predicts, with the errors that `vinetrack compare` would give it: as there, each trial
+# has its own release and origin, found anew for every model.
 
-GRID_POINTS = 500  # Points of the simulation grid (derived)
 
-MARGIN_FRAMES = 25  # Frames by which the grid extends beyond the recording
+@dataclass(frozen=True)
+class Prediction:
+    """A model's prediction of every trial of a campaign, in its order, and by condition the root mean square error of
+    position and the scatter of replicates, m.
+    """
 
-MAX_NEWTON_STEPS = 12  # Newton steps of the alignment at most
+    trials: tuple[TrialFit, ...]
+    errors_m: Mapping[str, float]
+    floors_m: Mapping[str, float]
 
-MAX_STEP_FRAMES = 5.0  # Largest step, in frames; chosen: keeps the release within the data even from a poor start
 
-CONVERGED_STEP_FRAMES = 1e-3  # Step, in frames, below which the alignment has converged (chosen)
+def predict_choice(campaign: Campaign, choice: ModelChoice, floors_m: Mapping[str, float] | None = None) -> Prediction:
+    """Predict every trial by a choice; the scatter of replicates hardly depends on it, and is taken as given."""
+    sized = sized_model(campaign, choice)
+    data = [
+        replace(trial.data, trial=with_yield_pressure(trial.data.trial, sized.yield_Pa)) for trial in campaign.trials
+    ]
+    predicted = predict_from_rest(sized.model, data, campaign.host)
+    squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in predicted]
+    errors_m = {
+        condition: math.sqrt(float(np.mean([squares[i] for i in campaign.indices_of_condition(condition)])))
+        for condition in campaign.conditions
+    }
+    return Prediction(tuple(predicted), errors_m, campaign.floors_m if floors_m is None else floors_m)
+
+
+def predict_fit(campaign: Campaign, fitted: Fit) -> Prediction:
+    """Predict every trial by a fit, exactly as `vinetrack compare` does."""
+    comparison = compare(fitted, campaign.pairs, kinematics=campaign.kinematics)
+    by_name = {trial.name: trial for trial in comparison.trials}
+    table = comparison.table.set_index("condition")
+    errors_m, floors_m = (
+        dict(zip(campaign.conditions, map(float, table.loc[list(campaign.conditions), column]), strict=True))
+        for column in ("rms_position_m", "replicate_floor_m")
+    )
+    return Prediction(tuple(by_name[trial.name] for trial in campaign.trials), errors_m, floors_m)
 
 
 @dataclass(frozen=True)
@@ -308,117 +330,9 @@ class SizedModel:
     yield_Pa: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class ModelCurves:
-    """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames. `release_s` and
-    `origin_m` are in the coordinates of the track. `growth_m` is the position that the camera would report, from the
-    origin of the page (`ExplorerTrial.origin_m`), `residual_m` is measurement minus model.
-    """
-
-    release_s: float
-    origin_m: float
-    growth_m: Floats
-    residual_m: Floats
-    mean_square_m2: float
-    path_s: Floats
-    path_m: Floats
-
-    @property
-    def rms_m(self) -> float:
-        """Root mean square of the residuals while anything moves, m."""
-        return math.sqrt(self.mean_square_m2)
-
-    def lead_position_m(self, time_s: Floats) -> Floats:
-        """Return positions at times, both in the coordinates of the track; NaN beyond the simulation."""
-        since_release = time_s - self.release_s
-        return self.origin_m + np.interp(since_release, self.path_s, self.path_m, right=math.nan)
-
-
-Curves = tuple[ModelCurves, ...]  # The predicted motion of every trial of a campaign, in its order
-
-
-def simulate_curves(campaign: Campaign, sized_model: SizedModel, before: Curves | None = None) -> Curves:
-    """Simulate every trial and align it with its measurement."""
-    trials = campaign.trials
-    starts = [trial.release_s for trial in trials]
-    if before is not None:
-        starts = [
-            curve.release_s if trial.data.trace is None else start
-            for curve, trial, start in zip(before, trials, starts, strict=True)
-        ]
-    grids = [_grid(trial) for trial in trials]
-    trajectories = simulate_many(
-        sized_model.model,
-        [with_yield_pressure(trial.data.trial, sized_model.yield_Pa) for trial in trials],
-        grids,
-        traces=[_trace_since_release(trial) for trial in trials],
-        host=campaign.host,
-    )
-    return tuple(_aligned(*parts) for parts in zip(trials, grids, trajectories, starts, strict=True))
-
-
 def with_yield_pressure(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
     """Return the trial with the fitted yield pressure of its vine, if there is one."""
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
-
-
-def _grid(aligned: ExplorerTrial) -> Floats:
-    """Times since release, up to the end of the recording plus a margin."""
-    data = aligned.data
-    last_s = max(data.time_s[-1] - aligned.release_s, 0.0) + MARGIN_FRAMES * data.frame_s
-    return np.linspace(0.0, last_s, GRID_POINTS)
-
-
-def _trace_since_release(aligned: ExplorerTrial) -> Trace | None:
-    trace = aligned.data.trace
-    return None if trace is None else (trace[0] - aligned.release_s, trace[1])
-
-
-def _aligned(aligned: ExplorerTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
-    """Newton steps in release, and in the origin if the vine was not filmed at rest."""
-    data, position = aligned.data, moved.observed_position_m
-    speed = np.gradient(position, grid)
-    release_s, origin_m = start_s, aligned.origin_m
-    longest_s = MAX_STEP_FRAMES * data.frame_s
-    for _ in range(MAX_NEWTON_STEPS):
-        since_release = data.time_s - release_s
-        residual = data.lead_position_m - origin_m - np.interp(since_release, grid, position)
-        # Before release the vine is at rest: its velocity is zero.
-        is_fixed = data.trace is not None
-        slope = (
-            np.zeros(since_release.size) if is_fixed else -np.interp(since_release, grid, speed, left=0.0, right=0.0)
-        )
-        shift_s, rise_m = _step(slope, residual, free_origin=not aligned.origin_known)
-        shift_s = min(max(shift_s, -longest_s), longest_s)
-        release_s += shift_s
-        origin_m += rise_m
-        if abs(shift_s) < CONVERGED_STEP_FRAMES * data.frame_s:
-            break
-    growth = np.interp(data.time_s - release_s, grid, position)
-    residual = data.lead_position_m - origin_m - growth
-    counted = residual[aligned.first_counted_frame(release_s) :]
-    offset = origin_m - aligned.origin_m
-    return ModelCurves(release_s, origin_m, growth + offset, residual, float(np.mean(counted**2)), grid, position)
-
-
-def _step(slope: Floats, residual: Floats, *, free_origin: bool) -> tuple[float, float]:
-    """Least-squares fit of the residuals by a shift in time, and one in position if that is free."""
-    if not free_origin:
-        square = float(slope @ slope)
-        return (float(slope @ residual) / square if square > 0 else 0.0), 0.0
-    design = np.column_stack([slope, np.ones(slope.size)])
-    shift, rise = scaled_least_squares(design, residual, math.sqrt(LEAST_EIGENVALUE))
-    return float(shift), float(rise)
-
-
-def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
-    """Return the root mean square position error by condition, m; all trials have the same weight."""
-    return {
-        condition: math.sqrt(
-            float(np.mean([curves[i].mean_square_m2 for i in campaign.indices_of_condition(condition)]))
-        )
-        for condition in campaign.conditions
-    }
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
@@ -441,10 +355,6 @@ def fitted_yield_pressures(campaign: Campaign, numbers: Mapping[str, float]) -> 
 
 # ------------------------------------------------------------------------------
 # The user's choice: the effects in the model and their sizes. Immutable; a change returns a new choice.
-
-
-class ChoiceError(UserError, ValueError):
-    """An effect, parameter or value that does not exist or is not allowed; one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -554,65 +464,3 @@ def sized_model(campaign: Campaign, choice: ModelChoice) -> SizedModel:
 def is_removable(effect: str) -> bool:
     """Return whether an effect may be removed: the base effects may not, since all others are added to them."""
     return effect not in BASE_EFFECTS
-
-
-def added_and_dropped(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
-    """Return the effects added to the model in use, and those removed from it. Returns added, dropped : list of str,
-    relative to the model in use.
-    """
-    added = [name for name in choice.effects if name not in campaign.in_use]
-    dropped = [name for name in campaign.in_use if name not in choice.effects]
-    return added, dropped
-
-
-def choice_from_options(
-    campaign: Campaign, start: ModelChoice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
-) -> ModelChoice:
-    """Return the choice described by options of the command line."""
-    choice = start
-    for name in add:
-        choice = choice.with_effect(_testable_effect(campaign, name))
-    for name in drop:
-        if not is_removable(name):
-            raise ChoiceError(
-                f"{name} is one of the base effects, to which all others are added: it cannot be dropped."
-            )
-        choice = choice.with_effect(name, False)
-    for text in sizes:
-        choice = _with_parsed_size(campaign, choice, text)
-    return choice
-
-
-def _testable_effect(campaign: Campaign, name: str) -> str:
-    import difflib
-
-    if name not in campaign.effects:
-        near = difflib.get_close_matches(name, campaign.effects, n=1)
-        raise ChoiceError(
-            f"There is no effect named {name!r}: {f'did you mean {near[0]}?' if near else 'see vinetrack effects'}"
-        )
-    if name in campaign.unusable:
-        raise ChoiceError(f"{name} {campaign.unusable[name]}.")
-    return name
-
-
-def _with_parsed_size(campaign: Campaign, choice: ModelChoice, text: str) -> ModelChoice:
-    name, equals, written = text.partition("=")
-    name = name.strip()
-    effect = _testable_effect(campaign, name.split(".")[0])
-    sizes = sizes_of(campaign, campaign.effects[effect], choice.numbers)
-    matching = [size for size in sizes if name in (size.name, size.key)]
-    if not equals or not matching:
-        known = ", ".join(size.name for size in sizes) or "none"
-        raise ChoiceError(f"{text!r} is no size: write NAME=VALUE, SI, with one of {known}.")
-    try:
-        value = float(written)
-    except ValueError:
-        raise ChoiceError(f"{written!r} is no number: write {name}=0.5, say, in SI units.") from None
-    low, high = matching[0].parameter.bounds
-    if not low <= value <= high:
-        raise ChoiceError(f"{name} = {value:g} is outside its bounds, {low:g} to {high:g}.")
-    choice = choice.with_effect(effect)
-    for size in matching:
-        choice = choice.with_size(size.name, value)
-    return choice

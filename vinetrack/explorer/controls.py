@@ -1,8 +1,7 @@
-"""The controls of one page: the trials shown, the effects in the model with their sizes, and the exports."""
+"""The controls of one page: the trials shown, the effects in the model with their sizes, and saving."""
 
 from __future__ import annotations
 
-import base64
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -37,7 +36,7 @@ from vinetrack.explorer.campaign import (
     sizes_of,
     slider_range,
 )
-from vinetrack.explorer.fitting import BackgroundFit, FitJob, Fitted, commands, export_bytes, model_text
+from vinetrack.explorer.fitting import BackgroundFit, FitJob, Fitted, commands, model_text
 from vinetrack.explorer.plots import command_block, escaped, html_div, progress_bar, stylesheet
 from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect, save_model
 
@@ -297,61 +296,20 @@ class TrialSelector:
         return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in conditions]
 
 
-MIME = {"csv": "text/csv", "svg": "image/svg+xml", "png": "image/png"}
-DOWNLOAD = """
-const [name, mime, body] = ["name", "mime", "body"].map((key) => cb_obj.data[key][0]);
-if (!name) return;
-const bytes = Uint8Array.from(atob(body), (char) => char.charCodeAt(0));
-const link = document.createElement("a");
-link.href = URL.createObjectURL(new Blob([bytes], {type: mime}));
-link.download = name;
-link.click();
-setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-"""
-_GAP = ":host { gap: 6px; flex-wrap: wrap; }"
-
-
 class SavePanel:
-    """Buttons of one page to save the model and to export figure and data."""
+    """Button of one page to save the model."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
         self.save = Button(label="Save the model to experiment.yaml", name="save", stylesheets=[stylesheet()], margin=0)
         self.save.on_click(self._save)
         self.message = html_div(name="saved")
-        self._download = ColumnDataSource({"name": [""], "mime": [""], "body": [""]}, name="download")
-        self._download.js_on_change("data", CustomJS(code=DOWNLOAD))
-        forms = {"svg": "Figure (SVG)", "png": "Figure (PNG)", "csv": "Data (CSV)"}
-        buttons = [self._button(form, label) for form, label in forms.items()]
         self.root = Column(
-            children=[
-                Row(children=[self.save], margin=0),
-                self.message,
-                Row(children=buttons, margin=0, stylesheets=[stylesheet(_GAP)]),
-                html_div("<small>Figure and data contain the trials that are shown, with the current model.</small>"),
-            ],
+            children=[Row(children=[self.save], margin=0), self.message],
             sizing_mode="stretch_width",
             name="keep",
             margin=0,
-            tags=[self._download],
         )
-
-    def _button(self, form: str, label: str) -> Button:
-        button = Button(label=label, name=f"export_{form}", stylesheets=[stylesheet()], margin=0)
-        button.on_click(self._exporter(form))
-        return button
-
-    def _exporter(self, form: str) -> Callable[[], None]:
-        def give() -> None:
-            page = self._page
-            if page.curves is None:
-                return
-            data = export_bytes(page.campaign, page.choice, page.curves, page.selector.shown, form)
-            body = base64.b64encode(data).decode("ascii")
-            name = f"{page.campaign.name}_explorer.{form}"
-            self._download.data = {"name": [name], "mime": [MIME[form]], "body": [body]}
-
-        return give
 
     def _save(self) -> None:
         page = self._page
@@ -363,20 +321,22 @@ class SavePanel:
             self.message.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
             return
         rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
+        lines = self._lines(save=True)
+        same = f" The same as a command:</p>{command_block(lines)}<p>" if lines else " "
         self.message.text = (
             f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
-            f" {escaped(model_text(page.choice.effects))}. The same as a command:</p>"
-            f"{command_block(self._lines(save=True))}<p>For new tables and a new report:</p>{command_block([rerun])}"
+            f" {escaped(model_text(page.choice.effects))}.{same}"
+            f"For new tables and a new report:</p>{command_block([rerun])}"
         )
 
     def _lines(self, *, save: bool = False) -> list[str]:
         page = self._page
-        start = page.background.initial
-        return commands(page.campaign, start, page.choice, fitted=page.is_fitted(), save=save)
+        return commands(page.campaign, page.choice, fitted=page.is_fitted(), save=save)
 
     def commands(self) -> str:
         """The commands that reproduce the state of the page, as HTML."""
-        return command_block(self._lines())
+        lines = self._lines()
+        return "<small>The same from the command line:</small>" + command_block(lines) if lines else ""
 
 
 # ------------------------------------------------------------------------------

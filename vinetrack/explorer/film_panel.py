@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.records import Floats, Trial, hand_corrected
-from vinetrack.explorer.campaign import Campaign, Curves, ExplorerTrial
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial, Prediction
 from vinetrack.explorer.plots import (
     MEASURED_EDGE,
     MODEL_EDGE,
@@ -205,8 +205,8 @@ class FilmPanel:
 
     def __init__(self, campaign: Campaign, document: Document, instant: Callable[[str, float | None], None]) -> None:
         self.campaign, self._document, self._instant = campaign, document, instant
-        self._curves: Curves | None = None
-        self._reference: Curves | None = None
+        self._now: Prediction | None = None
+        self._reference: Prediction | None = None
         self._film: DecodedRecording | None = None
         self._view: RecordingView | None = None
         self._playing: Any = None
@@ -272,9 +272,9 @@ class FilmPanel:
         fig.multi_line("xs", "ys", source=self._edges, line_color="colour", line_width=2.6, line_dash={"field": "dash"})
         return fig
 
-    def set_curves(self, curves: Curves | None, reference: Curves | None) -> None:
-        """Set the curves of the current model and of the model for comparison."""
-        self._curves, self._reference = curves, reference
+    def set_predictions(self, now: Prediction | None, reference: Prediction | None) -> None:
+        """Set the predictions of the current model and of the model for comparison."""
+        self._now, self._reference = now, reference
         self._draw_edges()
 
     def show_trial(self, name: str) -> None:
@@ -355,12 +355,14 @@ class FilmPanel:
         """Positions of the edge, m: measured, of the model for comparison, of the current model; NaN if unknown."""
         time_s, aligned = self._time_s(frame), self._shown_trial()
         place = self.campaign.trials.index(aligned)
-        at = np.array([time_s])
-        # The model is not defined before the first frame of the fit.
-        is_before_fit = time_s < float(aligned.data.time_s[0])
+        # The model is defined between the first and the last frame of the fit.
         model_m = [
-            math.nan if curves is None or is_before_fit else float(curves[place].lead_position_m(at)[0])
-            for curves in (self._reference, self._curves)
+            math.nan
+            if one is None
+            else float(
+                np.interp(time_s, aligned.data.time_s, one.trials[place].predicted_position_m, math.nan, math.nan)
+            )
+            for one in (self._reference, self._now)
         ]
         if self._view is None:
             return float(aligned.data.lead_position_m[min(frame, aligned.data.time_s.size - 1)]), model_m[0], model_m[1]
@@ -378,7 +380,7 @@ class FilmPanel:
             (float(view.along_px(np.array(reference_m))), REFERENCE_EDGE, "dotted", reference_m),
             (float(view.along_px(np.array(now_m))), MODEL_EDGE, "dashed", now_m),
         ]
-        same = self._reference is self._curves
+        same = self._reference is self._now
         drawn = [
             (view.across(px, frame), colour, dash)
             for px, colour, dash, at in edges
@@ -412,7 +414,7 @@ class FilmPanel:
         self._instant(aligned.name, since_s)
 
     def refresh(self) -> None:
-        """Update the caption after a change of the curves."""
+        """Update the caption after a change of the predictions."""
         if self._film is None or self._film.complete:
             self._update_caption(int(self.frame.value))
 

@@ -10,38 +10,27 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
-
-import numpy as np
+from typing import Generic, TypeVar
 
 from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.problems import UserError
 from vinetrack.core.threads import in_one_blas_thread
-from vinetrack.diagnosis.ladder import compare
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import BASE_EFFECTS, EffectError
 from vinetrack.explorer.campaign import (
     Campaign,
-    ChoiceError,
-    Curves,
     ModelChoice,
-    added_and_dropped,
+    Prediction,
     choice_in_use,
-    errors_m,
-    simulate_curves,
+    predict_choice,
+    predict_fit,
     sized_model,
-    sizes_of,
 )
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 log = logging.getLogger(__name__)
 
@@ -59,13 +48,11 @@ class FitCancelled(Exception):  # noqa: N818 - nothing went wrong
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit, the choice with its estimates, its curves and errors; `floors_m` is the replicate scatter."""
+    """A fit, the choice with its estimates, and what it predicts."""
 
     choice: ModelChoice
     fit: Fit
-    curves: Curves
-    errors_m: Mapping[str, float]
-    floors_m: Mapping[str, float]
+    prediction: Prediction
     seconds: float
 
     def number(self, name: str) -> Number | None:
@@ -110,12 +97,8 @@ def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watc
 
 
 def _evaluated(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
-    """Compare a fit with the measurement, as `vinetrack compare` does."""
     fitted_choice = with_numbers(choice, {number.name: number.value for number in result.numbers})
-    curves = simulate_curves(campaign, sized_model(campaign, fitted_choice))
-    table = compare(result, campaign.pairs, kinematics=campaign.kinematics).table
-    floors = dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
-    return Fitted(fitted_choice, result, curves, errors_m(campaign, curves), floors, seconds)
+    return Fitted(fitted_choice, result, predict_fit(campaign, result), seconds)
 
 
 def with_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
@@ -204,7 +187,7 @@ class FitJob(Generic[Progress, Outcome]):
 
 
 class BackgroundFit:
-    """Computes in a thread `curves` and `errors_m` of the model in use, then its fit. `failure` is the reason if it
+    """Computes in a thread the `prediction` of the model in use, then its fit. `failure` is the reason if it
     failed, else blank. Listeners are called from that thread.
     """
 
@@ -212,8 +195,7 @@ class BackgroundFit:
         self.campaign = campaign
         self.initial = choice_in_use(campaign)
         self.opening_choice = self.initial if choice in (None, self.initial) else choice
-        self.curves: Curves | None = None
-        self.errors_m: dict[str, float] = {}
+        self.prediction: Prediction | None = None
         self.fitted: Fitted | None = None
         self.step: Step | None = None
         self.failure = ""
@@ -245,8 +227,7 @@ class BackgroundFit:
 
     def _run(self) -> None:
         try:
-            self.curves = simulate_curves(self.campaign, sized_model(self.campaign, self.initial))
-            self.errors_m = errors_m(self.campaign, self.curves)
+            self.prediction = predict_choice(self.campaign, self.initial)
             self._notify()
             self.fitted = first_fit(self.campaign, self.initial, self._on_step)
         except (FitError, EffectError, SimulationError) as error:
@@ -318,103 +299,18 @@ class FitProgress:
         self.message = message
 
 
-# ------------------------------------------------------------------------------
-# Exports of the page: the curves as CSV, the figure as SVG or PNG, the choice as a command.
-
-PICTURES = ("svg", "png", "pdf")
-FORMATS = ("csv", *PICTURES)
-CURVE_COLUMNS = (
-    "model",
-    "condition",
-    "trial",
-    "time_s",
-    "lead_position_m",
-    "model_position_m",
-    "residual_m",
-    "replicates_mean_m",
-    "replicates_sigma_m",
-)
-
-
-def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
-    """Return measurement and model at every frame used, since release and from the origin."""
-    import pandas as pd
-
-    parts = []
-    for i in shown:
-        aligned, motion = campaign.trials[i], curves[i]
-        band = campaign.bands.get(aligned.condition)
-        unknown = np.full(aligned.time_s.size, math.nan)
-        mean_m = unknown if band is None else np.interp(aligned.time_s, band.time_s, band.mean_m)
-        sigma_m = unknown if band is None else np.interp(aligned.time_s, band.time_s, band.sigma_m)
-        columns = ("+".join(choice.effects), aligned.condition, aligned.name, aligned.time_s, aligned.growth_m)
-        model_columns = (motion.growth_m, motion.residual_m, mean_m, sigma_m)
-        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, (*columns, *model_columns), strict=True))))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
-
-
-def export_bytes(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
-    """Return the curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`."""
-    if form not in FORMATS:
-        raise ChoiceError(f"{form!r} is no export format: use one of {', '.join(FORMATS)}.")
-    table = curve_table(campaign, choice, curves, shown)
-    if form == "csv":
-        return table.to_csv(index=False, lineterminator="\n").encode("utf-8")
-    from vinetrack.figures.motion_figures import draw_model_comparison
-    from vinetrack.figures.style import render
-
-    conditions = [name for name in campaign.conditions if name in set(table["condition"])]
-    compared = _compared(campaign, choice, errors_m(campaign, curves), conditions)
-    trajectories = {str(name): part.reset_index(drop=True) for name, part in table.groupby("condition", sort=False)}
-    return render(draw_model_comparison(compared, trajectories), [form])[form]
-
-
-def _compared(
-    campaign: Campaign, choice: ModelChoice, errors: Mapping[str, float], conditions: Sequence[str]
-) -> pd.DataFrame:
-    import pandas as pd
-
-    floors = [campaign.floors_m.get(name, math.nan) for name in conditions]
-    rms = [errors[name] for name in conditions]
-    return pd.DataFrame(
-        {
-            "model": "+".join(choice.effects),
-            "condition": conditions,
-            "condition_label": [campaign.labels[name] for name in conditions],
-            "vine": [campaign.trials[campaign.indices_of_condition(name)[0]].data.trial.vine for name in conditions],
-            "rms_position_m": rms,
-            "ratio": [r / f if f > 0 else math.nan for r, f in zip(rms, floors, strict=True)],
-        }
-    )
-
-
-def write_export(campaign: Campaign, choice: ModelChoice, curves: Curves, path: Path) -> None:
-    """Write all trials to a file, atomically; its suffix gives the format."""
-    from vinetrack.core.tables import write_bytes
-
-    form = path.suffix.lower().removeprefix(".")
-    write_bytes(path, export_bytes(campaign, choice, curves, range(len(campaign.trials)), form))
-
-
-def commands(
-    campaign: Campaign, start: ModelChoice, choice: ModelChoice, *, fitted: bool, save: bool = False
-) -> list[str]:
-    """Return the commands that reproduce the choice without the page."""
+def commands(campaign: Campaign, choice: ModelChoice, *, fitted: bool, save: bool = False) -> list[str]:
+    """Return the commands that give the choice without the page; none for sizes that were dragged and not fitted, and
+    for a model without an effect of that in use.
+    """
     folder = shlex.quote(campaign.folder.as_posix())
-    added, dropped = added_and_dropped(campaign, choice)
-    if not added and not dropped and (fitted or not _changed_sizes(campaign, start, choice)):
+    added = [name for name in choice.effects if name not in campaign.in_use]
+    if not fitted or not set(campaign.in_use) <= set(choice.effects):
+        return []
+    if not added:
         return [f"vinetrack compare {folder}"]
-    if fitted and not dropped:
-        end = " --save" if save else ""
-        return [f"vinetrack add {_command_line_name(campaign, name)} {folder}{end}" for name in added]
-    options = [f"--add {name}" for name in added] + [f"--drop {name}" for name in dropped]
-    if fitted or save:
-        options += ["--refit"] if fitted else []
-        return [" ".join(["vinetrack explore", folder, *options, *(["--save"] if save else [])])]
-    options += [
-        f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in _changed_sizes(campaign, start, choice).items()
-    ]
-    return [" ".join(["vinetrack explore", folder, *options])]
+    end = " --save" if save else ""
+    return [f"vinetrack add {_command_line_name(campaign, name)} {folder}{end}" for name in added]
 
 
 def _command_line_name(campaign: Campaign, effect: str) -> str:
@@ -422,14 +318,6 @@ def _command_line_name(campaign: Campaign, effect: str) -> str:
     path = campaign.effects[effect].path
     is_unlisted = campaign.own_files([effect]) and path.name not in campaign.experiment.settings.effects
     return shlex.quote(path.as_posix()) if is_unlisted else effect
-
-
-def _changed_sizes(campaign: Campaign, start: ModelChoice, choice: ModelChoice) -> dict[str, float]:
-    """Sizes of effects in the model that differ from those with which the page opened, by name."""
-    names = [
-        size.name for effect in choice.effects for size in sizes_of(campaign, campaign.effects[effect], choice.numbers)
-    ]
-    return {name: choice.numbers[name] for name in names if choice.numbers[name] != start.numbers.get(name)}
 
 
 def model_text(names: Sequence[str]) -> str:

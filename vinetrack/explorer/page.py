@@ -1,17 +1,15 @@
-"""Controller of one open page: input changes the choice of model, from which curves, figures and text follow."""
+"""Controller of one open page: input changes the choice of model, from which predictions, figures and text follow."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
-from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.explorer.campaign import Curves, ModelChoice, errors_m, simulate_curves, sized_model
+from vinetrack.explorer.campaign import ModelChoice, Prediction, predict_choice
 from vinetrack.explorer.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
 from vinetrack.explorer.film_panel import FilmPanel
 from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, fit_choice, with_numbers
@@ -41,6 +39,7 @@ from vinetrack.explorer.text_panels import (
     tied_panel,
 )
 from vinetrack.figures.style import follows_screen
+from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.optimiser import Step
 
 # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
@@ -67,8 +66,7 @@ class Page:
     def __init__(self, background: BackgroundFit, document: Document, reopen: Reopen | None = None) -> None:
         self.background, self.campaign, self.document = background, background.campaign, document
         self.choice: ModelChoice = background.opening_choice
-        self.curves: Curves | None = None
-        self.errors_m: Mapping[str, float] = {}
+        self.shown: Prediction | None = None
         self.last: Fitted | None = None
         self.fitted_models: list[LadderEntry] = []
         self.held: HeldModel | None = None
@@ -111,7 +109,7 @@ class Page:
         buttons = Row(children=[self.refit, self.back, self.hold], margin=0, stylesheets=[wrapped])
         hint = html_div(
             "<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps this "
-            "model for comparison. The same from the command line:</small>"
+            "model for comparison.</small>"
         )
         actions = Column(
             children=[buttons, hint, self.command_text], sizing_mode="stretch_width", name="actions", margin=0
@@ -162,9 +160,9 @@ class Page:
         self._redraw_soon()
 
     def _selection_changed(self) -> None:
-        self.plots.set_shown(self.selector.shown, self._reference.curves if self._differs() else None)
-        if self.curves is not None:
-            self.plots.set_curves(self.curves, self.selector.shown)
+        self.plots.set_shown(self.selector.shown, self._reference.prediction if self._differs() else None)
+        if self.shown is not None:
+            self.plots.set_curves(self.shown, self.selector.shown)
             self._show_errors()
 
     def _as_fitted(self) -> None:
@@ -190,11 +188,10 @@ class Page:
         """Hold the current model for comparison; pressed again, compare with the model in use."""
         if self.held is not None:
             self.held = None
-        elif self.curves is not None:
-            fit = self.last if not self._sizes_changed else None
-            self.held = HeldModel(self.choice.effects, self.curves, dict(self.errors_m), fit)
+        elif self.shown is not None:
+            self.held = HeldModel(self.choice.effects, self.shown, None if self._sizes_changed else self.last)
         self.hold.label = "Hold to compare" if self.held is None else "Release"
-        if self.curves is not None:
+        if self.shown is not None:
             self._draw()
             self._update_text()
 
@@ -203,7 +200,7 @@ class Page:
         """The model for comparison: the one that is held, else the model in use."""
         if self.held is not None:
             return self.held
-        return HeldModel(self.campaign.in_use, self.background.curves, self.background.errors_m, self.background.fitted)
+        return HeldModel(self.campaign.in_use, self.background.prediction, self.background.fitted)
 
     # ---- fits ----------------------------------------------------------------------------------------------------
 
@@ -213,8 +210,8 @@ class Page:
 
     def _background_changed(self) -> None:
         background = self.background
-        if self.curves is None and background.curves is not None:
-            self._show_first_curves()
+        if self.shown is None and background.prediction is not None:
+            self._show_first_prediction(background.prediction)
         if self.last is None and background.fitted is not None:
             self._show_first_fit(background.fitted)
         if self._refit_requested and background.fitted is not None:
@@ -223,13 +220,12 @@ class Page:
             self._end_job(background.failure)
         self._update_status()
 
-    def _show_first_curves(self) -> None:
-        assert self.background.curves is not None
-        self.curves, self.errors_m = self.background.curves, self.background.errors_m
+    def _show_first_prediction(self, first: Prediction) -> None:
+        self.shown = first
         self._selection_changed()
         self._update_text()
-        self.film.set_curves(self.curves, self.background.curves)
-        worst = max(self.errors_m, key=lambda name: self.errors_m[name])
+        self.film.set_predictions(first, first)
+        worst = max(first.errors_m, key=lambda name: first.errors_m[name])
         self.film.show_trial(self.campaign.trials[self.campaign.indices_of_condition(worst)[0]].name)
         as_fitted = self.last is not None and self.choice is self.last.choice
         if self.choice is not self.background.initial and not as_fitted:
@@ -272,7 +268,7 @@ class Page:
             return
         self._progress.update(step)
         self._update_status()
-        self._simulate(with_numbers(self.choice, step.values))
+        self._predict(with_numbers(self.choice, step.values))
         self._update_text_soon()
 
     def _fit_done(self, fitted: Fitted) -> None:
@@ -282,7 +278,7 @@ class Page:
         before, self.last = self.last, fitted
         self.fitted_models.append(ladder_entry(self.campaign, fitted, before))
         self.choice, self._sizes_changed = fitted.choice, False
-        self.curves, self.errors_m = fitted.curves, fitted.errors_m
+        self.shown = fitted.prediction
         self.panel.show(self.choice, fitted)
         self._draw()
         self._update_text()
@@ -306,8 +302,8 @@ class Page:
 
     def _redraw(self) -> None:
         self._redraw_pending = False
-        if self.background.curves is not None:
-            self._simulate(self.choice)
+        if self.background.prediction is not None:
+            self._predict(self.choice)
         self._update_text_soon()
 
     def _update_text_soon(self) -> None:
@@ -315,48 +311,47 @@ class Page:
             self._text_pending = True
             self.document.add_timeout_callback(self._update_text, TEXT_DELAY_MS)
 
-    def _simulate(self, choice: ModelChoice) -> None:
-        """Simulate and draw a choice; if the simulation fails, show the error and keep the former curves."""
+    def _predict(self, choice: ModelChoice) -> None:
+        """Predict and draw a choice; if that fails, show the error and keep the former prediction."""
         try:
-            self.curves = simulate_curves(self.campaign, sized_model(self.campaign, choice), self.curves)
-        except SimulationError as error:
+            self.shown = predict_choice(self.campaign, choice, None if self.shown is None else self.shown.floors_m)
+        except FitError as error:
             self._progress.set_message(str(error))
             self._update_status()
             return
         self._progress.set_message("")
-        self.errors_m = errors_m(self.campaign, self.curves)
         self._draw()
 
     def _draw(self) -> None:
-        assert self.curves is not None
-        self.plots.set_curves(self.curves, self.selector.shown)
-        self.plots.set_reference(self._reference.curves if self._differs() else None, self.selector.shown)
+        assert self.shown is not None
+        self.plots.set_curves(self.shown, self.selector.shown)
+        self.plots.set_reference(self._reference.prediction if self._differs() else None, self.selector.shown)
         self._show_errors()
 
     def _show_errors(self) -> None:
-        floors = self.campaign.floors_m
-        self.plots.set_errors(self.errors_m, self._reference.errors_m, floors, self.selector.conditions)
+        assert self.shown is not None
+        self.plots.set_errors(
+            self.shown.errors_m, self._reference.errors_m, self.shown.floors_m, self.selector.conditions
+        )
 
     def _differs(self) -> bool:
         """Whether the model drawn is another than the model for comparison."""
-        return self.curves is not None and self.curves is not self._reference.curves
+        return self.shown is not None and self.shown is not self._reference.prediction
 
     def _update_text(self) -> None:
         """Update all text of the page."""
         self._text_pending = False
         if self._job is None and not self._refit_requested:
             # The error at a step of a fit, or before a fit, says nothing about the effect.
-            _set(self.headline, headline(self.campaign, self.choice, self.errors_m, self.background.errors_m))
-        if self.curves is not None:
-            self.film.set_curves(self.curves, self._reference.curves)
+            _set(self.headline, headline(self.campaign, self.choice, self.shown, self.background.prediction))
+        if self.shown is not None:
+            self.film.set_predictions(self.shown, self._reference.prediction)
             self.film.refresh()
         fit = None if self._sizes_changed else self.last
         comparison = (
             ""
-            if self.curves is None
-            else comparison_table(
-                self.campaign, self.held, HeldModel(self.choice.effects, self.curves, self.errors_m, fit)
-            )
+            if self.shown is None
+            else comparison_table(self.campaign, self.held, HeldModel(self.choice.effects, self.shown, fit))
         )
         _set(
             self.numbers,
@@ -380,7 +375,7 @@ class Page:
         elif self.background.running:
             what = (
                 "preparing the model"
-                if self.background.curves is None
+                if self.background.prediction is None
                 else "fitting the model in use, in the background"
             )
             _set(self.status, f"<small>{what} …</small>")

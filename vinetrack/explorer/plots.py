@@ -26,7 +26,7 @@ from bokeh.plotting import figure
 from bokeh.themes import Theme
 
 from vinetrack.core.records import Floats
-from vinetrack.explorer.campaign import Campaign, Curves, ExplorerTrial, condition_labels
+from vinetrack.explorer.campaign import Campaign, ExplorerTrial, Prediction, condition_labels
 from vinetrack.figures.style import GRID, INK, MUTED, TOKENS, VINE_COLOURS, page_frame, vine_styles
 
 # ------------------------------------------------------------------------------
@@ -167,9 +167,13 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
     return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
 
 
-def plotted_rows(count: int, first: int) -> slice:
-    """Return the rows of a track to draw: from a little before the motion, at most `MAX_POINTS`."""
-    begin = max(first - max((count - first) // 20, 2), 0)
+def _rows(aligned: ExplorerTrial) -> slice:
+    """The rows of a track to draw, at most `MAX_POINTS` and one."""
+    return plotted_rows(aligned.time_s.size, aligned.first_drawn)
+
+
+def plotted_rows(count: int, begin: int) -> slice:
+    """Return the rows to draw of `count`, from `begin`."""
     return slice(begin, None, max(math.ceil((count - begin) / MAX_POINTS), 1))
 
 
@@ -186,7 +190,7 @@ def _lines_by_trial(campaign: Campaign, lines: Iterable[tuple[ExplorerTrial, Flo
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
     for aligned, x, y in lines:
-        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        rows = _rows(aligned)
         columns["xs"].append(1e3 * x[rows])
         columns["ys"].append(1e3 * _with_gaps(aligned, rows, y[rows]))
         columns["colour"].append(colour[aligned.condition])
@@ -211,7 +215,8 @@ def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
         band = campaign.bands.get(condition)
         if band is None or band.time_s.size < 2:
             continue
-        rows = plotted_rows(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
+        first = int(np.searchsorted(band.time_s, 0.0))
+        rows = plotted_rows(band.time_s.size, max(first - max((band.time_s.size - first) // 20, 2), 0))
         time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
         columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
         columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
@@ -219,23 +224,24 @@ def replicate_bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
     return columns
 
 
-def model_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+def model_lines(campaign: Campaign, prediction: Prediction, shown: Sequence[int]) -> Columns:
     """Return one line per condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
     columns: Columns = {"xs": [], "ys": []}
     for condition in _conditions(campaign, shown):
         members = [i for i in shown if campaign.trials[i].condition == condition]
         longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
         aligned = campaign.trials[longest]
-        rows = plotted_rows(aligned.time_s.size, aligned.first_counted_frame(aligned.release_s))
+        rows = _rows(aligned)
         columns["xs"].append(1e3 * aligned.time_s[rows])
-        columns["ys"].append(1e3 * curves[longest].growth_m[rows])
+        growth_m = prediction.trials[longest].predicted_position_m - aligned.origin_m
+        columns["ys"].append(1e3 * growth_m[rows])
     return columns
 
 
-def residual_lines(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+def residual_lines(campaign: Campaign, prediction: Prediction, shown: Sequence[int]) -> Columns:
     """Return lines of measurement minus model, `ys` mm, against the growth, `xs` mm."""
-    trials = [(campaign.trials[i], curves[i]) for i in shown]
-    return _lines_by_trial(campaign, [(aligned, aligned.growth_m, motion.residual_m) for aligned, motion in trials])
+    trials = campaign.trials
+    return _lines_by_trial(campaign, [(trials[i], trials[i].growth_m, prediction.trials[i].residual_m) for i in shown])
 
 
 def error_bars(
@@ -389,7 +395,7 @@ class Plots:
         self._bars.selected.indices = []
         self._on_condition_click(names[new[0]])
 
-    def set_shown(self, shown: Sequence[int], reference: Curves | None) -> None:
+    def set_shown(self, shown: Sequence[int], reference: Prediction | None) -> None:
         """Select the trials to draw, and the reference curves of their conditions."""
         lines = measured_lines(self.campaign, shown)
         (left, right), (bottom, top) = axis_ranges(lines)
@@ -401,7 +407,7 @@ class Plots:
         few = len({self.campaign.trials[i].condition for i in shown}) <= MAX_BANDS
         self._band.data = replicate_bands(self.campaign, shown if few else [])
 
-    def set_reference(self, reference: Curves | None, shown: Sequence[int]) -> None:
+    def set_reference(self, reference: Prediction | None, shown: Sequence[int]) -> None:
         """Set the curves for comparison."""
         key = (id(reference), tuple(shown))
         if key != self._reference_drawn:
@@ -414,9 +420,9 @@ class Plots:
         """Mark a time since release, or none."""
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
-    def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
+    def set_curves(self, now: Prediction, shown: Sequence[int]) -> None:
         """Set the curves of the current model; for lines already drawn only their ordinates are sent."""
-        lines, residual = model_lines(self.campaign, curves, shown), residual_lines(self.campaign, curves, shown)
+        lines, residual = model_lines(self.campaign, now, shown), residual_lines(self.campaign, now, shown)
         low, high = symmetric_range(residual)
         if high != self.residual.y_range.end:
             self.residual.y_range.update(start=low, end=high)

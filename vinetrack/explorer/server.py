@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +19,6 @@ from tornado.web import ErrorHandler
 
 from vinetrack.core.local_page import (
     LOOPBACK,
-    PageError,
     allowed_hosts,
     secret_path,
     serve_on_free_port,
@@ -30,7 +27,7 @@ from vinetrack.core.local_page import (
 from vinetrack.explorer.fitting import BackgroundFit
 
 if TYPE_CHECKING:
-    from vinetrack.explorer.campaign import Campaign, ModelChoice
+    from vinetrack.explorer.campaign import Campaign
 
 
 SILENCED_LOGGERS = ("bokeh", "tornado")
@@ -120,29 +117,6 @@ def serve(
     say("Explorer ended.")
 
 
-# ------------------------------------------------------------------------------
-# The command `vinetrack explore`: the page for a results folder, or its functions without the page.
-
-
-@dataclass(frozen=True)
-class ExploreOptions:
-    """Options of the command line; see `vinetrack explore --help`."""
-
-    add: Sequence[str] = ()
-    drop: Sequence[str] = ()
-    sizes: Sequence[str] = ()
-    refit: bool = False
-    export: Sequence[Path] = ()
-    save: bool = False
-    port: int | None = None
-    browser: bool = True
-
-    @property
-    def needs_page(self) -> bool:
-        """Whether to open the page: refitting, exporting and saving need none."""
-        return not (self.refit or self.export or self.save)
-
-
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
     from vinetrack.explorer.campaign import read_campaign
@@ -152,69 +126,12 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     return read_campaign(folder, source, effects_of(source.folder))
 
 
-def explore(folder: Path, experiment: Path | None, options: ExploreOptions, say: Callable[[str], None]) -> None:
-    """Serve the page, or carry out the options and print the results."""
+def explore(
+    folder: Path, experiment: Path | None, say: Callable[[str], None], port: int | None, *, browser: bool
+) -> None:
+    """Serve the page of a results folder."""
     from vinetrack.core.terminal import waiting
-    from vinetrack.explorer.campaign import choice_from_options, choice_in_use
 
     with waiting(f"opening {folder}"):
         campaign = open_campaign(folder, experiment)
-        start = choice_in_use(campaign)
-        choice = choice_from_options(campaign, start, options.add, options.drop, options.sizes)
-    if options.needs_page:
-        if importlib.util.find_spec("bokeh") is None:
-            raise PageError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
-        from vinetrack.explorer.fitting import BackgroundFit
-
-        serve(BackgroundFit(campaign, start if choice == start else choice), say, options.port, browser=options.browser)
-        return
-    _run_without_page(campaign, start, choice, options, say)
-
-
-def _run_without_page(
-    campaign: Campaign, start: ModelChoice, choice: ModelChoice, options: ExploreOptions, say: Callable[[str], None]
-) -> None:
-    from vinetrack.core.terminal import waiting
-    from vinetrack.explorer.campaign import errors_m, simulate_curves, sized_model
-    from vinetrack.explorer.fitting import first_fit, fit_choice, likelihood_change_text, model_text, write_export
-    from vinetrack.pipeline.effects_stage import save_model
-
-    with waiting("simulating the trials"):
-        before = errors_m(campaign, simulate_curves(campaign, sized_model(campaign, start)))
-    if options.refit:
-        with waiting("fitting the model in use"):
-            first = first_fit(campaign, start)
-        with waiting(f"fitting {model_text(choice.effects)}"):
-            fitted = fit_choice(campaign, first.fit, choice)
-        choice = fitted.choice
-        say(str(fitted.fit))
-        say(likelihood_change_text(first.fit, fitted.fit))
-    curves = simulate_curves(campaign, sized_model(campaign, choice))
-    for line in error_lines(campaign, choice, errors_m(campaign, curves), before):
-        say(line)
-    for path in options.export:
-        write_export(campaign, choice, curves, path)
-        say(f"Written: {path}")
-    if options.save:
-        files = campaign.own_files(choice.effects)
-        say(f"Saved: {save_model(campaign.experiment.folder, choice.effects, files)}")
-
-
-def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], before: dict[str, float]) -> list[str]:
-    """Return a table of the error of every condition before and now, with the replicate scatter."""
-    from vinetrack.core.terminal import table
-    from vinetrack.explorer.campaign import overall_m
-    from vinetrack.explorer.fitting import model_text
-
-    def cells(values: dict[str, float]) -> list[str]:
-        return [f"{1e3 * values[key]:.3f}" if values[key] == values[key] else "–" for key in ("was", "now", "floor")]
-
-    floors = campaign.floors_m
-    rows = [
-        (campaign.labels[c], *cells({"was": before[c], "now": now[c], "floor": floors.get(c, float("nan"))}))
-        for c in campaign.conditions
-    ]
-    sums = (overall_m(errors, campaign.conditions) for errors in (before, now, floors))
-    rows.append(("all", *cells(dict(zip(("was", "now", "floor"), sums, strict=True)))))
-    head = ("condition", "model in use", "now", "replicates")
-    return [model_text(choice.effects), *table(rows, head, ("", "mm", "mm", "mm"), align="<>>>")]
+    serve(BackgroundFit(campaign), say, port, browser=browser)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.explorer.campaign import Campaign, Curves, ModelChoice, overall_m
+from vinetrack.explorer.campaign import Campaign, ModelChoice, Prediction, overall_m
 from vinetrack.explorer.fitting import Fitted, correlated_pairs_text, likelihood_change_text, model_text
 from vinetrack.explorer.plots import command_block, escaped, table, vine_colours
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
@@ -37,12 +38,16 @@ class LadderEntry:
 
 @dataclass(frozen=True)
 class HeldModel:
-    """A model for comparison: its effects, curves, errors by condition (m), and its fit, if it was fitted."""
+    """A model for comparison: its effects, what it predicts, and its fit, if it was fitted."""
 
     effects: tuple[str, ...]
-    curves: Curves | None
-    errors_m: Mapping[str, float]
+    prediction: Prediction | None
     fitted: Fitted | None
+
+    @property
+    def errors_m(self) -> Mapping[str, float]:
+        """Errors by condition, m."""
+        return {} if self.prediction is None else self.prediction.errors_m
 
 
 def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
@@ -61,9 +66,14 @@ def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel)
     return table(rows, ("", "held", "now"), ())
 
 
-def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
+def headline(
+    campaign: Campaign, choice: ModelChoice, prediction: Prediction | None, opened_with: Prediction | None
+) -> str:
     """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
-    now, before, floor = (overall_m(errors, campaign.conditions) for errors in (now_m, before_m, campaign.floors_m))
+    parts: list[Mapping[str, float]] = [{}, {}, campaign.floors_m]
+    if prediction is not None:
+        parts = [prediction.errors_m, opened_with.errors_m if opened_with else {}, prediction.floors_m]
+    now, before, floor = (overall_m(errors, campaign.conditions) for errors in parts)
     words = model_text(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
     if not math.isfinite(now):
@@ -76,7 +86,19 @@ def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float]
         least = f"; replicate scatter {_mm(floor)}" + (": nothing is left to explain" if at_floor else "")
     else:
         least = "; there are no replicates to compare with"
-    return f'<h1>{model}: <span class="{grade}">off by {_mm(now)}</span> rms{was}{least}.</h1>'
+    return f'<h1>{model}: <span class="{grade}">off by {_mm(now)}</span> rms{was}{least}.</h1>{not_run_yet(campaign)}'
+
+
+def not_run_yet(campaign: Campaign) -> str:
+    """Return that the results are of another model than the settings name now; blank if they are of the same."""
+    if campaign.saved == campaign.in_use:
+        return ""
+    saved, shown = escaped(model_text(campaign.saved)), escaped(model_text(campaign.in_use))
+    command = f"vinetrack run {shlex.quote(campaign.experiment.folder.as_posix())}"
+    return (
+        f'<p class="bad">experiment.yaml has the {saved} since these results were made: they, and what this page opened'
+        f" with, are of the {shown}. For new results: <code>{escaped(command)}</code></p>"
+    )
 
 
 def _mm(value_m: float) -> str:
@@ -138,7 +160,7 @@ def _ladder(campaign: Campaign, fitted_models: Sequence[LadderEntry]) -> str:
 def ladder_entry(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> LadderEntry:
     """Return the entry of a fit in the table of fitted models."""
     gained = "" if before is None else likelihood_change_text(before.fit, fitted.fit)
-    return LadderEntry(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
+    return LadderEntry(fitted.choice.effects, overall_m(fitted.prediction.errors_m, campaign.conditions), gained)
 
 
 def tied_panel(campaign: Campaign, summary: DiagnosisSummary | None, fitted: Fitted | None) -> str:

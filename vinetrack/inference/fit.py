@@ -141,11 +141,8 @@ def _fixed_terms_of(fit: Fit, rows: Indices) -> FixedTerms:
 
 # Least eigenvalue, of an information matrix of unit diagonal, at which release and origin are both determined (chosen)
 LEAST_EIGENVALUE = 1e-4
-
 MOST_STEPS = 20  # Maximum number of Gauss–Newton steps for release and origin (chosen)
-
 SETTLED_FRAMES = 1e-3  # Step of the release below which it has converged, frames (chosen)
-
 FEWEST_AT_REST = 5  # Frames at rest that determine where a vine started, to half the noise of one (derived)
 
 
@@ -157,41 +154,46 @@ def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[T
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
     """As `predict_trials`, for trials whose data are already prepared."""
     rho = 0.0 if from_rest else fit.noise_correlation
-    variance = fit.noise_m**2 * (1 - rho**2)
     predictor, trial_effects, square = aligned_to_trials(fit, data, from_rest=from_rest)
-    data = predictor.data
+    return _predicted(predictor, trial_effects, square, rho, fit.noise_m**2 * (1 - rho**2))
+
+
+def predict_from_rest(model: Model, data: Sequence[FitTrial], host: Model) -> list[TrialFit]:
+    """Predict trials by a model of given sizes as `predict_prepared` does from rest, with errors at a noise of 1 m."""
+    return _predicted(*_aligned(model, data, host, 0.0, from_rest=True), 0.0, 1.0)
+
+
+def _predicted(
+    predictor: Predictor, trial_effects: Floats, square: Floats, rho: float, variance: float
+) -> list[TrialFit]:
     try:
         trajectories = predictor.run(predictor.jobs(np.empty(0), trial_effects))
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
-    sigma = np.zeros((len(data), N_TRIAL_EFFECTS))
+    sigma = np.zeros((len(predictor.data), N_TRIAL_EFFECTS))
     sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
     return [
         trial_fit(
-            trial_data,
-            trial_effects[i],
-            sigma[i],
-            trajectories[i].observed_position_m,
-            trajectories[i].lead_velocity_m_s,
-            rho,
-            variance,
+            trial_data, trial_effects[i], sigma[i], path.observed_position_m, path.lead_velocity_m_s, rho, variance
         )
-        for i, trial_data in enumerate(data)
+        for i, (trial_data, path) in enumerate(zip(predictor.data, trajectories, strict=True))
     ]
 
 
 def aligned_to_trials(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
-    """Fit release and origin of trials to a fitted model. Returns predictor (of these trials, without free parameters),
-    trial_effects (release and origin; zero deviations), square (whitened cross products of release and origin). Shape
-    (n_trials, 4).
-    """
+    """Predictor of trials, release and origin under a fitted model, (n_trials, 4), and whitened cross products."""
     data = [_with_fitted_yield_pressure(fit, trial_data) for trial_data in data]
-    predictor = Predictor(_without_free_parameters(fit, data), data, fit.predictor.host)
+    rho = 0.0 if from_rest else fit.noise_correlation
+    return _aligned(fit.model, data, fit.predictor.host, rho, from_rest=from_rest)
+
+
+def _aligned(
+    model: Model, data: Sequence[FitTrial], host: Model | None, rho: float, *, from_rest: bool
+) -> tuple[Predictor, Floats, Floats]:
+    predictor = Predictor(_without_free_parameters(model, data), data, host)
     try:
         trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
-        trial_effects, square = _fit_release_and_origin(
-            predictor, trial_effects, 0.0 if from_rest else fit.noise_correlation, from_rest
-        )
+        trial_effects, square = _fit_release_and_origin(predictor, trial_effects, rho, from_rest)
     except SimulationError as error:
         raise FitError(f"The model cannot be simulated: {error}") from error
     return predictor, trial_effects, square
@@ -231,21 +233,19 @@ def _with_fitted_yield_pressure(fit: Fit, trial_data: FitTrial) -> FitTrial:
     return trial_data
 
 
-def _without_free_parameters(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
+def _without_free_parameters(model: Model, data: Sequence[FitTrial]) -> ParameterMap:
     try:
-        base = np.array([fit.model.parameters_of(trial_data.trial) for trial_data in data])
+        base = np.array([model.parameters_of(trial_data.trial) for trial_data in data])
     except EffectError as error:
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
-    base = base.reshape(len(data), len(fit.model.parameter_names))
-    return ParameterMap(fit.model, (), (), np.zeros((len(data), 0), dtype=int), base)
+    base = base.reshape(len(data), len(model.parameter_names))
+    return ParameterMap(model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
 def _fit_release_and_origin(
     predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool
 ) -> tuple[Floats, Floats]:
-    """Gauss–Newton steps in release and origin, of at most two frames; the trial effects and their information. Trials
-    that have converged are not simulated again.
-    """
+    """Gauss–Newton steps in release and origin, of at most two frames, until each trial has converged."""
     data = predictor.data
     frames = np.array([trial_data.frame_s for trial_data in data])
     origin_fixed = rest_is_seen(data) & from_rest

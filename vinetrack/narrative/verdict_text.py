@@ -401,7 +401,7 @@ def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ladder without its partial steps, which reduce an unexplained misfit without removing it."""
     if "partial" not in table:
         return table
-    return table[[value not in (True, "True") for value in table["partial"]]]
+    return table.loc[[value not in (True, "True") for value in table["partial"]]]
 
 
 MEASUREMENT = "measurement"
