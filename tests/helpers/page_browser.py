@@ -35,7 +35,7 @@ class Browser:
                 self.document.callbacks.remove_session_callback(callback)
                 callback.callback()
 
-    def until(self, asked: Callable[[], bool], seconds: float = 60) -> None:
+    def until(self, asked: Callable[[], bool], seconds: float = 240) -> None:
         end = time.monotonic() + seconds
         while not asked():
             assert time.monotonic() < end

@@ -86,11 +86,23 @@ def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
 
 def test_shared_values_are_set_in_place_and_in_the_unit_chosen() -> None:
     after = with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
-    assert after.startswith("# of the lab\nyield_pressure_kPa:  # measured twice\n")
+    assert after.startswith("# of the lab\nyield_pressure_psi: 0.5  # measured twice\n")
     assert parse_yaml(after, "").content == {
-        "yield_pressure_kPa": None, "thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069,
+        "yield_pressure_psi": 0.5, "thickness_um": 100, "capture_fps": 1069,
     }  # fmt: skip
     assert shared_values(after) == {"thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069}
+
+
+def test_no_blank_key_is_written_beside_the_same_quantity_in_another_unit() -> None:
+    """A new file has a blank `yield_pressure_kPa:`; that of an older version of the page has both."""
+    after = with_shared(first_settings(), {"yield_pressure_psi": "0.42", "capture_fps": "1000"})
+    assert parse_yaml(after, "").content["yield_pressure_psi"] == 0.42
+    assert "yield_pressure_kPa" not in parse_yaml(after, "").content
+    assert after.count("#") == first_settings().count("#")
+    both = with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
+    assert parse_yaml(both, "").content == {"yield_pressure_psi": 0.42}
+    back = with_shared(after, {"yield_pressure_kPa": "3"})
+    assert parse_yaml(back, "").content["yield_pressure_kPa"] == 3
 
 
 def test_shared_values_that_do_not_change_leave_the_text() -> None:

@@ -261,3 +261,24 @@ def test_eight_hundred_pixels_are_enough_in_both_schemes(person: Person, scheme:
     back = person.chrome.run("getComputedStyle(document.body).backgroundColor")
     brightness = sum(int(part) for part in str(back).strip("rgb()").split(",")[:3]) / 3
     assert brightness > 200 if scheme == "light" else brightness < 60
+
+
+def test_a_pasted_block_stands_beside_its_clips_and_is_taken_back_by_ctrl_z(person: Person) -> None:
+    """Rows in another order, with a header in psi and one row of no clip, pasted into the first cell."""
+    cells = "[...document.querySelectorAll('#trials [data-column=pressure_kPa]')].slice(1).map((field) => field.value)"
+    names = "[...document.querySelectorAll('#trials [data-column=trial]')].map((field) => field.value)"
+    before = person.chrome.run(cells), person.chrome.run(names)
+    block = "clip\\tpressure (psi)\\nd15 30kPa 1.mp4\\t4.4\\nother\\t9\\nd15 24kPa 1.mp4\\t3.5"
+    person.chrome.run(
+        "(() => { const field = document.querySelector('[data-column=trial][data-row=\"0\"]'); field.focus();"
+        " const clipboardData = new DataTransfer(); clipboardData.setData('text', \"" + block + '");'
+        " field.dispatchEvent(new ClipboardEvent('paste', {clipboardData, bubbles: true, cancelable: true})); })()"
+    )
+    person.chrome.wait("document.querySelectorAll('#pasted li').length === 1", "the row of no clip")
+    assert [float(cell) for cell in person.chrome.run(cells)] == pytest.approx([24.1317, 30.3369])
+    assert person.chrome.run(names) == before[1]
+    for kind in ("rawKeyDown", "keyUp"):
+        person.chrome.send(
+            "Input.dispatchKeyEvent", type=kind, key="z", code="KeyZ", windowsVirtualKeyCode=90, modifiers=2
+        )
+    assert person.chrome.run(cells) == before[0]

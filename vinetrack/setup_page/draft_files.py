@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -167,8 +168,9 @@ def with_shared(text: str, values: Mapping[str, str]) -> str:
     content = parse_yaml(text, SETTINGS).content
     for key, cell in values.items():
         for other in [name for name in content if name != key and _same_quantity(str(name), key)]:
-            if content[other] is not None:
-                text = with_value(text, other, None, SETTINGS)
+            text = _renamed(text, str(other), "" if key in content else key)
+            if key not in content:
+                content[key] = content[other]
         value = _value(cell)
         if value is None and content.get(key) is None:
             continue
@@ -176,6 +178,14 @@ def with_shared(text: str, values: Mapping[str, str]) -> str:
             continue
         text = with_value(text, key, value, SETTINGS)
     return text
+
+
+def _renamed(text: str, key: str, to: str) -> str:
+    """The settings with a top-level key under another name, or without its line: a blank key beside the same quantity
+    in another unit would be refused.
+    """
+    line = re.compile(rf"^{re.escape(key)}(\s*:)(.*\n?)", re.MULTILINE)
+    return line.sub(rf"{to}\1\2" if to else "", text, count=1)
 
 
 def _same_quantity(name: str, other: str) -> bool:

@@ -44,6 +44,7 @@ from vinetrack.setup_page.draft_files import (
     with_shared,
     write_draft,
 )
+from vinetrack.setup_page.pasted import place_block
 from vinetrack.video.frames import RecordingError
 
 # ------------------------------------------------------------------------------
@@ -284,6 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(length)
         answers: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "/api/check": self._check,
+            "/api/paste": lambda content: vars(place_block(**content)),
             "/api/track": self._track,
             "/api/save": self._save,
         }

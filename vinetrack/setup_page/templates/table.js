@@ -1,5 +1,5 @@
 // The table: one row for all trials, one for each trial, with problems under the cell concerned.
-import {$, baseOf, changed, el, labelOf, quantityOf, sharedValue, shownColumns, state, url} from "./state.js";
+import {$, ask, baseOf, changed, el, labelOf, quantityOf, sharedValue, shownColumns, state, url} from "./state.js";
 
 export function drawTable(choose) {
   const columns = shownColumns();
@@ -102,21 +102,49 @@ function move(event) {
   if (next) { next.focus(); next.select?.(); event.preventDefault(); }
 }
 
-function paste(event) {
-  const text = event.clipboardData.getData("text").replace(/\r/g, "").replace(/\n$/, "");
-  if (!/[\t\n]/.test(text)) return;
+// The server says which cells a pasted block changes; Ctrl-Z takes the whole block back.
+let before = null;
+async function paste(event) {
+  const text = event.clipboardData.getData("text");
+  const {column, row} = event.target.dataset;
+  const isText = state.known[baseOf(column)] && state.known[baseOf(column)].kind !== "number";
+  if (!/[\t\n]/.test(text.trim()) && (isText || !/;|,\s*\S+[,\s]|,\s+\S/.test(text))) return;
   event.preventDefault();
-  const fields = (line) => [...line.querySelectorAll("[data-column]")];
-  const lines = [...$("trials").querySelectorAll("tbody tr")];
-  const start = lines.indexOf(event.target.closest("tr"));
-  const left = fields(lines[start]).indexOf(event.target);
-  text.split("\n").forEach((words, down) => words.split("\t").forEach((word, right) => {
-    const field = lines[start + down] && fields(lines[start + down])[left + right];
-    if (!field) return;
-    field.value = word.trim();
-    field.dispatchEvent(new Event(field.matches("select") ? "change" : "input"));
-  }));
+  const columns = shownColumns();
+  const {rows, decimal} = state.sheet;
+  const at_row = row === "shared" ? row : Number(row);
+  let placed;
+  try {
+    placed = await ask("api/paste", {text, columns, rows, at_row, at_column: column, decimal: decimal || "."});
+  } catch (error) {
+    placed = {cells: [], notes: [error.message]};
+  }
+  before = structuredClone({sheet: state.sheet, shared: state.shared});
+  for (const [at, name, value] of placed.cells) {
+    if (at === "shared") state.shared[Object.keys(state.shared).find((key) => quantityOf(key) === quantityOf(name)) ?? name] = value;
+    else state.sheet.rows[at][name] = value;
+    if (at !== "shared" && !state.sheet.columns.includes(name)) state.sheet.columns.push(name);
+  }
+  refreshAt(column, row);
+  $("pasted").replaceChildren(...placed.notes.map((words) => el("li", {class: "warning"}, words)));
 }
+
+function refreshAt(column, row) {
+  changed();
+  redraw();
+  $("trials").querySelector(`[data-column="${column}"][data-row="${row}"]`)?.focus();
+}
+
+addEventListener("input", () => { before = null; });
+addEventListener("keydown", (event) => {
+  if (!before || !(event.ctrlKey || event.metaKey) || event.key !== "z") return;
+  event.preventDefault();
+  Object.assign(state, before);
+  before = null;
+  $("pasted").replaceChildren();
+  const {column, row} = document.activeElement?.dataset ?? {};
+  refreshAt(column, row);
+});
 
 function drawAdder(columns) {
   const shown = new Set(columns.map(quantityOf));
