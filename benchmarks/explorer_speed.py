@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"
 from chrome import Chrome
 from served import Served, Visitor
 
-from vinetrack.explorer.campaign import choice_in_use, predict_choice
-from vinetrack.explorer.server import open_campaign
+from vinetrack.pages.campaign import choice_in_use, predict_choice
+from vinetrack.pages.explorer_server import open_campaign
 
 SIZE = "size_reservoir_depletion.gamma"
 

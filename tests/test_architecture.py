@@ -37,7 +37,7 @@ FLOORS = (
     {"figures"},
     {"report"},
     {"pipeline"},
-    {"explorer", "interface", "setup_page"},
+    {"interface", "pages"},
     {"cli"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
@@ -49,19 +49,18 @@ BUDGETS = {
     "dynamics": (2899, 8, 90),
     "effects": (2809, 44, 223),
     "experiment": (2524, 8, 33),
-    "explorer": (3417, 9, 52),
     "figures": (3277, 9, 114),
     "inference": (7504, 19, 171),
     "interface": (699, 5, 3),
     "kinematics": (2278, 6, 42),
     "laboratory": (2547, 10, 39),
     "narrative": (1809, 5, 32),
+    "pages": (4462, 14, 70),
     "paper": (1369, 4, 21),
     "pipeline": (5305, 15, 70),
     "planning": (3522, 11, 84),
     "report": (1410, 5, 24),
     "results": (362, 2, 8),
-    "setup_page": (1230, 5, 25),
     "tracks": (2027, 5, 108),
     "video": (9145, 21, 343),
 }
@@ -69,8 +68,8 @@ BUDGETS = {
 
 HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
 HEAVY_AT_IMPORT = {
-    *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis", "explorer"),
-    *("planning", "paper", "interface", "setup_page"),
+    *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis"),
+    *("planning", "paper", "interface", "pages"),
 }
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 

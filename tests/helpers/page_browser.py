@@ -8,8 +8,8 @@ from typing import Any
 
 from bokeh.document import Document
 
-from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.explorer.page import Page
+from vinetrack.pages.fitting import BackgroundFit
+from vinetrack.pages.page import Page
 
 
 class Browser:

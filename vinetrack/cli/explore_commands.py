@@ -34,6 +34,6 @@ def _explore(
     with errors_as_sentences(log):
         if importlib.util.find_spec("bokeh") is None:
             raise UserError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
-        from vinetrack.explorer.server import explore
+        from vinetrack.pages.explorer_server import explore
 
         explore(results, experiment, typer.echo, port, browser=browser)

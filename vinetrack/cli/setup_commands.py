@@ -37,11 +37,11 @@ def _setup(
     """Create trials.csv and experiment.yaml from a folder of recordings, on a local page or with blanks to fill in."""
     with errors_as_sentences(log):
         if page:
-            from vinetrack.setup_page.page_server import serve
+            from vinetrack.pages.setup_server import serve
 
             serve(folder, typer.echo, port, browser=browser)
         else:
-            from vinetrack.setup_page.page_server import write_templates
+            from vinetrack.pages.setup_server import write_templates
 
             write_templates(folder, typer.echo)
 

@@ -17,9 +17,9 @@ from explorer_campaign import DEMO, SETTINGS, SMALL, make_experiment, make_resul
 from page_browser import Browser
 
 from vinetrack.diagnosis.ladder import compare
-from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.explorer.server import open_campaign
 from vinetrack.inference.fit_result import Fit
+from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.fitting import BackgroundFit
 
 EFFECT = "tail_friction"
 SIZE = f"size_{EFFECT}.mu_w"

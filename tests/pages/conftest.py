@@ -1,13 +1,30 @@
-"""A folder of rendered clips, as a user would have it."""
+"""One small results folder for the explorer, and a folder of rendered clips for the set-up page."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from explorer_campaign import SMALL, make_experiment, make_results
 from plain_scene import Plan, plain_scene, write_video
 
+from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.explorer_server import open_campaign
+
 CLIPS = ("d15 24kPa 1.mp4", "d15 30kPa 1.mp4")
+
+
+@pytest.fixture(scope="session")
+def small_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six trials of one vine, three conditions, two replicates each."""
+    folder = tmp_path_factory.mktemp("explorer")
+    return make_results(make_experiment(folder / "vines", SMALL), folder / "results" / "vines")
+
+
+@pytest.fixture(scope="session")
+def campaign(small_results: Path) -> Campaign:
+    """The same, opened."""
+    return open_campaign(small_results)
 
 
 @pytest.fixture(scope="session")

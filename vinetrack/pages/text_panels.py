@@ -12,12 +12,12 @@ from typing import Any
 from vinetrack.core.units import SLIDER_UNITS, decimals, display_unit
 from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.explorer.campaign import Campaign, ModelChoice, Prediction, overall_m
-from vinetrack.explorer.fitting import Fitted, correlated_pairs_text, likelihood_change_text, model_text
-from vinetrack.explorer.plots import command_block, escaped, table, vine_colours
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.verdict_text import estimate_text
+from vinetrack.pages.campaign import Campaign, ModelChoice, Prediction, overall_m
+from vinetrack.pages.fitting import Fitted, correlated_pairs_text, likelihood_change_text, model_text
+from vinetrack.pages.plots import command_block, escaped, table, vine_colours
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
 FLOOR_MARGIN = 1.15  # Chosen: an error up to 1.15 times the replicate scatter counts as equal to it

@@ -26,8 +26,8 @@ from bokeh.plotting import figure
 from bokeh.themes import Theme
 
 from vinetrack.core.records import Floats
-from vinetrack.explorer.campaign import Campaign, ExplorerTrial, Prediction, condition_labels
 from vinetrack.figures.style import GRID, INK, MUTED, TOKENS, VINE_COLOURS, page_frame, vine_styles
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction, condition_labels
 
 # ------------------------------------------------------------------------------
 # Style shared with the report: colours, fonts, and the pieces of HTML of the page.

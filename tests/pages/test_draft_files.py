@@ -10,7 +10,7 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.experiment.folder import check_experiment
-from vinetrack.setup_page.draft_files import (
+from vinetrack.pages.draft_files import (
     Draft,
     SheetDraft,
     draft_folder,
@@ -20,7 +20,7 @@ from vinetrack.setup_page.draft_files import (
     with_shared,
     write_draft,
 )
-from vinetrack.setup_page.page_server import write_templates
+from vinetrack.pages.setup_server import write_templates
 
 SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
 SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"

@@ -12,9 +12,9 @@ from explorer_campaign import SETTINGS, write_diagnosis
 from page_browser import Browser
 
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.explorer.server import open_campaign
+from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.fitting import BackgroundFit
 
 GAMMA = "size_reservoir_depletion.gamma"
 
@@ -200,7 +200,7 @@ def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
         raise FitError("Trial a: too hard.")
 
     before = error_of(browser)
-    monkeypatch.setattr("vinetrack.explorer.page.predict_choice", refuse)
+    monkeypatch.setattr("vinetrack.pages.page.predict_choice", refuse)
     browser.model(GAMMA).value = 1.1
     browser.turn()
     assert "too hard" in browser.text("status")
@@ -208,7 +208,7 @@ def test_a_failed_simulation_is_reported_and_the_curves_are_kept(
 
 
 def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
-    from vinetrack.explorer.campaign import choice_in_use
+    from vinetrack.pages.campaign import choice_in_use
 
     choice = choice_in_use(campaign).with_effect("leak").with_size("leak.rate", 0.2)
     background = BackgroundFit(campaign, choice).begin()
@@ -221,7 +221,7 @@ def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
 
 
 def test_a_page_opened_as_the_command_does_shows_the_fit_and_no_size_that_was_moved(campaign: Campaign) -> None:
-    from vinetrack.explorer.campaign import choice_in_use
+    from vinetrack.pages.campaign import choice_in_use
 
     grown = BackgroundFit(campaign, choice_in_use(campaign)).begin()
     grown.wait(240)

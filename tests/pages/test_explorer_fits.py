@@ -9,8 +9,11 @@ from dataclasses import replace
 
 import pytest
 
-from vinetrack.explorer.campaign import Campaign, choice_in_use, overall_m
-from vinetrack.explorer.fitting import (
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import Step, Watch
+from vinetrack.pages.campaign import Campaign, choice_in_use, overall_m
+from vinetrack.pages.fitting import (
     FAULT,
     BackgroundFit,
     FitJob,
@@ -21,9 +24,6 @@ from vinetrack.explorer.fitting import (
     fit_choice,
     likelihood_change_text,
 )
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import Step, Watch
 
 GAMMA = "reservoir_depletion.gamma"
 
@@ -48,7 +48,7 @@ def test_other_starts_are_tried_if_the_first_does_not_reach_the_known_fit(
         seen.append(thorough)
         return first.fit
 
-    monkeypatch.setattr("vinetrack.explorer.fitting.fit", fitted)
+    monkeypatch.setattr("vinetrack.pages.fitting.fit", fitted)
     first_fit(replace(campaign, log_likelihood=known), choice_in_use(campaign))
     assert seen == asked
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vinetrack.core.yaml_document import parse_yaml
-from vinetrack.setup_page.page_server import draft_from_json, draft_problems, page_state
+from vinetrack.pages.setup_server import draft_from_json, draft_problems, page_state
 
 
 def sent(folder: Path, **more: Any) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.setup_page.clip_names import columns_from_names, list_recordings, trial_names
+from vinetrack.pages.clip_names import columns_from_names, list_recordings, trial_names
 
 # ------------------------------------------------------------------------------
 # Editing of the trial sheet: cells as text, with those of an existing sheet preserved.

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_page_state import sent
 
-from vinetrack.setup_page.page_server import SetupServer, start_server
+from vinetrack.pages.setup_server import SetupServer, start_server
 
 OURS = {"X-Vinetrack": "setup"}
 
@@ -47,7 +47,7 @@ def test_the_page_its_style_and_its_scripts_are_served(server: SetupServer) -> N
     assert b"<title>vinetrack set-up</title>" in ask(server, "/")[1]
     assert b"--ink" in ask(server, "/setup.css")[1]
     assert ask(server, "/table.js")[2].startswith("text/javascript")
-    assert ask(server, "/page_server.py")[0] == 404
+    assert ask(server, "/setup_server.py")[0] == 404
 
 
 def test_frames_are_pictures_and_the_axis_lies_along_the_tube(server: SetupServer) -> None:

@@ -16,10 +16,10 @@ from page_browser import Browser
 
 from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.explorer import controls
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.explorer.server import open_campaign
+from vinetrack.pages import controls
+from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.fitting import BackgroundFit
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 

@@ -26,7 +26,7 @@ from bokeh.models import (
 from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.effects import Effect, load_effect
-from vinetrack.explorer.campaign import (
+from vinetrack.pages.campaign import (
     Campaign,
     ModelChoice,
     SizeControl,
@@ -36,12 +36,12 @@ from vinetrack.explorer.campaign import (
     sizes_of,
     slider_range,
 )
-from vinetrack.explorer.fitting import BackgroundFit, FitJob, Fitted, commands, model_text
-from vinetrack.explorer.plots import command_block, escaped, html_div, progress_bar, stylesheet
+from vinetrack.pages.fitting import BackgroundFit, FitJob, Fitted, commands, model_text
+from vinetrack.pages.plots import command_block, escaped, html_div, progress_bar, stylesheet
 from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect, save_model
 
 if TYPE_CHECKING:
-    from vinetrack.explorer.page import Page
+    from vinetrack.pages.page import Page
 
 
 STEPS = 400  # Steps of a slider; chosen: about one per pixel

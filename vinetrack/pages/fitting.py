@@ -18,7 +18,11 @@ from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import BASE_EFFECTS, EffectError
-from vinetrack.explorer.campaign import (
+from vinetrack.inference.fit import fit, refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
+from vinetrack.pages.campaign import (
     Campaign,
     ModelChoice,
     Prediction,
@@ -27,10 +31,6 @@ from vinetrack.explorer.campaign import (
     predict_fit,
     sized_model,
 )
-from vinetrack.inference.fit import fit, refit
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import CONVERGED_DECREASE, Step, Watch
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.records import Floats, Trial, hand_corrected
-from vinetrack.explorer.campaign import Campaign, ExplorerTrial, Prediction
-from vinetrack.explorer.plots import (
+from vinetrack.pages.campaign import Campaign, ExplorerTrial, Prediction
+from vinetrack.pages.plots import (
     MEASURED_EDGE,
     MODEL_EDGE,
     REFERENCE_EDGE,

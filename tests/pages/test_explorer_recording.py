@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from explorer_campaign import write_bars
 
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.film_panel import DecodedRecording, RecordingView, recording_view
+from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.film_panel import DecodedRecording, RecordingView, recording_view
 from vinetrack.results.folder_layout import Results
 from vinetrack.video.axis import Axis
 

@@ -30,9 +30,9 @@ from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment, corrections_text
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
-from vinetrack.setup_page.clip_names import list_pictures, list_recordings, list_tables, units_of
-from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
-from vinetrack.setup_page.draft_files import (
+from vinetrack.pages.clip_names import list_pictures, list_recordings, list_tables, units_of
+from vinetrack.pages.clip_views import ClipStore, jpeg, track_row, warm_up
+from vinetrack.pages.draft_files import (
     Draft,
     SheetDraft,
     draft_folder,
@@ -44,7 +44,7 @@ from vinetrack.setup_page.draft_files import (
     with_shared,
     write_draft,
 )
-from vinetrack.setup_page.pasted import place_block
+from vinetrack.pages.pasted import place_block
 from vinetrack.video.frames import RecordingError
 
 # ------------------------------------------------------------------------------

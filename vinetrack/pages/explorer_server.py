@@ -24,10 +24,10 @@ from vinetrack.core.local_page import (
     serve_on_free_port,
     stop_on_signals,
 )
-from vinetrack.explorer.fitting import BackgroundFit
+from vinetrack.pages.fitting import BackgroundFit
 
 if TYPE_CHECKING:
-    from vinetrack.explorer.campaign import Campaign
+    from vinetrack.pages.campaign import Campaign
 
 
 SILENCED_LOGGERS = ("bokeh", "tornado")
@@ -38,7 +38,7 @@ KEEP_ALIVE_MS = 20_000  # Interval of pings to an open page; chosen: a closed pa
 
 def application(background: BackgroundFit) -> Application:
     """Return the application, which creates a page for each visitor."""
-    from vinetrack.explorer.page import Page
+    from vinetrack.pages.page import Page
 
     shown = [background]
 
@@ -119,7 +119,7 @@ def serve(
 
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """Open a results folder and its experiment."""
-    from vinetrack.explorer.campaign import read_campaign
+    from vinetrack.pages.campaign import read_campaign
     from vinetrack.pipeline.effects_stage import effects_of, read_source_experiment
 
     source = read_source_experiment(folder, experiment)

@@ -15,7 +15,8 @@ from explorer_campaign import DEMO, SMALL, make_experiment, make_results
 
 from vinetrack.core.records import Trial
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import (
+from vinetrack.laboratory.tracks import grow, read_ground_truth
+from vinetrack.pages.campaign import (
     Campaign,
     choice_in_use,
     condition_labels,
@@ -23,8 +24,9 @@ from vinetrack.explorer.campaign import (
     predict_choice,
     slider_range,
 )
-from vinetrack.explorer.fitting import commands, model_text
-from vinetrack.explorer.plots import (
+from vinetrack.pages.explorer_server import open_campaign
+from vinetrack.pages.fitting import commands, model_text
+from vinetrack.pages.plots import (
     error_bars,
     measured_lines,
     model_lines,
@@ -32,8 +34,6 @@ from vinetrack.explorer.plots import (
     residual_lines,
     symmetric_range,
 )
-from vinetrack.explorer.server import open_campaign
-from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.results.folder_layout import ResultsError
 
 GAMMA = "reservoir_depletion.gamma"

@@ -15,7 +15,7 @@ from served import Served
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.setup_page.page_server import start_server
+from vinetrack.pages.setup_server import start_server
 from vinetrack.video.curved_axis import CurvedAxis, axis_from_entry
 
 pytestmark = [

@@ -9,11 +9,14 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
-from vinetrack.explorer.campaign import ModelChoice, Prediction, predict_choice
-from vinetrack.explorer.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
-from vinetrack.explorer.film_panel import FilmPanel
-from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, fit_choice, with_numbers
-from vinetrack.explorer.plots import (
+from vinetrack.figures.style import follows_screen
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.optimiser import Step
+from vinetrack.pages.campaign import ModelChoice, Prediction, predict_choice
+from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
+from vinetrack.pages.film_panel import FilmPanel
+from vinetrack.pages.fitting import BackgroundFit, FitJob, FitProgress, Fitted, fit_choice, with_numbers
+from vinetrack.pages.plots import (
     Plots,
     escaped,
     html_div,
@@ -25,7 +28,7 @@ from vinetrack.explorer.plots import (
     theme,
     vine_colours,
 )
-from vinetrack.explorer.text_panels import (
+from vinetrack.pages.text_panels import (
     DIAGNOSIS,
     DiagnosisSummary,
     HeldModel,
@@ -38,9 +41,6 @@ from vinetrack.explorer.text_panels import (
     read_summary,
     tied_panel,
 )
-from vinetrack.figures.style import follows_screen
-from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.optimiser import Step
 
 # Chosen: a quarter of a screen's frame of 16 ms, so that several moves of a slider cause one redraw
 REDRAW_DELAY_MS = 4

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.setup_page.clip_names import (
+from vinetrack.pages.clip_names import (
     columns_from_names,
     list_pictures,
     list_recordings,

@@ -18,9 +18,9 @@ from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.server import address as where
-from vinetrack.explorer.server import open_campaign, start_server
+from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.explorer_server import address as where
+from vinetrack.pages.explorer_server import open_campaign, start_server
 
 
 def refused(*arguments: object) -> str:
