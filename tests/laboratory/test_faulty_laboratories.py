@@ -33,8 +33,6 @@ TUBE = Tube(pressure=20e3, yield_pressure=3e3, diameter=0.024, thickness=2e-4, l
 B, N = 6.44, 0.37
 
 
-def _with_B(shot: Shot, factor: float) -> Shot:
-    return replace(shot, physics=shot.physics._replace(B=factor * shot.physics.B))
 
 
 def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.Generator]:

@@ -20,7 +20,6 @@ from vinetrack.paper.protocol import (
     position_conditions,
     position_errors,
     speed_conditions,
-    speed_curves,
 )
 
 
@@ -41,12 +40,6 @@ FIG4 = [trial("a", 28, 35.6), trial("b", 28, 35.6), trial("c", 7, 35.6)]
 FIG5 = [trial("d", 41, 10, 150), trial("e", 41, 10, 150), trial("f", 41, 50, 150)]
 OTHERS = [trial("g", 28, 20), trial("h", 41, 0, 150), trial("i", 20, 35.6), trial("j", 28, 35.6, 100)]
 TRIALS = with_names([*FIG4, *FIG5, *OTHERS])
-
-
-def test_trials_of_each_figure_are_found_by_what_was_set() -> None:
-    by_pressure = {kPa: [one.name for one in own] for kPa, own in position_conditions(TRIALS).items()}
-    assert by_pressure == {7.0: ["c"], 28.0: ["a", "b"]}
-    assert [[one.name for one in own] for own in speed_conditions(TRIALS).values()] == [["d", "e"], ["f"]]
 
 
 RESTS = {"a": Rest(0.03, -0.01), "b": Rest(0.1, 0.02)}
@@ -79,33 +72,11 @@ def test_the_mean_counts_until_the_first_trial_has_grown_to_95_per_cent() -> Non
     np.testing.assert_allclose(mean["lead_position_sigma_m"], math.sqrt(0.02) * grown_m, atol=2e-5)
 
 
-def test_a_speed_that_is_off_is_not_taken_up_by_the_release() -> None:
-    """Both 8 % ahead: the mean is off by 8 % of the growth, most of which a shift in time would have hidden."""
-    conditions = position_conditions(TRIALS)
-    (row,) = position_errors(conditions, filmed(a=1.08, b=1.08), RESTS).itertuples()
-    plain = follow(TRIALS[0], NONE, 6.44)
-    grown_m = plain.lead_position_m[plain.lead_position_m < 0.95 * 0.28 / 1.08]
-    assert row.rms_mean_m == pytest.approx(0.08 * math.sqrt(np.mean(grown_m**2)), rel=0.02)
-    assert row.rms_single_m == pytest.approx(row.rms_mean_m, rel=1e-3)
-
-
 def test_what_trials_differ_by_leaves_their_mean() -> None:
     """10 % ahead and 4 % behind: the mean is 3 % ahead, single trials √((0.1² + 0.04²)/2) = 7.62 %."""
     (row,) = position_errors(position_conditions(TRIALS), filmed(a=1.1, b=0.96), RESTS).itertuples()
     assert row.rms_single_m / row.rms_mean_m == pytest.approx(math.sqrt(0.0058) / 0.03, rel=0.01)
     assert row.n_trials == 2
-
-
-def test_a_trial_that_was_not_fitted_does_not_count() -> None:
-    (row,) = position_errors(position_conditions(TRIALS), filmed(a=1.1, b=0.96), {"a": RESTS["a"]}).itertuples()
-    assert row.n_trials == 1
-    assert row.rms_mean_m == row.rms_single_m
-
-
-def test_without_fitted_trials_there_are_no_errors() -> None:
-    conditions = position_conditions(TRIALS)
-    assert len(mean_motions(conditions, {}, RESTS)) == 0
-    assert len(position_errors(conditions, filmed(a=1.0), {})) == 0
 
 
 def test_speeds_are_taken_at_12_cm_from_where_each_trial_rested() -> None:
@@ -135,10 +106,3 @@ def test_eq2_by_another_integrator() -> None:
     there.terminal = True  # type: ignore[attr-defined]
     found = solve_ivp(rates, (0, 1), [0.0, 1e-9], events=there, method="LSODA", rtol=1e-9, atol=1e-12)
     assert eq2_speed_m_s(one) == pytest.approx(found.y_events[0][0][1] / 2, rel=2e-3)
-
-
-def test_curves_run_from_the_least_payload_to_the_largest() -> None:
-    curve = speed_curves(speed_conditions(TRIALS), instants=3)
-    assert curve["payload_g"].tolist() == pytest.approx([10, 30, 50])
-    assert curve["final_lead_velocity_m_s"].is_monotonic_decreasing
-    assert curve["final_lead_velocity_m_s"].iloc[0] == pytest.approx(eq2_speed_m_s(TRIALS[3]))

@@ -12,24 +12,17 @@ from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
 from vinetrack.paper.arithmetic import (
-    DEPARTURE_COLUMNS,
     DEPARTURES,
-    NONE,
-    as_table,
     departure_table,
     follow,
-    motion_table,
     paper_trial,
-    position_rms_m,
     position_trials,
     pressure_table,
 )
 from vinetrack.paper.result_rows import (
-    departures_in_words,
     drag_shares,
     fast_vine_speeds,
     rule_on_noise_free,
-    theory_rows,
 )
 
 A, L, PAY, B, N, P_Y, G, AMBIENT, V0 = math.pi * 0.012**2, 0.28, 35.6e-3, 6.44, 0.37, 3e3, 9.81, 101_325.0, 3.7e-3
@@ -56,11 +49,6 @@ def by_scipy(pressure_Pa: float, gamma: float | None, time_s: np.ndarray) -> np.
     return np.minimum(found.y[0] / 2, L)
 
 
-def test_the_columns(departures: pd.DataFrame) -> None:
-    assert list(departures.columns) == list(DEPARTURE_COLUMNS)
-    assert len(departures) == 2 * 3 * len(DEPARTURES)
-
-
 @pytest.mark.parametrize(("pressure_kPa", "gamma", "name"), [(14, 1.0, "depletion_slow"), (28, 1.4, "depletion_fast")])
 def test_depletion_by_another_integrator(departures: pd.DataFrame, pressure_kPa: int, gamma: float, name: str) -> None:
     time_s = np.arange(0, 1.5, 1 / 1069)
@@ -85,30 +73,6 @@ def test_a_slack_tail_leaves_the_tip_to_itself_at_7_kpa(departures: pd.DataFrame
     assert moved.end_time_s == pytest.approx(0.28 / speed, rel=0.01)
     row = departures[(departures["pressure_kPa"] == 7) & (departures["departure"] == "slack")].iloc[0]
     assert row["rms_position_m"] > 0.05
-
-
-def test_what_changes_nothing_has_no_error() -> None:
-    trial = replace(position_trials()[2], growth_angle_rad=math.pi / 2)
-    slack = next(one for one in DEPARTURES if one.name == "slack")
-    plain, moved = follow(trial, NONE, B), follow(trial, slack, B)
-    assert position_rms_m(plain, moved, trial) < 1e-5
-
-
-def test_errors_in_words(departures: pd.DataFrame) -> None:
-    words = departures_in_words(departures, "Fig. 4", 7)
-    assert "would cause 5.74 to 6.93 cm" in words
-    assert words.startswith("not in it")
-    assert departures_in_words(departures, "Fig. 4", 41) == ""
-
-
-def test_motions_start_at_rest_and_end_at_the_end() -> None:
-    table = motion_table(instants=20)
-    assert set(table["departure"]) == {"eq2", *(one.name for one in DEPARTURES)}
-    for (pressure_kPa, name), part in table.groupby(["pressure_kPa", "departure"]):
-        assert part["lead_position_m"].iloc[0] == 0, (pressure_kPa, name)
-        assert part["lead_position_m"].is_monotonic_increasing
-    eq2 = table[table["departure"] == "eq2"].groupby("pressure_kPa")["lead_position_m"].max()
-    assert eq2.tolist() == pytest.approx([0.28] * 3, abs=1e-3)
 
 
 def test_pressures_fall_from_full_to_what_the_gas_law_leaves() -> None:
@@ -154,11 +118,3 @@ def test_a_chamber_that_sags_lowers_the_exponent_of_the_published_rule() -> None
     n, found = rule_on_noise_free(1.4, horizontal())
     assert n < 0.35
     assert found[4] > 6.9
-
-
-def test_lines_without_an_experiment() -> None:
-    table = as_table(theory_rows([])).set_index("row")
-    assert set(table["mark"]) == {"not checkable"}
-    assert table.loc["fast_vine_predicted_95", "ours"] == pytest.approx(47, abs=0.5)
-    assert "rule_bias_n" not in table.index
-    assert "rule_bias_n" in set(as_table(theory_rows(horizontal(4)))["row"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
@@ -47,26 +45,12 @@ def test_a_pressure_below_the_yield_pressure() -> None:
     assert any("2.5 kPa lies below the yield pressure" in one and "raise the pressure" in one for one in found)
 
 
-def test_a_pressure_that_may_lie_below_the_yield_pressure() -> None:
-    found = design_checks(prediction(pressure_kPa=3.2, yield_pressure_sigma_kPa=0.2))
-    assert any("of the draws the vine does not grow to its end" in one for one in found)
-
-
 def test_a_tail_that_would_have_to_push() -> None:
     found = design_checks(
         prediction(diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0)
     )
     (sentence,) = (one for one in found if "predicts compression in the tail" in one)
     assert "in every draw" in sentence
-
-
-def test_a_tail_that_seldom_pushes_is_told_how_low_its_tension_comes() -> None:
-    """A median above 0 alone would deny what the sentence says."""
-    vine = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 28, "growth_angle_deg": 60}
-    found = prediction(StatedValues(B=6.44, B_error=0.1), **vine)
-    assert 0.05 < found.slack < 0.5
-    (sentence,) = (one for one in design_checks(found) if "predicts compression in the tail" in one)
-    assert re.search(r"N, below -0\.\d+ N in one draw of twenty", sentence)
 
 
 def test_a_tail_that_may_go_slack_does() -> None:
@@ -85,12 +69,6 @@ def test_a_reservoir_that_sags() -> None:
     # 60 cm³ of vine at y/L = 0.95 in 1 L: 125.3 kPa/1.060 is 7.1 kPa less, 30 % of 24 kPa; γ = 1.4 makes 41 %.
     found = design_checks(prediction(chamber_l=1))
     assert any("reservoir of 1 L loses 30% (slow) to 41% (fast)" in one for one in found)
-
-
-def test_drag_above_a_twentieth_of_the_drive() -> None:
-    # ½ρ ẏ² is 5 % of 60 kPa at 71 m/s; without damping ẏ = √(F/λ ln 20) = 89 m/s, F = 7.3 N, λ = 2.7 g/m.
-    found = design_checks(prediction(StatedValues(B=1e-6, n=0.37), thickness_um=40, pressure_kPa=60, length_mm=290))
-    assert any("air drag" in one and "above 5%" in one for one in found)
 
 
 def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:

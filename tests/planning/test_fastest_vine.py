@@ -63,22 +63,6 @@ def test_at_the_burst_stress_acceleration_is_the_same_for_every_film() -> None:
     assert speeds[1] == pytest.approx(expected, rel=0.01)
 
 
-def test_pressure_is_held_by_the_supply_or_by_the_wall() -> None:
-    limits = room(62, films_m=(50e-6, 100e-6), burst_share=0.8)
-    assert limits.pressure_of(25e-3, 50e-6) == pytest.approx(0.8 * 2 * 50e-6 * 7.8e6 / 25e-3)
-    assert limits.pressure_of(10e-3, 100e-6) == 62e3
-    held = {round(1e6 * choice.thickness_m): choice.limits[0] for choice in fastest(limits, EXACT, samples=50)}
-    assert held[50] == "burst"
-
-
-def test_odds_add_up_and_a_film_that_is_slower_in_every_draw_has_none() -> None:
-    choices = fastest(room(40, films_m=(50e-6, 60e-6, 200e-6)), samples=200)
-    odds = {round(1e6 * choice.thickness_m): choice.odds for choice in choices}
-    assert sum(odds.values()) == pytest.approx(1.0)
-    assert odds[200] < 0.03
-    assert 0.1 < odds[50] < 0.9
-
-
 def test_with_a_payload_speed_is_that_of_the_payload() -> None:
     (choice,) = fastest(room(payload_g=10), EXACT, samples=50)
     assert choice.prediction.final.name == "ejection speed of the payload"

@@ -11,11 +11,9 @@ import pytest
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.effects import EffectError
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.inference.fit_data import FitError
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.predictive_inputs import PRESSURE, YIELD, Size, fit_numbers, read_sizes, size_of
+from vinetrack.planning.predictive_inputs import PRESSURE, YIELD, Size, fit_numbers, read_sizes
 
 B, N = "eversion_damping.B", "eversion_damping.n"
 VINE = "24mm-200um-280mm"
@@ -70,37 +68,9 @@ def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess() -
     assert predictive_inputs(trial()).medians[B] == pytest.approx(3.32, abs=0.005)
 
 
-def test_a_printed_vine_has_its_printed_b() -> None:
-    assert predictive_inputs(trial(diameter_mm=18, thickness_um=150)).medians[B] == 4.54
-
-
 def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three() -> None:
     draws = predictive_inputs(trial()).draw(40_000, seed=1)[YIELD]
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
-
-
-def test_the_printed_yield_pressure_is_believed_of_the_vine_that_it_was_printed_for() -> None:
-    """Printed as about 3 kPa: evenly between 2.5 and 3.5 has a standard deviation of 1/√12 kPa."""
-    inputs = predictive_inputs(trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=28))
-    assert inputs.origins[YIELD].startswith("printed")
-    draws = inputs.draw(20_000, 1, only=["printed P_y"])[YIELD]
-    assert np.mean(draws) == pytest.approx(3e3, rel=0.01)
-    assert np.std(draws) == pytest.approx(1e3 / math.sqrt(12), rel=0.03)
-    assert predictive_inputs(trial(diameter_mm=12, thickness_um=100)).origins[YIELD].startswith("guess")
-
-
-def test_a_size_beyond_what_is_plausible_is_said() -> None:
-    said = StatedValues(effects=("air_drag",), sizes={"air_drag.C_D": Size(99.0, 99.0)})
-    assert predictive_inputs(trial(), said).notes == ("C_D of air_drag is outside its plausible range, 0 to 3",)
-    assert (
-        predictive_inputs(trial(), StatedValues(effects=("air_drag",), sizes={"air_drag.C_D": Size(0.5, 1.5)})).notes
-        == ()
-    )
-
-
-def test_a_yield_pressure_that_is_given_has_its_stated_error() -> None:
-    draws = predictive_inputs(trial(yield_pressure_kPa=5, yield_pressure_sigma_kPa=0.3)).draw(40_000, seed=1)[YIELD]
-    assert (np.mean(draws), np.std(draws)) == pytest.approx((5e3, 300.0), rel=0.02)
 
 
 def test_draws_from_a_fit_have_its_covariance() -> None:
@@ -112,18 +82,6 @@ def test_draws_from_a_fit_have_its_covariance() -> None:
     assert found == pytest.approx(np.array(expected), abs=3e-6)
 
 
-def test_a_fit_to_few_trials_is_believed_no_more_than_its_own_intervals_say() -> None:
-    # Student's t with 4 degrees of freedom: 2.776 standard errors hold 95 %.
-    draws = predictive_inputs(vine_of_the_fit(), None, fit_numbers(fitted(half=2.776), "a")).draw(40_000, seed=3)
-    assert np.std(draws[N]) == pytest.approx(0.01 * 2.776 / 1.960, rel=0.02)
-
-
-def test_the_next_trial_differs_from_the_shared_numbers_as_trials_of_the_fit_do() -> None:
-    content = fitted(between_trials=[[0.0, 0.0, 0.0], [0.0, 9e-4, 0.0], [0.0, 0.0, 0.0]])
-    draws = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "a")).draw(20_000, seed=4)
-    assert np.std(draws[N]) == pytest.approx(math.hypot(0.01, 0.03), rel=0.03)
-
-
 def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
     content = fitted(trials={str(k): {} for k in range(13)})
@@ -132,12 +90,6 @@ def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_
     draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
-
-
-def test_a_vine_of_another_length_is_the_same_vine_for_b() -> None:
-    inputs = predictive_inputs(vine_of_the_fit(length_mm=500), None, fit_numbers(fitted(), "a"))
-    assert inputs.medians[B] == pytest.approx(6.0)
-    assert not inputs.notes
 
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess() -> None:
@@ -153,33 +105,11 @@ def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> Non
     assert predictive_inputs(vine_of_the_fit(yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
 
 
-def test_numbers_that_a_fit_left_open_are_named() -> None:
-    content = fitted()
-    content["covariance"][1] = [*content["covariance"][1][:1], None, None]
-    inputs = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "results/a"))
-    assert any("does not determine n" in words for words in inputs.notes)
-    assert np.ptp(inputs.draw(10, 1)[N]) == 0
-
-
-def test_a_refused_fit_and_one_of_falling_bodies_cannot_be_believed() -> None:
-    with pytest.raises(FitError, match="no fit to predict from: too few trials"):
-        fit_numbers(fitted(refused="too few trials"), "results/a")
-    falling = fitted(model=["gravity"], numbers=[number("gravity.g", "", 9.8, 0.1)], covariance=[[0.01]])
-    with pytest.raises(FitError, match="not a fit of everting vines"):
-        predictive_inputs(trial(), None, fit_numbers(falling, "results/a"))
-
-
 def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common() -> None:
     one, other = predictive_inputs(trial()), predictive_inputs(trial(length_mm=300))
     assert np.array_equal(one.draw(50, 7)[B], one.draw(50, 7)[B])
     assert np.array_equal(one.draw(50, 7)[N], other.draw(50, 7)[N])
     assert not np.array_equal(one.draw(50, 7, ["guess of B"])[B], other.draw(50, 7, ["guess of B"])[B])
-
-
-def test_no_draw_leaves_what_physics_allows() -> None:
-    draws = predictive_inputs(trial(), StatedValues(n=0.01, n_error=0.5)).draw(2000, 1)
-    assert (draws[N] >= 0).all()
-    assert (draws[YIELD] >= 0).all()
 
 
 def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
@@ -203,29 +133,3 @@ def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
 )
 def test_sizes_of_effects_are_numbers_or_ranges(text: str, sizes: dict[str, Size]) -> None:
     assert read_sizes(text)[1] == sizes
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("air_drg", "Did you mean 'air_drag'"),
-        ("air_drag=fast", "write a number, or a range"),
-        ("air_drag=1:2:3", "write a number, or a range"),
-        ("air_drag=300", "between 0 and 200"),
-        ("air_drag=1,2", "has 1 parameters, not 2"),
-    ],
-)
-def test_sizes_that_are_none_are_refused_in_a_sentence(text: str, words: str) -> None:
-    with pytest.raises(EffectError, match=words):
-        read_sizes(text)
-
-
-def test_a_range_is_drawn_evenly() -> None:
-    said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=0.5:1.5")[1])
-    draws = predictive_inputs(trial(), said).draw(20_000, 2)["air_drag.C_D"]
-    assert (draws.min(), draws.max(), np.mean(draws)) == pytest.approx((0.5, 1.5, 1.0), abs=0.01)
-
-
-def test_sizes_of_vines_are_read_from_their_names() -> None:
-    assert size_of("2.5mm-50um-12.5mm") == pytest.approx((2.5e-3, 50e-6))
-    assert size_of("ball") is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.planned import planned_trial
 from vinetrack.planning.fastest_vine import (
     GAMMAS,
-    chamber_by_gauge,
     chamber_for,
-    chambers,
     final_with,
     gauge_loss,
     supplied_chamber,
@@ -66,19 +63,6 @@ def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma: float, loss: floa
     assert gauge_loss(28e3, 1e-4, volume, gamma, ATM) == pytest.approx(loss)
 
 
-def test_a_chamber_by_hand() -> None:
-    # 62 kPa, 5 %: (163.325 − 3.1)/163.325 = 0.98102; 0.98102/0.01898 = 51.69 times what is swept.
-    assert chamber_for(62e3, 1.0, 0.05, 1.0, ATM) == pytest.approx(51.69, rel=1e-3)
-    assert chamber_by_gauge(1.0, 0.05) == pytest.approx(19.0)
-
-
-def test_the_gauge_rule_is_too_small_and_fast_growth_needs_most() -> None:
-    asked, slow, fast, naive = chambers(trial(), 0.05)
-    assert asked.volume_m3 == pytest.approx(3.7e-3)
-    assert naive.volume_m3 < slow.volume_m3 < fast.volume_m3
-    assert min(naive.losses.values()) > 0.15
-
-
 def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
     inputs = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
     model = make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
@@ -89,22 +73,9 @@ def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
     assert final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
 
 
-def test_a_supply_that_is_shut_is_a_closed_chamber() -> None:
-    inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    closed = gauge_loss(28e3, swept_m3(inputs.trial), 3.7e-3, 1.4, ATM)
-    assert supplied_loss(inputs, 3.7e-3, 1e4, 1.4) == pytest.approx(closed, rel=0.01)
-
-
 def test_a_quick_supply_saves_a_chamber() -> None:
     inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
     closed = chamber_for(28e3, swept_m3(inputs.trial), 0.05, 1.4, ATM)
     volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
     assert volumes[0] < volumes[1] < closed
     assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
-
-
-def test_a_law_of_the_chamber_in_the_model_gives_way_to_the_one_asked_about() -> None:
-    plain = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    with_law = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37, effects=("reservoir_depletion",)))
-    small = replace(plain, trial=replace(plain.trial, chamber_m3=1e-3))
-    assert final_with(with_law, 3.7e-3, 1.0, 0.95) == pytest.approx(final_with(small, 3.7e-3, 1.0, 0.95))
