@@ -28,9 +28,8 @@ from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.schema import with_names
 from vinetrack.laboratory.tracks import GroundTruth, campaign, damping_values, grow, isometric_vine
-from vinetrack.planning.input_sources import predictive_inputs
 from vinetrack.planning.prediction import run
-from vinetrack.planning.predictive_inputs import numbers_of
+from vinetrack.planning.predictive_inputs import numbers_of, predictive_inputs
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
 SAMPLES = 400

@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "FitError": "vinetrack.inference.fit",
     "Model": "vinetrack.dynamics.model",
-    "StatedValues": "vinetrack.planning.input_sources",
+    "StatedValues": "vinetrack.planning.predictive_inputs",
     "base_model": "vinetrack.dynamics.model",
     "compare": "vinetrack.interface.calls",
     "diagnose": "vinetrack.interface.calls",
@@ -34,7 +34,7 @@ _HOMES = {
     "power": "vinetrack.interface.calls",
     "predict": "vinetrack.inference.fit",
     "predict_vine": "vinetrack.planning.prediction",
-    "predictive_inputs": "vinetrack.planning.input_sources",
+    "predictive_inputs": "vinetrack.planning.predictive_inputs",
     "read_experiment": "vinetrack.experiment.folder",
     "refit": "vinetrack.inference.fit",
     "simulate": "vinetrack.dynamics.simulate",

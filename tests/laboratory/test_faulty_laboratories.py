@@ -19,7 +19,7 @@ from hidden.laboratory_folder import write_experiment, write_truth
 from hidden.laboratory_kinds import BARE
 from hidden.laboratory_rows import ROWS, campaign
 from hidden.motion import AIR, G, Physics, Tube, follow
-from hidden.shots import Camera, Laboratory, Shot, careful, film, plan, seen
+from hidden.shots import Camera, Laboratory, careful, film, plan, seen
 from hidden.slack import follow_slack
 from hidden.verdicts import Answer, Should, judge
 from hidden.visibility import visible_sigma
@@ -31,8 +31,6 @@ SEED = 20_900
 FEW = (18, 24)
 TUBE = Tube(pressure=20e3, yield_pressure=3e3, diameter=0.024, thickness=2e-4, length=0.28, payload=0.0, cosine=0.0)
 B, N = 6.44, 0.37
-
-
 
 
 def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.Generator]:

@@ -7,7 +7,6 @@ import math
 import pandas as pd
 import pytest
 
-from vinetrack.core.records import Trial
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.summary import CONDITION_COLUMNS
@@ -161,8 +160,6 @@ def test_an_experiment_without_any_of_it_leaves_ours_blank() -> None:
     rows = table(nothing())
     assert set(rows.index) == set(table(found()).index)
     assert rows["ours"].isna().all()
-
-
 
 
 EVERY_NUMBER = {

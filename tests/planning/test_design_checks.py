@@ -8,8 +8,8 @@ import pytest
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 from vinetrack.planning.prediction import VinePrediction, design_checks, neglected, predict_vine, typical_sizes
+from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
 SAFE = {
     "diameter_mm": "18",

@@ -10,8 +10,8 @@ import pytest
 
 from vinetrack.experiment.planned import planned_trial
 from vinetrack.planning.fastest_vine import Room, fastest, final_speeds
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 from vinetrack.planning.prediction import predict_vine
+from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
 EXACT = StatedValues(n=0.37, spreads=(0.0, 0.0))
 

@@ -12,7 +12,6 @@ from scipy.integrate import solve_ivp
 from vinetrack.core import published
 from vinetrack.core.records import Trial
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 from vinetrack.planning.prediction import (
     EDGE,
     LEAST_TENSION,
@@ -22,7 +21,7 @@ from vinetrack.planning.prediction import (
     predict_vine,
     run,
 )
-from vinetrack.planning.predictive_inputs import BAND, YIELD, damping_prior
+from vinetrack.planning.predictive_inputs import BAND, YIELD, StatedValues, damping_prior, predictive_inputs
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
 EXACT = {"yield_pressure_sigma_kPa": "0"}

@@ -12,8 +12,15 @@ import pytest
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.experiment.planned import planned_trial
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.predictive_inputs import PRESSURE, YIELD, Size, fit_numbers, read_sizes
+from vinetrack.planning.predictive_inputs import (
+    PRESSURE,
+    YIELD,
+    Size,
+    StatedValues,
+    fit_numbers,
+    predictive_inputs,
+    read_sizes,
+)
 
 B, N = "eversion_damping.B", "eversion_damping.n"
 VINE = "24mm-200um-280mm"

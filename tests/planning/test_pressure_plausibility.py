@@ -8,8 +8,7 @@ import pytest
 
 from vinetrack.core import published
 from vinetrack.core.records import Trial
-from vinetrack.planning.predictive_inputs import damping_prior
-from vinetrack.planning.pressure_plausibility import pressure_problems
+from vinetrack.planning.predictive_inputs import damping_prior, pressure_problems
 
 PSI = 6.894757
 

@@ -20,7 +20,7 @@ from vinetrack.planning.fastest_vine import (
     supplied_loss,
     swept_m3,
 )
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
+from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
 ATM = 101_325.0
 

@@ -34,7 +34,6 @@ from vinetrack.narrative.power_text import (
     trial_entries,
 )
 from vinetrack.narrative.verdict_text import joined
-from vinetrack.planning.design_simulation import DesignProblem, expected_rises, mean_separation, simulated_rises
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
     OTHER_RIG,
@@ -49,6 +48,7 @@ from vinetrack.planning.discriminating_design import (
     sampling_of,
     worth,
 )
+from vinetrack.planning.simulated_campaigns import DesignProblem, expected_rises, mean_separation, simulated_rises
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
 

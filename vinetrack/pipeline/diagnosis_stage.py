@@ -408,7 +408,7 @@ def sheet_contradictions(results: Results, pairs: Sequence[tuple[Trial, Track]])
     """Return a sentence for each column of the sheet that recordings or speeds contradict. Returns by name of the
     column.
     """
-    from vinetrack.planning.pressure_plausibility import pressure_problems
+    from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
 
     noted: dict[str, list[tuple[str, str]]] = {}

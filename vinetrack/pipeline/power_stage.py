@@ -197,7 +197,7 @@ def _planned_campaign(request: PowerRequest, planned: PlannedTrials) -> PowerCam
     """Return the campaign of planned trials; B, n and yield pressure are stated, published, or from scaling laws."""
     from vinetrack.effects import own_effects
     from vinetrack.inference.parameters import DAMPING, EXPONENT
-    from vinetrack.planning.input_sources import StatedValues, predictive_inputs
+    from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
 
     folder, settings = planned.folder or Path(), planned.settings
     user_effects = dict(own_effects([folder / path for path in settings.effects]))

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.effects import Effect
     from vinetrack.figures.prediction_figures import PredictionPicture
-    from vinetrack.planning.input_sources import StatedValues
     from vinetrack.planning.prediction import Neglected, Quantity, VinePrediction
-    from vinetrack.planning.predictive_inputs import FitNumbers, Input, PredictiveInputs
+    from vinetrack.planning.predictive_inputs import FitNumbers, Input, PredictiveInputs, StatedValues
 
 
 # ------------------------------------------------------------------------------
@@ -109,8 +108,7 @@ def read_basis(request: PredictionRequest, needed: Sequence[str] | None = None) 
     """Read the sheet or the options, the fit, and the requested effects."""
     from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
     from vinetrack.experiment.settings import ExperimentSettings
-    from vinetrack.planning.input_sources import StatedValues
-    from vinetrack.planning.predictive_inputs import read_sizes
+    from vinetrack.planning.predictive_inputs import StatedValues, read_sizes
 
     if request.sheet is not None:
         planned = planned_sheet(request.sheet)
@@ -191,7 +189,7 @@ def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Eff
 def inputs_of(basis: PredictionBasis) -> list[PredictiveInputs]:
     """Return the predictive inputs of every trial."""
     from vinetrack.inference.fit_data import FitError
-    from vinetrack.planning.input_sources import predictive_inputs
+    from vinetrack.planning.predictive_inputs import predictive_inputs
 
     try:
         return [predictive_inputs(trial, basis.stated, basis.fit) for trial in basis.planned.trials]

@@ -62,7 +62,7 @@ def check_folder(folder: Path) -> CheckReport:
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.pipeline.workflow import path_problems
-    from vinetrack.planning.pressure_plausibility import pressure_problems
+    from vinetrack.planning.predictive_inputs import pressure_problems
     from vinetrack.tracks.frame_timing import mean_speed
     from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.tracks.position_noise import common_rounding_noise

@@ -22,7 +22,6 @@ from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.experiment.schema import with_names
-from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 from vinetrack.planning.prediction import (
     LONGEST_S,
     POINTS,
@@ -32,7 +31,14 @@ from vinetrack.planning.prediction import (
     run,
     told_by_payload,
 )
-from vinetrack.planning.predictive_inputs import BURST_STRESS_PA, FitNumbers, PredictiveInputs, burst_pressure_Pa
+from vinetrack.planning.predictive_inputs import (
+    BURST_STRESS_PA,
+    FitNumbers,
+    PredictiveInputs,
+    StatedValues,
+    burst_pressure_Pa,
+    predictive_inputs,
+)
 
 GRID = (17, 9)  # Numbers of diameters and lengths in each round (chosen)
 
