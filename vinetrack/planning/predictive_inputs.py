@@ -18,7 +18,7 @@ import numpy as np
 
 from vinetrack.core import published
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import convert, number
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError
@@ -826,8 +826,6 @@ def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield
         return math.nan
     damping = drive_N / (trial.travel_ratio * mean_speed_m_s) ** published.EXPONENT
     return damping / damping_prior(trial.diameter_m, trial.thickness_m)
-
-
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
