@@ -55,7 +55,7 @@ BUDGETS = {
     "kinematics": (2278, 6, 42),
     "laboratory": (2547, 10, 39),
     "narrative": (1809, 5, 32),
-    "pages": (4462, 14, 70),
+    "pages": (4454, 12, 70),
     "paper": (1369, 4, 21),
     "pipeline": (5305, 15, 70),
     "planning": (3522, 11, 84),

@@ -8,7 +8,7 @@ from typing import Any
 
 from bokeh.document import Document
 
-from vinetrack.pages.fitting import BackgroundFit
+from vinetrack.pages.campaign import BackgroundFit
 from vinetrack.pages.page import Page
 
 

@@ -12,17 +12,19 @@ import pytest
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import Step, Watch
-from vinetrack.pages.campaign import Campaign, choice_in_use, overall_m
-from vinetrack.pages.fitting import (
+from vinetrack.pages.campaign import (
     FAULT,
     BackgroundFit,
+    Campaign,
     FitJob,
     FitProgress,
     Fitted,
+    choice_in_use,
     correlated_pairs_text,
     first_fit,
     fit_choice,
     likelihood_change_text,
+    overall_m,
 )
 
 GAMMA = "reservoir_depletion.gamma"
@@ -48,7 +50,7 @@ def test_other_starts_are_tried_if_the_first_does_not_reach_the_known_fit(
         seen.append(thorough)
         return first.fit
 
-    monkeypatch.setattr("vinetrack.pages.fitting.fit", fitted)
+    monkeypatch.setattr("vinetrack.pages.campaign.fit", fitted)
     first_fit(replace(campaign, log_likelihood=known), choice_in_use(campaign))
     assert seen == asked
 

@@ -12,9 +12,8 @@ from explorer_campaign import SETTINGS, write_diagnosis
 from page_browser import Browser
 
 from vinetrack.experiment.settings import read_experiment_settings
-from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.campaign import BackgroundFit, Campaign
 from vinetrack.pages.explorer_server import open_campaign
-from vinetrack.pages.fitting import BackgroundFit
 
 GAMMA = "size_reservoir_depletion.gamma"
 

@@ -17,9 +17,8 @@ from page_browser import Browser
 from vinetrack.effects import EffectError, remember
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.pages import controls
-from vinetrack.pages.campaign import Campaign
+from vinetrack.pages.campaign import BackgroundFit, Campaign
 from vinetrack.pages.explorer_server import open_campaign
-from vinetrack.pages.fitting import BackgroundFit
 from vinetrack.pipeline.effects_stage import WrittenProposal
 from vinetrack.results.folder_layout import ResultsError
 

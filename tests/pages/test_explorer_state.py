@@ -19,13 +19,14 @@ from vinetrack.laboratory.tracks import grow, read_ground_truth
 from vinetrack.pages.campaign import (
     Campaign,
     choice_in_use,
+    commands,
     condition_labels,
+    model_text,
     overall_m,
     predict_choice,
     slider_range,
 )
 from vinetrack.pages.explorer_server import open_campaign
-from vinetrack.pages.fitting import commands, model_text
 from vinetrack.pages.plots import (
     error_bars,
     measured_lines,

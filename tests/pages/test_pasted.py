@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vinetrack.pages.pasted import SHARED_ROW, place_block, read_block
+from vinetrack.pages.draft_files import SHARED_ROW, place_block, read_block
 
 COLUMNS = ["capture_fps", "diameter_mm", "pressure_kPa", "payload_g"]
 ROWS = [

@@ -18,8 +18,8 @@ from page_browser import Browser
 
 from vinetrack.diagnosis.ladder import compare
 from vinetrack.inference.fit_result import Fit
+from vinetrack.pages.campaign import BackgroundFit
 from vinetrack.pages.explorer_server import open_campaign
-from vinetrack.pages.fitting import BackgroundFit
 
 EFFECT = "tail_friction"
 SIZE = f"size_{EFFECT}.mu_w"

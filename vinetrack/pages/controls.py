@@ -27,16 +27,20 @@ from vinetrack.core.problems import ExperimentError, UserError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.effects import Effect, load_effect
 from vinetrack.pages.campaign import (
+    BackgroundFit,
     Campaign,
+    FitJob,
+    Fitted,
     ModelChoice,
     SizeControl,
     choice_in_use,
+    commands,
     is_removable,
+    model_text,
     read_campaign,
     sizes_of,
     slider_range,
 )
-from vinetrack.pages.fitting import BackgroundFit, FitJob, Fitted, commands, model_text
 from vinetrack.pages.plots import command_block, escaped, html_div, progress_bar, stylesheet
 from vinetrack.pipeline.effects_stage import WrittenProposal, propose_effect, save_model
 

@@ -24,7 +24,7 @@ from vinetrack.core.local_page import (
     serve_on_free_port,
     stop_on_signals,
 )
-from vinetrack.pages.fitting import BackgroundFit
+from vinetrack.pages.campaign import BackgroundFit
 
 if TYPE_CHECKING:
     from vinetrack.pages.campaign import Campaign

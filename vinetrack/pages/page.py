@@ -12,10 +12,19 @@ from bokeh.models import Button, Column, CustomJS, Row
 from vinetrack.figures.style import follows_screen
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.optimiser import Step
-from vinetrack.pages.campaign import ModelChoice, Prediction, predict_choice
+from vinetrack.pages.campaign import (
+    BackgroundFit,
+    FitJob,
+    FitProgress,
+    Fitted,
+    ModelChoice,
+    Prediction,
+    fit_choice,
+    predict_choice,
+    with_numbers,
+)
 from vinetrack.pages.controls import EffectPanel, ProposalPanel, Reopen, SavePanel, TrialSelector
 from vinetrack.pages.film_panel import FilmPanel
-from vinetrack.pages.fitting import BackgroundFit, FitJob, FitProgress, Fitted, fit_choice, with_numbers
 from vinetrack.pages.plots import (
     Plots,
     escaped,

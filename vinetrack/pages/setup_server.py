@@ -38,13 +38,13 @@ from vinetrack.pages.draft_files import (
     draft_folder,
     files_stamp,
     open_draft,
+    place_block,
     read_draft,
     same_cells,
     shared_values,
     with_shared,
     write_draft,
 )
-from vinetrack.pages.pasted import place_block
 from vinetrack.video.frames import RecordingError
 
 # ------------------------------------------------------------------------------

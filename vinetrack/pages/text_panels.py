@@ -15,8 +15,16 @@ from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.verdict_text import estimate_text
-from vinetrack.pages.campaign import Campaign, ModelChoice, Prediction, overall_m
-from vinetrack.pages.fitting import Fitted, correlated_pairs_text, likelihood_change_text, model_text
+from vinetrack.pages.campaign import (
+    Campaign,
+    Fitted,
+    ModelChoice,
+    Prediction,
+    correlated_pairs_text,
+    likelihood_change_text,
+    model_text,
+    overall_m,
+)
 from vinetrack.pages.plots import command_block, escaped, table, vine_colours
 from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis
 
