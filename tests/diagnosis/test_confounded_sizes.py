@@ -80,7 +80,6 @@ def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
     text = confounders_in_words(tuple(by_effect.values()))
-    assert text.startswith(" This K may be too large by up to ")
     assert f"because of linear_damping (b up to {linear.limit:.2g} N·s/m)" in text
     assert f"because of fold_inertia (η up to {fold.limit:.2g})" in text
 

@@ -64,11 +64,12 @@ def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
     ],
 )
 def test_a_weight_shared_with_a_richer_form_is_said_to_be(others: tuple[str, ...], words: str) -> None:
-    from vinetrack.diagnosis.result import MISSING, REFITTED, Candidate, Diagnosis, Round, limit_reason
+    from vinetrack.diagnosis.remarks import remark
+    from vinetrack.diagnosis.result import MISSING, REFITTED, Candidate, Diagnosis, Round
     from vinetrack.narrative.diagnosis_text import diagnosis_text
 
     found = Candidate("leak", "physical", REFITTED, 80.0, 8.9, in_answer_set=True, posterior_weight=0.5)
-    reason = f"{limit_reason('leak')} and fits no better"
+    reason = remark("contains_and_fits_no_better", name="leak")
     richer = [Candidate(name, "physical", REFITTED, 80.1, 8.9, reason=reason, posterior_weight=0.5) for name in others]
     step = Round(("gravity",), MISSING, ("leak",), (found, *richer), "")
     lines = diagnosis_text(Diagnosis((step,), ("leak",), "")).splitlines()

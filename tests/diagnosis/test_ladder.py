@@ -164,7 +164,11 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
     table = ladder([found], [""])
     assert len(left_out(found).not_predicted) == 3
     assert math.isfinite(table["rms_left_out_m"].iloc[0])
-    assert any("left-out conditions is without 3 trials" in note and "24mm" in note for note in table.attrs["notes"])
+    assert next((note.code, note.facts["left_out"], note.facts["count"]) for note in table.attrs["notes"]) == (
+        "left_out_error_without",
+        "conditions",
+        3,
+    )
     # The reader sees an error in sample of all trials beside one without them: a diagnosis says so.
     told = diagnose._with_ladder(Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
     assert told.notes == tuple(table.attrs["notes"])

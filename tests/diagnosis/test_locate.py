@@ -63,9 +63,6 @@ def test_an_emptying_chamber_makes_it_fail_and_the_words_say_where(depleting: Fa
     worst = depleting.by_condition.iloc[0]
     assert worst["rms_m"] == depleting.by_condition["rms_m"].max()
     assert depleting.by_condition["z"].max() > 3.5
-    first = depleting.sentences()[0]
-    assert first.startswith(f"The model fails most at {worst['pressure_Pa'] / 1e3:.3g} kPa ({worst['vine']})")
-    assert "where replicates scatter by" in first
     assert any("B" in said and "pressure" in said for said in depleting.sentences()[1:])
 
 
@@ -95,7 +92,6 @@ def test_a_misfit_of_one_condition_is_found_there_with_its_size_and_sign() -> No
     there = found.along_position[found.along_position["condition"] == chosen]
     best = there.loc[there["mean_residual_m"].idxmax()]
     assert 0.1 < best["lead_position_m"] < 0.18
-    assert "ahead of the model" in found.sentences()[0]
 
 
 def test_single_trials_are_judged_by_the_scatter_of_the_fit() -> None:

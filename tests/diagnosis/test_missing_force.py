@@ -46,7 +46,6 @@ def test_a_rough_patch_is_found_with_its_position_and_size(patch: MissingForce) 
     assert best["explained"] > 0.9
     low, high = (float(word) for word in best["words"].split(" mm")[0].split("between ")[1].split(" and "))
     assert (low, high) == pytest.approx((120, 150), abs=2)
-    assert "acts between" in patch.sentence
     assert patch.depends_on["growth"] > 0.9 > patch.depends_on["speed"]
 
 
@@ -72,14 +71,12 @@ def test_a_friction_that_falls_with_speed_is_identified(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "stribeck", -1.5, 93))
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
     assert found.laws["amplitude_N"].iloc[0] < 0
-    assert "falls with speed" in found.sentence
     assert found.depends_on["speed"] > 0.9
 
 
 def test_a_force_that_grows_with_time_is_distinguished_from_one_that_grows_with_travel(tmp_path: Path) -> None:
     found = laws_of(fitted(tmp_path, "growing", -0.3, 94))
     assert found.laws["law"].iloc[0] == "time"
-    assert "grows in proportion to time" in found.sentence
     assert found.depends_on["time"] > 0.95
 
 

@@ -127,12 +127,17 @@ def reeled() -> tuple[Pairs, list[Fit]]:
     return pairs, fits_of(pairs, "reservoir_depletion", "tail_friction")
 
 
+def measured(found: NextExperiment) -> set[str]:
+    """Effects about which a measurement would decide."""
+    return {effect.name for effect in found.measurement.facts["effects"]}
+
+
 def test_another_connector_separates_drag_from_inlet_loss_without_a_new_vine(advised: NextExperiment) -> None:
     assert not any(trial["new_vine"] for trial in advised.trials)
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
     assert advised.separation_sigma["air_drag | inlet_loss"] > 8
-    assert "an inlet of" in advised.text
+    assert advised.advice.code == "trials_to_make"
 
 
 def test_the_predicted_separation_agrees_with_the_simulated_one(advised: NextExperiment) -> None:
@@ -155,7 +160,6 @@ def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
     pairs, fits = dragged
     found = next_experiment(fits, Limits(inlet_mm=(8.0,), trials=5))
     assert any(trial["new_vine"] for trial in found.trials)
-    assert "measure its yield pressure" in found.text
     new = grown(as_trials(found, pairs[0][0]), 4102, {"air_drag.C_D": 60.0}, 1e-4, off=1.15)
     predicted = found.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
     assert predicted > 5
@@ -169,8 +173,8 @@ def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_separate_
     found = next_experiment(dragged[1], limits)
     assert found.trials == ()
     assert found.separation_sigma["air_drag | inlet_loss"] < 3
-    assert "second gauge behind the connector" in str(found.calibration)
-    assert found.text.startswith("No trials within `limits` separate the tied hypotheses by 3 σ")
+    assert found.advice.code == "no_trials_separate"
+    assert measured(found) == {"air_drag", "inlet_loss"}
 
 
 def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
@@ -211,35 +215,33 @@ def test_recording_the_pressure_can_separate_depletion_from_friction(reeled: tup
         reeled[1], Limits(trials=1, chamber_l=(3.7,), pressure_kPa=(28.0, 28.0), payload_g=(0.0, 0.0), new_vines=False)
     )
     assert found.trials == ()
-    assert "Record the pressure at the vine during growth" in str(found.calibration)
-    assert "spring balance" in str(found.calibration)
+    assert found.measurement.facts["trace_decides"]
+    assert "tail_friction" in measured(found)
 
 
 def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()
-    assert "ruler" in str(found.calibration)
-    assert "strobe" in str(found.calibration)
-    assert found.text.startswith("Measure before making more trials: length_scale and time_base")
+    assert measured(found) == {"length_scale", "time_base"}
+    assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale", "time_base"])
 
 
 def test_a_measurement_error_tied_with_no_effect_calls_for_a_measurement(dragged: tuple[Pairs, list[Fit]]) -> None:
     (scaled,) = fits_of(dragged[0], "length_scale")
     plain = vt.refit(scaled, vt.base_model())
-    text = next_experiment([plain, scaled]).text
-    assert text.startswith("Measure before making more trials: length_scale is an error of measurement. length_scale:")
+    found = next_experiment([plain, scaled])
+    assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale"])
 
 
 def test_a_measurement_error_tied_with_physics_may_be_measured_instead(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "air_drag", "length_scale"), Limits(trials=2, new_vines=False))
-    assert "a ruler beside the vine" in str(found.calibration)
-    assert "air_drag:" not in str(found.calibration)
+    assert measured(found) == {"length_scale"}
 
 
 def test_the_text_states_that_no_trial_is_possible(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(dragged[1], Limits(pressure_kPa=(0.5, 1.0), payload_g=(0.0, 0.0)))
     assert found.trials == ()
-    assert found.text.startswith("No trial within the limits can be made and simulated.")
+    assert found.advice.code == "no_feasible_trial"
 
 
 def test_the_same_seed_gives_the_same_advice(dragged: tuple[Pairs, list[Fit]]) -> None:

@@ -14,6 +14,7 @@ import vinetrack.inference.fit
 from vinetrack.diagnosis import candidate_fits
 from vinetrack.diagnosis.candidate_fits import SubsetFitter, full_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+from vinetrack.diagnosis.remarks import Remark
 from vinetrack.effects import find_effect
 from vinetrack.inference.parameters import YIELD_PRESSURE
 from vinetrack.inference.solving import solve_onward
@@ -78,7 +79,7 @@ def test_a_rival_that_ends_higher_from_where_the_best_ended_is_kept(
         fit: Any = SimpleNamespace(
             log_likelihood=log_likelihood, predictor=None, solution=None, model=SimpleNamespace(values={})
         )
-        return LikelihoodRatio((find_effect(name),), fit, 0.0, 0.0, plausible=True, reason="")
+        return LikelihoodRatio((find_effect(name),), fit, 0.0, 0.0, plausible=True, reason=Remark())
 
     best, rival = ratio("leak", -100.0), ratio("air_drag", -105.0)
     refitted = SimpleNamespace(log_likelihood=-105.0 + gained)

@@ -13,6 +13,7 @@ from scipy.stats import chi2, norm
 from vinetrack.diagnosis import effect_sets
 from vinetrack.diagnosis.effect_sets import EffectSets
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, in_sigmas, sizes_of
+from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.score_test import FamilyTest
 from vinetrack.effects import find_effect
 
@@ -25,7 +26,7 @@ def of(
 ) -> LikelihoodRatio:
     fit: Any = SimpleNamespace(log_likelihood=log_likelihood, model=(), numbers=numbers)
     effects = tuple(find_effect(name) for name in names)
-    return LikelihoodRatio(effects, fit, 0.0, 0.0, plausible=True, reason="", inflation=inflation)
+    return LikelihoodRatio(effects, fit, 0.0, 0.0, plausible=True, reason=Remark(), inflation=inflation)
 
 
 def sets_of(known: list[LikelihoodRatio], thresholds: Mapping[str, float] | None = None) -> EffectSets:
@@ -56,9 +57,9 @@ def test_each_member_of_three_is_worth_six_standard_deviations_beside_the_others
     assert sets.member_sigmas(triple, triple.effects[2]) == pytest.approx(worth)
     assert bool(sets.superfluous(triple)) != enough
     if not enough:
-        assert f"tail_friction reaches {worth:.1f} σ given the others, and 6.0 σ are required" in sets.superfluous(
-            triple
-        )
+        told = sets.superfluous(triple)
+        assert (told.code, told.facts["effect"]) == ("too_weak_in_set", "tail_friction")
+        assert (told.facts["sigmas"], told.facts["required"]) == (pytest.approx(worth), 6.0)
 
 
 def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely() -> None:
@@ -70,7 +71,7 @@ def test_a_member_is_worth_half_where_trials_scatter_twice_as_widely() -> None:
 def test_a_member_that_is_tried_in_many_shapes_is_asked_for_its_own_threshold() -> None:
     triple = of(NAMES, TRIPLE)
     assert not sets_of(pairs(6.5), {"tail_friction": 6.4}).superfluous(triple)
-    assert "6.6 σ are required" in sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple)
+    assert sets_of(pairs(6.5), {"tail_friction": 6.6}).superfluous(triple).facts["required"] == 6.6
 
 
 @pytest.mark.parametrize(("gain", "better"), [(0.0, False), (4.9, False), (5.1, True)])

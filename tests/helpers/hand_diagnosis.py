@@ -38,12 +38,21 @@ def candidate(effect: str, delta_chi2: float | None, **changes: Any) -> dict[str
     return row | changes
 
 
+IMPLAUSIBLE = {"code": "implausible_size", "symbol": "1/τ", "value": 9.0, "unit": "1/s", "low": 0.0, "high": 3.0}
+
+
 def ranking(*answers: str, kind: str = "physical") -> list[dict[str, Any]]:
     rows = [candidate(name, 400.0 - i, in_answer_set=True, kind=kind) for i, name in enumerate(answers)]
     rows += [
-        candidate("leak", 350.0, plausible=False, reason="needs more gas than there is"),
+        candidate("leak", 350.0, plausible=False, reason_code=IMPLAUSIBLE),
         candidate("time_base", 25.0, kind="measurement", status="screened", numbers=[], largest={"tau": 3e-3}),
-        candidate("payload_drag", None, status="not testable here", numbers=[], reason="no trial has a payload"),
+        candidate(
+            "payload_drag",
+            None,
+            status="not testable here",
+            numbers=[],
+            reason_code={"code": "column_blank", "column": "payload_g"},
+        ),
     ]
     return rows
 

@@ -173,7 +173,7 @@ def test_the_most_significant_candidate_is_chosen_by_score_not_by_a_gain_with_th
 def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() -> None:
     fact = facts(diagnosis("unexplained"), None)[0]
     assert (fact.question, fact.answer) == ("Nearest candidate", "leak")
-    assert fact.note == "19 σ better, but needs more gas than there is"
+    assert fact.note == "19 σ better, but it would need 1/τ = 9 1/s, and 0 to 3 is plausible"
 
 
 def test_upper_limits_are_in_the_displayed_unit() -> None:
@@ -191,7 +191,7 @@ def test_upper_limits_are_in_the_displayed_unit() -> None:
 def test_candidates_that_cannot_be_tested_here_are_listed_with_the_reason() -> None:
     html = shown(diagnosis())
     assert "Not testable here: 1 effect" in html
-    assert "payload drag: no trial has a payload" in html
+    assert "payload drag: it needs `payload_g`, which is blank" in html
 
 
 def test_the_ranking_has_every_candidate_with_its_numbers() -> None:
@@ -199,7 +199,11 @@ def test_the_ranking_has_every_candidate_with_its_numbers() -> None:
     assert section is not None
     first = section["rounds"][0]["table"].rows
     assert [row[0] for row in first] == ["● reservoir depletion", "leak", "time base"]
-    assert first[1][4:] == ("k = 0.00200 ± 0.00010 kPa", "fitted", "not plausible; needs more gas than there is")
+    assert first[1][4:] == (
+        "k = 0.00200 ± 0.00010 kPa",
+        "fitted",
+        "not plausible; it would need 1/τ = 9 1/s, and 0 to 3 is plausible",
+    )
     assert first[2][5] == "predicted"
     assert len(section["rounds"]) == 2
 

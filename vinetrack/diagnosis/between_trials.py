@@ -29,6 +29,7 @@ from vinetrack.diagnosis.between_gain import (
     with_trace_errors,
 )
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,
@@ -373,7 +374,7 @@ def _fitted(before: Fit, difference: Difference) -> Fit | None:
 
 
 def between_candidates(
-    fitted: Sequence[LikelihoodRatio], answer: Sequence[str], rejected: Mapping[str, str]
+    fitted: Sequence[LikelihoodRatio], answer: Sequence[str], rejected: Mapping[str, Remark]
 ) -> list[Candidate]:
     """Rows of the ranking of candidates for the differences that were fitted."""
     return [

@@ -21,6 +21,7 @@ from vinetrack.diagnosis.ladder import candidates_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import Power, PowerInput, Rate, SimulatedRates
+from vinetrack.diagnosis.remarks import Remark
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import SimulationError
@@ -109,7 +110,7 @@ def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> Campa
     )
 
 
-def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
+def planned_tests(design: CampaignDesign) -> tuple[MisfitTests, dict[str, Remark]]:
     """Misfit tests of a noise-free campaign with all candidates, under the noise and scatter of its design. Returns
     tests (its scores are zero but for rounding; its information is what the campaign would have), not_testable (reasons
     by name of the candidates that cannot act with this sheet).

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.dynamics.model import Model, check_needs, stated
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect, EffectError, Parameter
@@ -34,13 +35,8 @@ THRESHOLD_AMPLITUDES = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
 RANGE_SHARE_BESIDE_SLIP = 0.5
 
 # Columns that only a tube has, and what an effect that needs them acts on
-TUBE_ONLY_COLUMNS = {
-    "length_mm": "a tube",
-    "thickness_um": "film",
-    "chamber_l": "the gas of a chamber",
-    "inlet_mm": "the gas of a chamber",
-    "yield_pressure_kPa": "a tube under pressure",
-}
+COLUMN_BLANK, COLUMNS_PARTLY_BLANK = "column_blank", "columns_partly_blank"  # Codes of reasons
+TUBE_ONLY_COLUMNS = ("chamber_l", "inlet_mm", "yield_pressure_kPa")
 
 
 @dataclass(frozen=True)
@@ -68,34 +64,32 @@ class CandidateShape:
         return self.effect.parameters[0]
 
 
-def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
+def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, Remark]]:
     """Candidates that these trials can test, and for the others the reason why not. Returns testable, reasons (why each
     of the others cannot be tested, by name).
     """
-    can_act, reasons = [], {}
+    can_act: list[Effect] = []
+    reasons: dict[str, Remark] = {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
         if no_tube and (absent := [column for column in effect.needs if column in TUBE_ONLY_COLUMNS]):
-            reasons[effect.name] = (
-                f"it acts on {TUBE_ONLY_COLUMNS[absent[0]]}, and a body that moves as a whole has none"
-            )
+            reasons[effect.name] = remark("no_tube", column=absent[0])
             continue
         if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
-            reasons[effect.name] = "the measured pressure already includes it"
+            reasons[effect.name] = remark("in_measured_pressure")
             continue
         if "trace_time" in effect.functions and all(trial_data.trace is None for trial_data in data):
-            reasons[effect.name] = "it needs a pressure measured during growth, and no trial has one"
+            reasons[effect.name] = remark("no_measured_pressure")
             continue
         if absent := [
             column for column in effect.needs if not any(stated(column, trial_data.trial) for trial_data in data)
         ]:
-            reasons[effect.name] = f"it needs `{absent[0]}`, which is blank or zero for every trial"
+            reasons[effect.name] = remark(COLUMN_BLANK, column=absent[0])
             continue
         try:
             check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
         except EffectError:
-            blank = " and ".join(f"`{column}`" for column in effect.needs)
-            reasons[effect.name] = f"it needs {blank}, which the sheet leaves blank for some trials"
+            reasons[effect.name] = remark(COLUMNS_PARTLY_BLANK, columns=list(effect.needs))
             continue
         can_act.append(effect)
     return tuple(can_act), reasons

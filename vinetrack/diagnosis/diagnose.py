@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.core.records import Track
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.between_trials import between_candidates
-from vinetrack.diagnosis.candidates import testable
+from vinetrack.diagnosis.candidates import COLUMN_BLANK, COLUMNS_PARTLY_BLANK, testable
 from vinetrack.diagnosis.ladder import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
@@ -29,11 +29,13 @@ from vinetrack.diagnosis.odd_trials import (
     with_lost_frames,
     with_odd_trials,
 )
+from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN_TRIALS,
+    CONTAINS,
     NOT_TESTABLE,
     REFITTED,
     SCREENED,
@@ -41,7 +43,6 @@ from vinetrack.diagnosis.result import (
     Candidate,
     Diagnosis,
     Round,
-    limit_reason,
 )
 from vinetrack.diagnosis.selection import TAIL_SLACK, SelectionStep, contradictions, select_effects
 from vinetrack.dynamics.model import Model, base_model, host_for, make_model
@@ -49,7 +50,6 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_text import explain, joined
 from vinetrack.tracks.position_noise import rejected_points_note
 
 if TYPE_CHECKING:
@@ -59,9 +59,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-
-NO_RESPONSE = "no trial responds to it at any plausible size"
-TOO_WEAK = "in these conditions the largest plausible size would not be detected"
 
 
 def _quiet(_: str) -> None:
@@ -116,8 +113,7 @@ def diagnose(
         result = _with_ladder(result, report)
     if ladder and result.final_verdict == ADEQUATE:
         report("looking for contradictions")
-        sentences = contradictions(result.fits, result.effects, result.ladder)
-        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {line}" for line in sentences)))
+        result = replace(result, notes=(*result.notes, *contradictions(result.fits, result.effects, result.ladder)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -145,21 +141,20 @@ def _settings(
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
-def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mapping[str, str]) -> Diagnosis:
+def _to_diagnosis(fit: Fit, steps: Sequence[SelectionStep], not_testable: Mapping[str, Remark]) -> Diagnosis:
     """Selection steps in words and tables."""
     rounds = tuple(_to_round(step, not_testable) for step in steps)
     added = tuple(step.answer_names[0] for step in steps[:-1])
     fits = (fit, *(step.tests.fit for step in steps[1:]))
     explanation = " ".join(finished.explanation for finished in rounds)
-    # Reasons that name a column of the sheet quote it.
-    lacking_columns = [name for name, reason in not_testable.items() if "`" in reason]
-    if lacking_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
-        explanation += f" Not tried, because the sheet does not state what they need: {joined(lacking_columns)}."
+    lack_columns = [name for name, why in not_testable.items() if why.code in (COLUMN_BLANK, COLUMNS_PARTLY_BLANK)]
+    if lack_columns and any(finished.verdict == UNEXPLAINED for finished in rounds):
+        explanation += " " + str(remark("not_tried", names=lack_columns))
     power = power_of(steps[-1].tests, not_testable, first_round=steps[0].tests)
     return Diagnosis(rounds=rounds, effects=added, explanation=explanation, fits=fits, power=power)
 
 
-def _to_round(step: SelectionStep, not_testable: Mapping[str, str]) -> Round:
+def _to_round(step: SelectionStep, not_testable: Mapping[str, Remark]) -> Round:
     tests = step.tests
     names, cosines = _cosines(tests)
     return Round(
@@ -167,7 +162,7 @@ def _to_round(step: SelectionStep, not_testable: Mapping[str, str]) -> Round:
         verdict=step.verdict,
         answer_set=step.answer_names,
         ranking=tuple(_ranking(step, not_testable)),
-        explanation=explain(step),
+        explanation=in_words(step),
         cosine_names=names,
         cosines=cosines,
         fit=tests.fit,
@@ -209,7 +204,7 @@ def _cosines(tests: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
     return names, matrix.tolist()
 
 
-def _ranking(step: SelectionStep, not_testable: Mapping[str, str]) -> list[Candidate]:
+def _ranking(step: SelectionStep, not_testable: Mapping[str, Remark]) -> list[Candidate]:
     tests = step.tests
     rejected = dict(step.rejected)
     singles = {hypothesis.names[0]: hypothesis for hypothesis in step.fitted if len(hypothesis.names) == 1}
@@ -220,7 +215,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, str]) -> list[Candi
     for effect in tests.effects:
         upper_limits, is_detectable = tests.upper_limits(effect)
         if effect.name in tests.sensitivities.silent:
-            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=NO_RESPONSE))
+            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=remark("no_response")))
             continue
         z, shape = tests.best_z(effect.name)
         in_answer_set = effect.name in step.answer_names
@@ -249,7 +244,7 @@ def _ranking(step: SelectionStep, not_testable: Mapping[str, str]) -> list[Candi
                 )
             )
         elif step.verdict == ADEQUATE and not is_detectable and z < tests.family.threshold(effect.name):
-            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=TOO_WEAK))
+            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=remark("too_weak_here")))
         else:
             rows.append(
                 Candidate(
@@ -289,19 +284,19 @@ def _predicted_gain(step: SelectionStep, name: str, z: float) -> float:
     return math.nan if step.tests.poorly_fitted else step.tests.predicted_gain(name)
 
 
-def _contains_answer(effect: Effect, step: SelectionStep) -> str:
+def _contains_answer(effect: Effect, step: SelectionStep) -> Remark:
     """Say that an effect contains one of the answer set: it can fit no worse, and need not be fitted."""
     contained = [name for name in effect.replaces if name in step.answer_names]
-    return limit_reason(contained[0]) if contained else ""
+    return remark(CONTAINS, name=contained[0]) if contained else Remark()
 
 
-def _subset_fit_behind(step: SelectionStep, name: str) -> str:
+def _subset_fit_behind(step: SelectionStep, name: str) -> Remark:
     """Say how far a candidate is behind the best, where it was fitted to one trial of every condition only."""
     subset_fits = step.search.subset_fits if step.search else {}
     if name not in subset_fits:
-        return ""
+        return Remark()
     behind = subset_fits[name].deviance - min(subset_fit.deviance for subset_fit in subset_fits.values())
-    return f"fitted to one trial of every condition, worse by Δχ² = {behind:.0f}" if behind > 0 else ""
+    return remark("behind_in_one_trial_each", delta_chi2=behind) if behind > 0 else Remark()
 
 
 def _finite_or_lowest(value: float) -> float:
@@ -319,7 +314,7 @@ def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
         table = ladder((*result.fits, *partial_fits), ("", *result.effects, *partial_effects), len(partial_effects))
         return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"The ladder of errors could not be computed: {error}"))
+        return replace(result, notes=(*result.notes, remark("no_ladder", error=str(error))))
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
@@ -344,7 +339,7 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     try:
         return replace(result, next_experiment=next_experiment(tied, limits).to_json())
     except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"No next experiment could be computed: {error}"))
+        return replace(result, notes=(*result.notes, remark("no_next_experiment", error=str(error))))
 
 
 def _located(result: Diagnosis, report: Report) -> Diagnosis:
@@ -355,7 +350,7 @@ def _located(result: Diagnosis, report: Report) -> Diagnosis:
     try:
         failure = locate(result.fits[0])
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"Where the model fails could not be computed: {error}"))
+        return replace(result, notes=(*result.notes, remark("not_located", error=str(error))))
     drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
     return replace(result, failure=failure, where=failure.sentences(), drift=drift)
 
@@ -368,7 +363,7 @@ def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:
     try:
         force = missing_force(result.fits[0])
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
-        return replace(result, notes=(*result.notes, f"The missing force could not be computed: {error}"))
+        return replace(result, notes=(*result.notes, remark("no_missing_force", error=str(error))))
     explanation = f"{result.explanation} {force.sentence}"
     learned = None if force.learned is None else force.learned.table
     return replace(

@@ -31,6 +31,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
     sizes_of,
 )
 from vinetrack.diagnosis.misfit_tests import SEARCH_SIGMAS, MisfitTests
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import Confounder
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.dynamics.simulate import SimulationError
@@ -154,7 +155,7 @@ class EffectSets:
         delta_chi2 = 2 * (hypothesis.fit.log_likelihood - others.fit.log_likelihood)
         return in_sigmas(max(delta_chi2, 0.0) / hypothesis.inflation, sizes_of((effect,), hypothesis.fit))
 
-    def superfluous(self, hypothesis: LikelihoodRatio) -> str:
+    def superfluous(self, hypothesis: LikelihoodRatio) -> Remark:
         """Find the first member of a set whose significance given the others is too low."""
         for effect in hypothesis.effects:
             others = frozenset(other.name for other in hypothesis.effects if other is not effect)
@@ -164,8 +165,8 @@ class EffectSets:
             if smaller is not None:
                 required = max(required, self.search.tests_after(smaller.fit).family.threshold(effect.name))
             if sigmas < required:
-                return f"{effect.name} reaches {sigmas:.1f} σ given the others, and {required:.1f} σ are required"
-        return ""
+                return remark("too_weak_in_set", effect=effect.name, sigmas=sigmas, required=required)
+        return Remark()
 
     def is_better(self, hypothesis: LikelihoodRatio, smaller: LikelihoodRatio | None = None) -> bool:
         """Whether a set is better than a smaller one by at least the threshold of its additional effect. The smaller
@@ -211,12 +212,12 @@ class EffectSets:
 # ------------------------------------------------------------------------------
 # Which hypotheses leave an adequate model: the misfit tests are repeated with each member of the answer set added.
 
-MISFIT_REMAINS = "a significant misfit remains once it is added"
+MISFIT_REMAINS = remark("misfit_remains")
 
 
 def adequate_hypotheses(
     hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
-) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
+) -> tuple[list[LikelihoodRatio], dict[str, Remark], MisfitTests | None]:
     """Test the model with each hypothesis of the answer set added, and keep those that no test rejects. A hypothesis
     that leaves a significant misfit is rejected, and no longer sets the likelihood that others are compared with.
     Returns adequate (the likeliest first; empty where every hypothesis is rejected), rejected (reason by label), after

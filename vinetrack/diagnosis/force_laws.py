@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.core.units import decimals
 from vinetrack.diagnosis.force_inversion import (
     FittedMotion,
     ForceEstimate,
@@ -26,6 +25,7 @@ from vinetrack.diagnosis.force_inversion import (
     with_model_terms,
 )
 from vinetrack.diagnosis.force_surface import SmoothForce
+from vinetrack.diagnosis.remarks import remark
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
@@ -131,36 +131,7 @@ class Law:
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
         """Describe the law with its size."""
-        if self.kind == "periodic":
-            size = f"with an amplitude of {_with_error(math.hypot(*amplitude_N), sigma_N)}"
-        else:
-            size = f"{'+' if amplitude_N[0] > 0 else ''}{_with_error(amplitude_N[0], sigma_N)}".replace("-", "−")
-        by_area = ", in proportion to the cross-section of the vine" if self.reference_area_m2 else ""
-        words = _WORDS[self.kind]
-        if self.factor:
-            words = f"{words.partition(', {size}')[0]}, times {_FACTOR_WORDS[self.factor]}, {{size}} at its largest"
-        return (
-            words.format(
-                size=size,
-                low=f"{1e3 * max(self.low, 0.0):.0f}",
-                high=f"{1e3 * self.high:.0f}",
-                scale_mm=_round(1e3 * self.scale),
-                scale_ms=_round(1e3 * self.scale),
-                scale=f"{self.scale:.2g}",
-            )
-            + by_area
-        )
-
-
-def _round(value: float) -> str:
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
-
-
-def _with_error(value_N: float, sigma_N: float) -> str:
-    if not math.isfinite(sigma_N):
-        return "any size"
-    digits = decimals(sigma_N)
-    return f"{value_N:.{digits}f} ± {sigma_N:.{digits}f} N"
+        return str(remark("law", law=self, amplitude_N=amplitude_N, sigma_N=sigma_N))
 
 
 def _patch(law: Law, motion: FittedMotion) -> Floats:
@@ -205,31 +176,6 @@ VARIABLE_OF_KIND = {
 # Kinds that peak at rest, where positions do not determine the speed: their size is stated at the lowest speed observed
 _LARGEST_AT_REST = ("inverse_speed", "falling_with_speed")
 
-_WORDS = {
-    "constant": "a constant force of {size}",
-    "position": "a force in proportion to the tail's travel x, {size} at the end",
-    "speed": "a force in proportion to the speed ẋ, {size} at the highest",
-    "speed_squared": "a force in proportion to ẋ², {size} at the highest speed",
-    "position_squared": "a force in proportion to x², {size} at the end",
-    "beyond_a_place": "a force that rises in proportion to the growth beyond {scale_mm} mm, {size} at the end",
-    "speed_cubed": "a force in proportion to ẋ³, {size} at the highest speed",
-    "beyond_a_speed": "a force in proportion to the excess of ẋ over {scale} m/s, {size} at the highest speed",
-    "squared_beyond_a_speed": (
-        "a force in proportion to the square of the excess of ẋ over {scale} m/s, {size} at the highest speed"
-    ),
-    "pressure": "a force in proportion to the pressure, {size} at the highest",
-    "time": "a force that grows in proportion to time, {size} at the end of the longest trial",
-    "inverse_speed": "a force that falls with speed as 1/ẋ, {size} at {scale} m/s and below",
-    "falling_with_speed": (
-        "a force that falls with speed, {size} at the lowest speed, by a factor of e every {scale} m/s of ẋ"
-    ),
-    "fading_in_time": "a force that decays in time, {size} at release, by a factor of e every {scale_ms} ms",
-    "fading_along": "a force that decays along the growth, {size} at the start, by a factor of e every {scale_mm} mm",
-    "patch": "a force that acts between {low} and {high} mm of growth, {size}",
-    "periodic": "a force that repeats every {scale_mm} mm of growth, {size}",
-}
-
-
 # Products in the grid (chosen)
 _PRODUCTS = {
     **dict.fromkeys(("position", "position_squared", "fading_along", "beyond_a_place"), ("speed", "pressure")),
@@ -237,8 +183,6 @@ _PRODUCTS = {
     "speed_squared": ("position", "pressure"),
     "falling_with_speed": ("pressure",),
 }
-
-_FACTOR_WORDS = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_tests
 from vinetrack.diagnosis.linear_power import effect_power, power_of, typical_shape_index
 from vinetrack.diagnosis.misfit_tests import MisfitTests
+from vinetrack.diagnosis.next_experiment import trial_entries
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials, Power
 from vinetrack.diagnosis.score_test import products_without_trial_effects, scores_of
 from vinetrack.dynamics.model import Value
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.narrative.power_text import trial_entries
 from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
 from vinetrack.planning.predictive_inputs import damping_prior
 from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES

@@ -21,6 +21,7 @@ import numpy as np
 from vinetrack.core.notebook import plot
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.replicates import Replicates, align_replicates, first_that_counts, replicates_of
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import simulate_many
@@ -332,7 +333,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     import pandas as pd
 
     rows: list[dict[str, object]] = []
-    notes: list[str] = []
+    notes: list[Remark] = []
     for enlarged, name in zip(fits, added, strict=True):
         row, remarks = _ladder_row(enlarged, name)
         row["partial"] = len(rows) >= len(fits) - partial
@@ -343,7 +344,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     return table
 
 
-def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
+def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[Remark]]:
     """The row of one model, and notes about trials that could not be predicted."""
     inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)
     floor_m, floor_sigma_m = inside.floor
@@ -357,7 +358,7 @@ def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]
         "excess_left_out_m": excess(outside.rms_m, floor_m),
         "floor_sigma_m": floor_sigma_m,
     }
-    return row, [*_notes("left-out conditions", outside), *_notes("the left-out highest pressure", highest)]
+    return row, [*_notes("conditions", outside), *_notes("highest_pressure", highest)]
 
 
 def excess(rms_m: float, floor_m: float) -> float:
@@ -436,12 +437,12 @@ def _combined(parts: Sequence[Errors]) -> Errors:
     )
 
 
-def _notes(what: str, errors: Errors) -> list[str]:
+def _notes(left_out: str, errors: Errors) -> list[Remark]:
     reasons: dict[str, int] = {}
     for reason in errors.not_predicted.values():
         reasons[reason] = reasons.get(reason, 0) + 1
     return [
-        f"The error on {what} is without {count} trial{'s' if count > 1 else ''}, unlike that in sample: {reason}"
+        remark("left_out_error_without", left_out=left_out, count=count, reason=reason)
         for reason, count in reasons.items()
     ]
 

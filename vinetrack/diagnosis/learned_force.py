@@ -42,8 +42,8 @@ from vinetrack.diagnosis.force_surface import (
     standard_error,
 )
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2
+from vinetrack.diagnosis.remarks import joined
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_text import joined
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,7 +16,8 @@ from scipy.special import gammaincc, ndtri_exp
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.between_gain import film_gain
 from vinetrack.diagnosis.candidates import is_plausible, plausible_range, slip_of
-from vinetrack.diagnosis.result import BETWEEN_TRIALS, limit_reason
+from vinetrack.diagnosis.remarks import Remark, remark
+from vinetrack.diagnosis.result import BETWEEN_TRIALS, CONTAINS_AND_FITS_NO_BETTER
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
 from vinetrack.inference.fit import refit
@@ -129,7 +130,7 @@ class LikelihoodRatio:
     delta_chi2: float
     sigma: float
     plausible: bool
-    reason: str
+    reason: Remark
     credible: bool = True
     inflation: float = 1.0
     prior_penalty: float = 0.0  #: penalty of sizes outside their plausible range, on the scale of −2 ln L
@@ -207,7 +208,7 @@ def likelihood_ratio(
     )
 
 
-def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> str:
+def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> Remark:
     """Say that a fitted size is smaller than its standard error; blank where none is. Such a fit is better because of
     the parameters that shape the effect, and its size is not determined.
     """
@@ -220,8 +221,8 @@ def _compatible_with_none(effects: Sequence[Effect], after: Fit) -> str:
             sigmas = [abs(number.value - parameter.zero) / number.sigma for number in numbers if number.sigma > 0]
             if sigmas and max(sigmas) < MIN_SIZE_SIGMAS:
                 number = numbers[0]
-                return f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
-    return ""
+                return remark("size_may_be_zero", symbol=number.symbol, value=number.value, sigma=number.sigma)
+    return Remark()
 
 
 def sizes_of(effects: Sequence[Effect], after: Fit) -> int:
@@ -248,7 +249,7 @@ def in_sigmas(delta_chi2: float, degrees_of_freedom: int) -> float:
     return max(float(-ndtri_exp(log_p - math.log(2))), 0.0)
 
 
-def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
+def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, Remark]:
     """Whether the fitted sizes are plausible, and if not, why. Returns plausible, reason (blank where they are
     plausible).
     """
@@ -261,10 +262,10 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
                 # At a bound outside the plausible range the size is implausible whatever its standard error.
                 at_implausible_bound = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
                 if at_implausible_bound or not is_plausible(parameter, number.value, number.sigma, widened=widened):
-                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-                    needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"
-                    return False, f"{needs}, and {low:.3g} to {high:.3g} is plausible"
-    return True, ""
+                    unit = "" if parameter.unit == "1" else parameter.unit
+                    facts = {"symbol": number.symbol, "value": number.value, "unit": unit, "low": low, "high": high}
+                    return False, Remark("implausible_size", facts)
+    return True, Remark()
 
 
 def robust_ratio(after: Fit, names: Collection[str]) -> float:
@@ -302,7 +303,7 @@ def _complexity(hypothesis: LikelihoodRatio) -> int:
     return sum(len(effect.parameters) for effect in hypothesis.effects)
 
 
-def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
+def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, Remark]]:
     """Hypotheses that cannot be excluded, the best first, and for those rejected the reason in words. A hypothesis is
     excluded if its −2 ln L, divided by the best one's inflation, is more than 9 above the best, both with the film mass
     as stated and with the film mass free (`film_gain`). Returns members, rejected (reason by label; hypotheses excluded
@@ -332,9 +333,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     lowest = min(penalised(ratio) for ratio in likely)
     plausible = [ratio for ratio in likely if penalised(ratio) - lowest <= ANSWER_SET_DELTA_CHI2]
     rejected = {
-        ratio.label: ratio.reason or "its size lies outside the plausible range"
-        for ratio in likely
-        if ratio not in plausible
+        ratio.label: ratio.reason or remark("outside_plausible_range") for ratio in likely if ratio not in plausible
     }
     members = []
     for ratio in plausible:
@@ -349,7 +348,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             )
         ]
         if simpler:
-            rejected[ratio.label] = f"{limit_reason(simpler[0].names[-1])} and fits no better"
+            rejected[ratio.label] = remark(CONTAINS_AND_FITS_NO_BETTER, name=simpler[0].names[-1])
         else:
             members.append(ratio)
     credible = [hypothesis for hypothesis in members if hypothesis.credible]

@@ -24,6 +24,7 @@ from vinetrack.diagnosis.candidates import CandidateShape, effect_sensitivities,
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET_DELTA_CHI2, CREDIBLE_RANGE_FACTOR
 from vinetrack.diagnosis.misfit_tests import SINGLE_PROBE_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.score_test import Products, informations_at, products_of, projected, scores_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.effects import Effect
@@ -285,7 +286,7 @@ class _Response:
 
 def power_of(
     tests: MisfitTests,
-    not_testable: Mapping[str, str] | None = None,
+    not_testable: Mapping[str, Remark] | None = None,
     inputs: Sequence[PowerInput] = (),
     *,
     nonlinear: bool = False,
@@ -298,10 +299,10 @@ def power_of(
         for response in _responses(tests, nonlinear=nonlinear)
         if (power := _effect_power(tests, response, null_scores, inflation, least)) is not None
     ]
-    silent = dict.fromkeys(tests.sensitivities.silent, "no trial responds to it at any plausible size")
-    wary = ""
+    silent = dict.fromkeys(tests.sensitivities.silent, remark("no_response"))
+    wary = Remark()
     if tests.exceeds_slow_errors or tests.poorly_fitted:
-        wary = "the residuals exceed the noise of the trials, and the sizes count the excess as noise"
+        wary = remark("excess_counted_as_noise")
     return Power(
         n_trials=len(tests.fit.trials),
         threshold=tests.family.single_shape_threshold,

@@ -22,22 +22,18 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import in_one_blas_thread
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect
+from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.power_text import (
-    advice_text,
-    calibration_advice,
-    only_measurement,
-    separation_text,
-    trial_entries,
-)
-from vinetrack.narrative.verdict_text import joined
 from vinetrack.planning.discriminating_design import (
     NEW_VINE,
     OTHER_RIG,
     SAME_RIG,
+    Condition,
     RefitTerms,
     best_design,
     best_new_vines,
@@ -78,13 +74,18 @@ class NextExperiment:
     of what differs from the rig so far.
     """
 
-    text: str
+    advice: Remark
     trials: tuple[Mapping[str, Any], ...] = ()
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
     if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alternatives: tuple[Mapping[str, Any], ...] = ()
-    calibration: str | None = None
+    measurement: Remark = field(default_factory=Remark)
+
+    @property
+    def text(self) -> str:
+        """The advice in words."""
+        return str(self.advice)
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it; unknown values are null."""
@@ -98,7 +99,7 @@ class NextExperiment:
                     pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()
                 },
                 "alternatives": [dict(other) for other in self.alternatives],
-                "calibration": self.calibration,
+                "calibration": str(self.measurement) or None,
             }
         )
         return content
@@ -139,20 +140,49 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     _check_fits(tied)
     tied = list(tied)[:MAX_HYPOTHESES]
     names = _hypothesis_names(tied)
-    if only_measurement(tied):
-        advice = calibration_advice(list(itertools.combinations(tied, 2)))
+    measurement = _deciding_measurements(list(itertools.combinations(tied, 2)))
+    if _only_measurement(tied):
         faults = [name for name in names if name != NO_FURTHER_EFFECT]
-        are = "are errors" if len(faults) > 1 else "is an error"
-        text = f"Measure before making more trials: {joined(faults)} {are} of measurement. {advice}"
-        return NextExperiment(text=text, calibration=advice)
+        return NextExperiment(remark("measure_first", faults=faults, measurement=measurement), measurement=measurement)
     bench, terms = _feasible_trials(tied, names, limits)
     options = _options(bench, terms, limits, seed)
     if not options:
-        advice = calibration_advice(list(itertools.combinations(tied, 2)))
-        return NextExperiment(
-            text=f"No trial within the limits can be made and simulated. {advice}", calibration=advice
-        )
+        return NextExperiment(remark("no_feasible_trial", measurement=measurement), measurement=measurement)
     return _recommendation(bench, options, seed)
+
+
+def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
+    """Return the effects that only the first model has, and those that only the second has. Returns only_first,
+    only_second : list of Effect.
+    """
+    return (
+        [effect for effect in first.model if effect.name not in second.model],
+        [effect for effect in second.model if effect.name not in first.model],
+    )
+
+
+def _only_measurement(tied: Sequence[Fit]) -> bool:
+    """Return whether the hypotheses differ only in faults of the measurement."""
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
+    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
+
+
+def _deciding_measurements(pairs: Sequence[tuple[Fit, Fit]]) -> Remark:
+    """What to measure in order to exclude one of each pair of hypotheses: the effects whose files say so. Where a fault
+    of the measurement is among them, a calibration decides, and only the calibration is named.
+    """
+    trace_decides = False
+    effects: dict[str, Effect] = {}
+    for pair in pairs:
+        only_first, only_second = effects_between(*pair)
+        trace_decides |= any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second)
+        effects.update({effect.name: effect for effect in [*only_first, *only_second]})
+    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
+    if not (trace_decides or effects):
+        return Remark()
+    facts = {"trace_decides": trace_decides, "effects": measured or list(effects.values())}
+    return Remark("deciding_measurements", {**facts, "faults_only": bool(measured)})
 
 
 def _check_fits(tied: Sequence[Fit]) -> None:
@@ -258,7 +288,8 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
     ]
     worth_it = worth_it and len(unresolved) < len(expected_sigma)
     fits = [hypothesis.fit for hypothesis in bench.hypotheses]
-    advice = calibration_advice([(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)])
+    pairs = [(fits[a], fits[b]) for a, b in unresolved or _separable_by_measurement(fits)]
+    measurement = _deciding_measurements(pairs)
     sigmas = {_pair_name(names, pair): sigma for pair, sigma in expected_sigma.items()}
     simulated_by_name = {_pair_name(names, pair): mean_and_sd for pair, mean_and_sd in simulated.items()}
     trials = trial_entries(bench.conditions, best.design)
@@ -267,13 +298,14 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
         for a, b in expected_sigma
     }
     return NextExperiment(
-        text=advice_text(
-            trials,
-            separation_text(if_true, simulated_by_name),
-            [_pair_name(names, pair) for pair in unresolved],
-            advice,
-            worth_it=worth_it,
-            least=LEAST_SEPARATION,
+        advice=remark(
+            "trials_to_make" if worth_it else "no_trials_separate",
+            trials=trials,
+            if_true=if_true,
+            simulated=simulated_by_name,
+            unresolved=[_pair_name(names, pair) for pair in unresolved],
+            measurement=measurement,
+            least_sigma=LEAST_SEPARATION,
         ),
         trials=trials if worth_it else (),
         separation_sigma=sigmas,
@@ -287,7 +319,7 @@ def _recommendation(bench: DesignProblem, options: Sequence[_Option], seed: int)
             for option in sorted(options, key=lambda ranked: -ranked.worth)
             if option.design != best.design
         ),
-        calibration=advice or None,
+        measurement=measurement,
     )
 
 
@@ -313,3 +345,23 @@ def _simulated_separations(rises: Floats) -> dict[tuple[int, int], tuple[float, 
 
 def _pair_name(names: Sequence[str], pair: tuple[int, int]) -> str:
     return f"{names[pair[0]]} | {names[pair[1]]}"
+
+
+def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
+    """Return the trials of a design as entries of `next_experiment`, one for each condition."""
+    return tuple(
+        _entry(every[index], int(count))
+        for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    )
+
+
+def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
+    trial = condition.trial
+    settings = {name: COLUMNS[name].of_trial(trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
+    return {
+        **{name: float(f"{value:.6g}") for name, value in settings.items()},
+        "replicates": replicates,
+        "vine": trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }

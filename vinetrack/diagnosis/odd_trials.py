@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, Trial, plain_track, with_flag
 from vinetrack.core.units import GRAVITY_M_S2
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import ADEQUATE, ARTEFACT, DROPPED_FRAMES, UNEXPLAINED, Diagnosis, Round
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import middle_speed
-from vinetrack.narrative.verdict_text import dropped_in_words, joined, odd_in_words, perhaps_dropped_in_words
 from vinetrack.tracks.frame_timing import correct_frames, frames_surely_missing
 
 Indices = NDArray[np.int_]
@@ -160,8 +160,7 @@ def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callabl
     """
     if not odd:
         return result
-    words = odd_in_words(odd, len(result.fits[0].trials))
-    noted = replace(result, notes=(*result.notes, words))
+    noted = replace(result, notes=(*result.notes, remark("odd_trials", odd=odd, count=len(result.fits[0].trials))))
     if result.verdict == ADEQUATE:
         return noted
     try:
@@ -174,12 +173,9 @@ def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callabl
     if not unexplained and set(result.answer_set) & set(others.answer_set):
         return noted
     result = replace(result, odd_trials=tuple(trial.name for trial in odd))
-    names = joined(result.odd_trials)
-    words = f"{words} Without {names} the verdict is `{others.verdict}`: {others.explanation} With {names}:"
-    if unexplained:
-        return replace(result, explanation=f"{words} {result.explanation}")
-    basis = f"the verdict would rest on {'it' if len(odd) == 1 else 'them'} alone. {result.explanation}"
-    return _withdrawn(result, f"{words} {basis}")
+    facts = {"odd": odd, "count": len(result.fits[0].trials), "others": others, "with_them": result.explanation}
+    words = str(Remark("odd_trials_decide", {**facts, "withdrawn": not unexplained}))
+    return replace(result, explanation=words) if unexplained else _withdrawn(result, words)
 
 
 def _withdrawn(result: Diagnosis, words: str) -> Diagnosis:
@@ -247,9 +243,9 @@ def with_lost_frames(result: Diagnosis, dropped: LostFrames) -> Diagnosis:
     if not dropped.trials:
         return result
     if not dropped.certain:
-        return replace(result, notes=(*result.notes, perhaps_dropped_in_words(dropped.trials)))
+        return replace(result, notes=(*result.notes, remark("frames_perhaps_missing", trials=dropped.trials)))
     first = result.rounds[0]
-    words = dropped_in_words(dropped.trials)
+    words = str(remark("frames_missing", trials=dropped.trials))
     artefact = Round(
         model=first.model,
         verdict=ARTEFACT,
@@ -260,7 +256,7 @@ def with_lost_frames(result: Diagnosis, dropped: LostFrames) -> Diagnosis:
         cosines=first.cosines,
         fit=first.fit,
     )
-    note = f"With corrected times: {result.verdict}. {result.explanation}"
+    note = remark("with_corrected_times", verdict=result.verdict, explanation=result.explanation)
     return Diagnosis(
         rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,), power=result.power
     )

@@ -16,6 +16,7 @@ import numpy as np
 from vinetrack.core.notebook import plot
 from vinetrack.core.records import Trial
 from vinetrack.core.units import or_nan
+from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.experiment.schema import COLUMNS
 
 if TYPE_CHECKING:
@@ -272,11 +273,11 @@ class Power:
     threshold: float
     false_alarms: Mapping[str, float]
     effects: tuple[EffectPower, ...] = ()
-    not_testable: Mapping[str, str] = field(default_factory=dict)
+    not_testable: Mapping[str, Remark] = field(default_factory=dict)
     numbers: tuple[NumberWidth, ...] = ()
     inputs: tuple[PowerInput, ...] = ()
     model: tuple[str, ...] = ()
-    wary: str = ""
+    wary: Remark = field(default_factory=Remark)
     simulated: tuple[SimulatedRates, ...] = ()
     further: tuple[FurtherTrials, ...] = ()
     recommended: InformativeTrials | None = None
@@ -304,8 +305,6 @@ class Power:
 
     def to_json(self) -> dict[str, Any]:
         """As `power` of `diagnosis.json`; sizes in SI units."""
-        from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence
-
         return {
             "n_trials": self.n_trials,
             "model": list(self.model),
@@ -313,12 +312,14 @@ class Power:
             "false_alarm_rate": self.false_alarm_rate,
             "false_alarms": dict(self.false_alarms),
             "effects": [entry.to_json() for entry in self.effects],
-            "not_testable": dict(self.not_testable),
+            "not_testable": {name: str(why) for name, why in self.not_testable.items()},
+            "not_testable_codes": {name: why.to_json() for name, why in self.not_testable.items()},
             "numbers": [vars(number) for number in self.numbers],
             "inputs": [vars(entry) for entry in self.inputs],
-            "wary": self.wary,
+            "wary": str(self.wary),
+            "wary_code": self.wary.to_json(),
             "simulated": [rates.to_json() for rates in self.simulated],
-            "in_words": [false_alarm_sentence(self), *could_have_seen(self)],
+            "in_words": str(remark("detectable", power=self)).splitlines(),
             **({"recommended_trials": list(self.recommended.trials)} if self.recommended else {}),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
@@ -331,14 +332,16 @@ class Power:
             threshold=or_nan(content.get("threshold_sigma")),
             false_alarms={str(name): or_nan(rate) for name, rate in (content.get("false_alarms") or {}).items()},
             effects=tuple(EffectPower.from_json(entry) for entry in content.get("effects") or ()),
-            not_testable=dict(content.get("not_testable") or {}),
+            not_testable={
+                str(name): Remark.from_json(why) for name, why in (content.get("not_testable_codes") or {}).items()
+            },
             numbers=tuple(
                 NumberWidth(str(e["name"]), str(e["vine"]), or_nan(e["value"]), or_nan(e["half_width"]))
                 for e in content.get("numbers") or ()
             ),
             inputs=tuple(PowerInput(**entry) for entry in content.get("inputs") or ()),
             model=tuple(content.get("model") or ()),
-            wary=str(content.get("wary") or ""),
+            wary=Remark.from_json(content.get("wary_code")),
         )
 
     def plot(self, name: str = "power", **options: Any) -> Figure:
@@ -346,6 +349,4 @@ class Power:
         return plot(self, name, **options)
 
     def __str__(self) -> str:
-        from vinetrack.narrative.power_text import power_lines
-
-        return "\n".join(power_lines(self))
+        return in_words(self)

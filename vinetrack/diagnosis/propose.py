@@ -12,7 +12,7 @@ import math
 import tempfile
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -44,13 +44,13 @@ from vinetrack.diagnosis.likelihood_ratio import (
 )
 from vinetrack.diagnosis.misfit_tests import FAR_OFF_CHI2_PER_DOF
 from vinetrack.diagnosis.missing_force import LEAST_MISFIT_REDUCTION, DetectedLaw, learn_missing_force, missing_force
+from vinetrack.diagnosis.remarks import Remark, joined, remark
 from vinetrack.diagnosis.selection import MAX_RESTARTS, MIN_LOG_LIKELIHOOD_GAIN
 from vinetrack.dynamics.model import Model, check_needs, make_model
 from vinetrack.effects import Effect, EffectError, find_effect, load_effect, remember
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_text import joined
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -441,7 +441,7 @@ class Proposal:
     rms_left_out_m: float
     laws: tuple[ProposedLaw, ...]
     tied: tuple[ProposedLaw, ...]
-    reason: str = ""
+    reason: Remark = field(default_factory=Remark)
     table: ProposedTable | None = None
 
     def sentences(self) -> list[str]:
@@ -450,7 +450,7 @@ class Proposal:
 
     def _of_laws(self) -> list[str]:
         if not self.tied:
-            return [self.reason if self.table else f"{self.reason.removesuffix('.')}; nothing is proposed."]
+            return [f"{self.reason}." if self.table else f"{self.reason}; nothing is proposed."]
         best = self.tied[0]
         lines = [
             f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
@@ -487,7 +487,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
 def _fitted_laws(model: Model, before: Fit, detected: Sequence[DetectedLaw], report: Callable[[str], None]) -> Proposal:
     """Fit the laws in the equation of motion, and find those that the data do not exclude."""
     if not detected:
-        reason = "No simple law of force is detected in the misfit of the model."
+        reason = remark("no_law_detected")
         return Proposal(before, left_out(before).rms_m, (), (), reason)
     with tempfile.TemporaryDirectory() as folder:
         effects = [_loaded(law, Path(folder)) for law in detected]
@@ -528,7 +528,7 @@ def _proposal(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
         and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > LEAST_MISFIT_REDUCTION * misfit)
     ]
     if not significant:
-        reason = "No simple law of force both explains the misfit and predicts left-out conditions better."
+        reason = remark("no_law_predicts_better")
         return Proposal(before, error_m, laws, (), reason)
     not_excluded, _ = answer_set([law.ratio for law in significant])
     tied = tuple(law for ratio in not_excluded for law in significant if law.ratio is ratio)

@@ -11,9 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.notebook import html_table, plot
+from vinetrack.core.notebook import plot
 from vinetrack.core.units import or_nan
 from vinetrack.diagnosis.power import Power
+from vinetrack.diagnosis.remarks import Remark, in_words, remark
 from vinetrack.inference.fit_result import Fit, Number
 
 if TYPE_CHECKING:
@@ -108,11 +109,8 @@ BETWEEN_SUMMARIES = {
 }
 
 
-def limit_reason(name: str) -> str:
-    """Return the beginning of `Candidate.reason` of a richer form: a candidate that equals another in a limit.
-    `Candidate.is_richer_form_of` recognises it in a stored diagnosis.
-    """
-    return f"it contains {name} as a limit"
+# Codes of reasons of a richer form: a candidate that equals another in a limit, named `name`
+CONTAINS, CONTAINS_AND_FITS_NO_BETTER = "contains", "contains_and_fits_no_better"
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,7 @@ class Candidate:
     numbers: tuple[Number, ...] = ()
     plausible: bool = True
     in_answer_set: bool = False
-    reason: str = ""
+    reason: Remark = field(default_factory=Remark)
     largest: Mapping[str, float] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: float = math.nan
@@ -139,7 +137,7 @@ class Candidate:
 
     def is_richer_form_of(self, name: str) -> bool:
         """Whether it was set aside because it contains another effect as a limit."""
-        return self.reason.startswith(limit_reason(name))
+        return self.reason.code in (CONTAINS, CONTAINS_AND_FITS_NO_BETTER) and self.reason.facts["name"] == name
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -152,7 +150,8 @@ class Candidate:
             "numbers": [number.to_json() for number in self.numbers],
             "plausible": self.plausible,
             "in_answer_set": self.in_answer_set,
-            "reason": self.reason,
+            "reason": str(self.reason),
+            "reason_code": self.reason.to_json(),
             "largest": dict(self.largest),
             "posterior_weight": self.posterior_weight,
             "log_bayes": self.log_bayes,
@@ -173,7 +172,7 @@ class Candidate:
             numbers=numbers,
             plausible=bool(entry.get("plausible", True)),
             in_answer_set=bool(entry.get("in_answer_set")),
-            reason=str(entry.get("reason") or ""),
+            reason=Remark.from_json(entry.get("reason_code")),
             largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
             along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
             posterior_weight=or_nan(entry.get("posterior_weight")),
@@ -247,11 +246,12 @@ class Diagnosis:
     where: Sequence[str] = ()
     next_experiment: Mapping[str, Any] | None = None
     missing_force: Mapping[str, Any] | None = None
-    notes: Sequence[str] = ()
+    notes: Sequence[Remark | str] = ()  # A file holds their sentences
     failure: Failure | None = None
     force_table: pd.DataFrame | None = None
     learned_table: pd.DataFrame | None = None
     stored_parameters: tuple[Number, ...] = ()
+    contradicted_columns: tuple[str, ...] = ()
     refused: str = ""
     power: Power | None = None
     odd_trials: tuple[str, ...] = ()
@@ -305,8 +305,6 @@ class Diagnosis:
         """The candidates of all rounds, one row each."""
         import pandas as pd
 
-        from vinetrack.narrative.verdict_text import estimates_text
-
         columns = ["round", "effect", "kind", "status", "delta_chi2", "sigma", "size", "in_answer_set", "plausible"]
         rows = [
             (
@@ -316,10 +314,10 @@ class Diagnosis:
                 c.status,
                 c.delta_chi2,
                 c.sigma,
-                estimates_text(c),
+                in_words(c),
                 c.in_answer_set,
                 c.plausible,
-                c.reason,
+                str(c.reason),
             )
             for i, step in enumerate(self.rounds, 1)
             for c in step.ranking
@@ -342,8 +340,9 @@ class Diagnosis:
             "drift": [dict(row) for row in self.drift],
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
-            "notes": list(self.notes),
+            "notes": [str(note) for note in self.notes],
             "odd_trials": list(self.odd_trials),
+            "contradicted_columns": list(self.contradicted_columns),
             "refused": self.refused or None,
             "power": None if self.power is None else self.power.to_json(),
         }
@@ -367,6 +366,7 @@ class Diagnosis:
             notes=tuple(str(note) for note in content.get("notes") or ()),
             stored_parameters=tuple(Number.from_json(stored) for stored in content.get("parameters") or ()),
             odd_trials=tuple(content.get("odd_trials") or ()),
+            contradicted_columns=tuple(content.get("contradicted_columns") or ()),
             refused=str(content.get("refused") or ""),
             power=Power.from_json(content["power"]) if content.get("power") else None,
         )
@@ -380,14 +380,7 @@ class Diagnosis:
         return f"Diagnosis({self.verdict or 'refused'}{f': {named}' if named else ''})"
 
     def _repr_html_(self) -> str:
-        from vinetrack.narrative.verdict_text import summary_facts, verdict_sentence
-
-        rows = [(fact.question, fact.answer, fact.note) for fact in summary_facts(self, self.ladder)]
-        return html_table(
-            ("", "", ""), rows, f"{self.verdict or 'refused'}: {verdict_sentence(self)}", [self.explanation]
-        )
+        return str(remark("diagnosis_page", diagnosis=self))
 
     def __str__(self) -> str:
-        from vinetrack.narrative.diagnosis_text import diagnosis_text
-
-        return diagnosis_text(self)
+        return in_words(self)

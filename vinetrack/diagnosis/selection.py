@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -50,6 +50,7 @@ from vinetrack.diagnosis.misfit_tests import (
     has_excess_scatter,
     misfit_tests,
 )
+from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED, Confounder
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.simulate import SimulationError
@@ -98,34 +99,31 @@ def is_within_position_errors(before: Fit, after: Fit) -> bool:
     return math.isfinite(without_m + with_m) and with_m >= without_m
 
 
-def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[str, ...]:
+def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFrame | None) -> tuple[Remark, ...]:
     """List the results that contradict the final model of a diagnosis where the verdict calls it adequate. Returns
-    sentences; empty where nothing contradicts the verdict.
+    remarks; empty where nothing contradicts the verdict.
     """
     return (*_not_better(added, ladder), *_still_drifts(fits[-1]))
 
 
-def _not_better(added: Sequence[str], ladder: pd.DataFrame | None) -> Iterator[str]:
+def _not_better(added: Sequence[str], ladder: pd.DataFrame | None) -> Iterator[Remark]:
     if ladder is None:
         return
     errors_m = [float(value) for value in ladder["rms_left_out_m"]]
     for name, without_m, with_m in zip(added, errors_m, errors_m[1:], strict=False):
         if math.isfinite(without_m + with_m) and with_m >= without_m:
-            yield (
-                f"The error on left-out conditions does not fall with {name}: {without_m * 1e3:.2f} mm without "
-                f"it, {with_m * 1e3:.2f} mm with it. The data support {name} by the shape of the motion alone."
-            )
+            yield remark("left_out_error_does_not_fall", name=name, without_m=without_m, with_m=with_m)
 
 
-def _still_drifts(fit: Fit) -> Iterator[str]:
+def _still_drifts(fit: Fit) -> Iterator[Remark]:
     try:
         result = drift(fit)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return
     table = result.table
     sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > CONTRADICTING_DRIFT_SIGMAS)]
-    model = " + ".join(fit.model.names)
-    yield from (f"With {model}: {line}" for line in sure.drop_duplicates(["parameter", "against"])["sentence"])
+    for line in sure.drop_duplicates(["parameter", "against"])["sentence"]:
+        yield remark("still_drifts", model=list(fit.model.names), drift=line)
 
 
 # ------------------------------------------------------------------------------
@@ -246,10 +244,10 @@ class SelectionStep:
     tests: MisfitTests
     answer_set: tuple[LikelihoodRatio, ...] = ()
     fitted: tuple[LikelihoodRatio, ...] = ()
-    rejected: tuple[tuple[str, str], ...] = ()
+    rejected: tuple[tuple[str, Remark], ...] = ()
     answer_names: tuple[str, ...] = ()
     search: CandidateFits | None = None
-    note: str = ""
+    note: Remark = field(default_factory=Remark)
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
     unstated_differences: tuple[LikelihoodRatio, ...] = ()
@@ -399,13 +397,9 @@ def _single_effect_rounds(
     return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
 
 
-def _negligible_note(best: LikelihoodRatio, tests: MisfitTests) -> str:
-    """Why an effect that improves the likelihood is not counted, in words."""
-    moved_mm = 1e3 * displacement_m(tests.fit, best.fit)
-    return (
-        f"{best.label} would improve the fit by {best.sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
-        "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted"
-    )
+def _negligible_note(best: LikelihoodRatio, tests: MisfitTests) -> Remark:
+    """Why an effect that improves the likelihood is not counted."""
+    return remark("not_counted", label=best.label, sigma=best.sigma, moved_m=displacement_m(tests.fit, best.fit))
 
 
 def verdict_of(adequate: Sequence[LikelihoodRatio]) -> str:
@@ -422,7 +416,7 @@ def _effect_set_rounds(
     singles = sorted(hypotheses, key=lambda single: -single.fit.log_likelihood)
     sets = EffectSets(search, singles, report)
     size, backward_steps, best_so_far = 2, 0, singles[0]
-    rejected: dict[str, str] = {}
+    rejected: dict[str, Remark] = {}
     while size <= MAX_EFFECTS:
         report(f"{size} effects together")
         of_this_size = sets.grow(size)
@@ -432,7 +426,7 @@ def _effect_set_rounds(
         if after is not None:
             if sets.is_better(adequate[0]):
                 return _rounds_of_sets(tests, sets, adequate, rejected, after)
-            rejected[adequate[0].label] = "its gain over the best smaller set is within chance"
+            rejected[adequate[0].label] = remark("gain_within_chance")
         if not sets.is_better(of_this_size[0]):
             break
         stalled = size > 2 and _is_stalled(of_this_size, best_so_far)
@@ -460,7 +454,7 @@ def _rounds_of_sets(
     tests: MisfitTests,
     sets: EffectSets,
     adequate: Sequence[LikelihoodRatio],
-    rejected: dict[str, str],
+    rejected: dict[str, Remark],
     after: MisfitTests,
 ) -> list[SelectionStep]:
     """Rounds from adequate sets of effects: one for each effect that all sets share, then one for the alternatives.
@@ -509,14 +503,13 @@ def _shared_step(
     added: tuple[Effect, ...],
     name: str,
     fitted: tuple[LikelihoodRatio, ...],
-    rejected: tuple[tuple[str, str], ...],
+    rejected: tuple[tuple[str, Remark], ...],
 ) -> SelectionStep:
     """The round that names an effect which all sets share; the effects in `added` are in the model already."""
     remaining = [effect for effect in best.effects if effect not in added]
     remaining.sort(key=lambda effect: effect.name != name)
     together = likelihood_ratio(tests.fit, remaining, best.fit)
-    count = {2: "two", 3: "three", 4: "four", 5: "five"}[len(remaining)] if len(remaining) > 1 else ""
-    note = f"{count} effects are missing: none alone removes the misfit" if count else ""
+    note = remark("several_missing", count=len(remaining)) if len(remaining) > 1 else Remark()
     if not added:
         return SelectionStep(verdict, tests, (together,), fitted, rejected, (name,), sets.search, note)
     subset = sets.subset(best, (*added, remaining[0]))
@@ -540,15 +533,11 @@ def _partial_steps(tests: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRati
 
 
 def _rejection_reasons(
-    best_of_size: Sequence[LikelihoodRatio], rejected: dict[str, str]
-) -> tuple[tuple[str, str], ...]:
+    best_of_size: Sequence[LikelihoodRatio], rejected: dict[str, Remark]
+) -> tuple[tuple[str, Remark], ...]:
     """Label of the best hypothesis of each size, and why it is no explanation."""
-    return tuple(
-        dict.fromkeys(
-            (
-                hypothesis.label,
-                hypothesis.reason if not hypothesis.credible else rejected.get(hypothesis.label, MISFIT_REMAINS),
-            )
-            for hypothesis in best_of_size
-        )
-    )
+    reasons = {
+        hypothesis.label: rejected.get(hypothesis.label, MISFIT_REMAINS) if hypothesis.credible else hypothesis.reason
+        for hypothesis in best_of_size
+    }
+    return tuple(reasons.items())

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.units import display_unit, interval, number, with_error, with_interval
+from vinetrack.core.notebook import html_table
+from vinetrack.core.units import decimals, display_unit, interval, number, with_error, with_interval
+from vinetrack.diagnosis.remarks import joined
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -19,12 +23,23 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_brief
+from vinetrack.narrative.power_text import (
+    advice_text,
+    could_have_seen,
+    false_alarm_sentence,
+    measure_first_text,
+    measurement_text,
+    power_brief,
+)
 from vinetrack.narrative.verdict_text import (
     ODD_MEANING,
     difference_headline,
+    dropped_in_words,
     estimates_text,
-    joined,
+    odd_deciding_in_words,
+    odd_in_words,
+    perhaps_dropped_in_words,
+    summary_facts,
     trials_differ,
     verdict_sentence,
 )
@@ -32,13 +47,13 @@ from vinetrack.narrative.verdict_text import (
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.force_laws import Law
     from vinetrack.inference.fit_result import Fit
 
 
 # ------------------------------------------------------------------------------
 # The damping law of an experiment in sentences and tables, for terminal and report, and how it was determined.
 
-_STATUSES = ("ok", "warning", "failed", "left_out")
 _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
 
 # The two fits of the damping law, by their keys in `damping.json`
@@ -110,7 +125,7 @@ def damping_headline(damping: Mapping[str, Any]) -> str:
 def status_tally(trials: pd.DataFrame) -> str:
     """Return the number of trials of each status, as a sentence."""
     counts = trials["status"].value_counts()
-    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUSES if counts.get(status, 0)]
+    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUS_WORDS if counts.get(status, 0)]
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
@@ -298,7 +313,7 @@ def _ranking(step: Round) -> list[str]:
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
                 estimates_text(candidate),
-                candidate.reason or _status(candidate, step),
+                str(candidate.reason) or _status(candidate, step),
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
@@ -371,3 +386,104 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     body = [(title, row.get("before", "–"), row.get("after", "–"), unit) for (title, unit), row in changed.items()]
     lines += aligned(body, ("", "before", "after", "unit"))
     return lines + [f"! {message}" for message in after.messages]
+
+
+def diagnosis_page(diagnosis: Diagnosis) -> str:
+    """Return the first screen of a diagnosis as HTML, for a notebook."""
+    rows = [(fact.question, fact.answer, fact.note) for fact in summary_facts(diagnosis, diagnosis.ladder)]
+    title = f"{diagnosis.verdict or 'refused'}: {verdict_sentence(diagnosis)}"
+    return html_table(("", "", ""), rows, title, [diagnosis.explanation])
+
+
+def contradicted_in_words(columns: Sequence[str]) -> str:
+    """Return the warning that measurements contradict the sheet in these columns."""
+    named = joined(columns)
+    return f"But the measurements contradict the sheet in {named}: correct that before relying on this verdict."
+
+
+def sentences_of(text: str) -> list[str]:
+    """Return the sentences of an explanation, for a line each."""
+    return re.split(r"(?<=[.!?]) (?=[A-Z])", text.strip())
+
+
+# ------------------------------------------------------------------------------
+# Simple laws of a missing force.
+
+# Form of a force, and where along the motions it has the stated size
+_LAWS = {
+    "constant": ("a constant force of {size}", ""),
+    "position": ("a force in proportion to the tail's travel x", "{size} at the end"),
+    "speed": ("a force in proportion to the speed ẋ", "{size} at the highest"),
+    "speed_squared": ("a force in proportion to ẋ²", "{size} at the highest speed"),
+    "position_squared": ("a force in proportion to x²", "{size} at the end"),
+    "beyond_a_place": ("a force that rises in proportion to the growth beyond {scale_mm} mm", "{size} at the end"),
+    "speed_cubed": ("a force in proportion to ẋ³", "{size} at the highest speed"),
+    "beyond_a_speed": ("a force in proportion to the excess of ẋ over {scale} m/s", "{size} at the highest speed"),
+    "squared_beyond_a_speed": (
+        "a force in proportion to the square of the excess of ẋ over {scale} m/s",
+        "{size} at the highest speed",
+    ),
+    "pressure": ("a force in proportion to the pressure", "{size} at the highest"),
+    "time": ("a force that grows in proportion to time", "{size} at the end of the longest trial"),
+    "inverse_speed": ("a force that falls with speed as 1/ẋ", "{size} at {scale} m/s and below"),
+    "falling_with_speed": (
+        "a force that falls with speed",
+        "{size} at the lowest speed, by a factor of e every {scale} m/s of ẋ",
+    ),
+    "fading_in_time": ("a force that decays in time", "{size} at release, by a factor of e every {scale_ms} ms"),
+    "fading_along": (
+        "a force that decays along the growth",
+        "{size} at the start, by a factor of e every {scale_mm} mm",
+    ),
+    "patch": ("a force that acts between {low} and {high} mm of growth, {size}", ""),
+    "periodic": ("a force that repeats every {scale_mm} mm of growth, {size}", ""),
+}
+
+
+def law_text(law: Law, amplitude_N: Sequence[float], sigma_N: float) -> str:
+    """Describe a law of force with its size."""
+    if law.kind == "periodic":
+        size = f"with an amplitude of {_force_text(math.hypot(*amplitude_N), sigma_N)}"
+    else:
+        size = f"{'+' if amplitude_N[0] > 0 else ''}{_force_text(amplitude_N[0], sigma_N)}".replace("-", "−")
+    form, place = _LAWS[law.kind]
+    if law.factor:
+        by = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}[law.factor]
+        form, place = f"{form}, times {by}", "{size} at its largest"
+    text = (f"{form}, {place}" if place else form).format(
+        size=size,
+        low=f"{1e3 * max(law.low, 0.0):.0f}",
+        high=f"{1e3 * law.high:.0f}",
+        scale_mm=_whole_or_two_digits(1e3 * law.scale),
+        scale_ms=_whole_or_two_digits(1e3 * law.scale),
+        scale=f"{law.scale:.2g}",
+    )
+    return f"{text}, in proportion to the cross-section of the vine" if law.reference_area_m2 else text
+
+
+def _whole_or_two_digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _force_text(value_N: float, sigma_N: float) -> str:
+    if not math.isfinite(sigma_N):
+        return "any size"
+    digits = decimals(sigma_N)
+    return f"{value_N:.{digits}f} ± {sigma_N:.{digits}f} N"
+
+
+# Remarks that take more than a template, by their codes
+REMARKS: dict[str, Callable[..., str]] = {
+    "odd_trials": odd_in_words,
+    "odd_trials_decide": odd_deciding_in_words,
+    "frames_missing": dropped_in_words,
+    "frames_perhaps_missing": perhaps_dropped_in_words,
+    "deciding_measurements": measurement_text,
+    "measure_first": measure_first_text,
+    "no_feasible_trial": lambda measurement: f"No trial within the limits can be made and simulated. {measurement}",
+    "trials_to_make": advice_text,
+    "no_trials_separate": partial(advice_text, worth_it=False),
+    "detectable": lambda power: "\n".join([false_alarm_sentence(power), *could_have_seen(power)]),
+    "diagnosis_page": diagnosis_page,
+    "law": law_text,
+}

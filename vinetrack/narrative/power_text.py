@@ -6,18 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vinetrack.core.units import display_unit, number
+from vinetrack.diagnosis.remarks import joined
 from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
-from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_text import joined, listed_names, spaced_name
-from vinetrack.planning.discriminating_design import NEW_VINE, Condition
+from vinetrack.narrative.verdict_text import MOST_NAMED, listed_names, spaced_name
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.further_trials import InformativeTrials
     from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
+    from vinetrack.diagnosis.remarks import Remark
 
 
 LOW_POWER = 0.1  # Power below which an effect counts as undetectable (chosen)
@@ -293,43 +291,16 @@ COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_an
 
 _MUCH_MORE = 1.5  # Ratio from which the larger of two expected significances is stated beside the smaller (chosen)
 
-_WITH_TRACE = (
-    "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
-    " measured, and only the other hypothesis can explain a remaining misfit."
-)
 
-
-def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
-    """Return the effects that only the first model has, and those that only the second has. Returns only_first,
-    only_second : list of Effect.
-    """
-    return (
-        [effect for effect in first.model if effect.name not in second.model],
-        [effect for effect in second.model if effect.name not in first.model],
+def measurement_text(trace_decides: bool, effects: Sequence[Effect], faults_only: bool) -> str:
+    """Return what to measure in order to exclude one of the hypotheses, as the files of their effects state."""
+    with_trace = (
+        "Record the pressure at the vine during growth and give it with the track: the pressure in the chamber is then"
+        " measured, and only the other hypothesis can explain a remaining misfit."
     )
-
-
-def only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ only in faults of the measurement."""
-    common = set.intersection(*(set(fit.model.names) for fit in tied))
-    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
-    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
-
-
-def calibration_advice(pairs: Sequence[tuple[Fit, Fit]]) -> str:
-    """Return what to measure in order to exclude one of each pair of hypotheses, as the files of their effects state.
-    Where a fault of the measurement is among them, a calibration decides, and only the calibration is returned.
-    """
-    sentences: list[str] = []
-    effects: dict[str, Effect] = {}
-    for pair in pairs:
-        only_first, only_second = effects_between(*pair)
-        if any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second) and _WITH_TRACE not in sentences:
-            sentences.append(_WITH_TRACE)
-        effects.update({effect.name: effect for effect in [*only_first, *only_second]})
-    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
-    for effect in measured or effects.values():
-        words = " ".join(filter(None, ("" if measured else told_apart(effect), remedy(effect))))
+    sentences = [with_trace] if trace_decides else []
+    for effect in effects:
+        words = " ".join(filter(None, ("" if faults_only else told_apart(effect), remedy(effect))))
         if words:
             sentences.append(f"{effect.name}: {words[0].lower()}{words[1:]}")
     return " ".join(sentences)
@@ -368,56 +339,42 @@ def separation_text(
     return ", ".join(parts)
 
 
-def trial_entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """Return the trials of a design as entries of `next_experiment`, one for each condition."""
-    return tuple(
-        _entry(every[index], int(count))
-        for index, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
-    )
-
-
-def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
-    trial = condition.trial
-    settings = {name: COLUMNS[name].of_trial(trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
-    return {
-        **{name: float(f"{value:.6g}") for name, value in settings.items()},
-        "replicates": replicates,
-        "vine": trial.vine,
-        "new_vine": condition.effort == NEW_VINE,
-        "changed": list(condition.changed),
-    }
-
-
 def advice_text(
     trials: Sequence[Mapping[str, Any]],
-    promise: str,
-    left: Sequence[str],
-    advice: str,
+    if_true: Mapping[str, Mapping[str, float]],
+    simulated: Mapping[str, tuple[float, float]],
+    unresolved: Sequence[str],
+    measurement: Remark,
+    least_sigma: float,
     *,
-    worth_it: bool,
-    least: float,
+    worth_it: bool = True,
 ) -> str:
     """Return the advice: the trials to make, the hypotheses that they separate, and what to measure instead."""
+    promise, advice = separation_text(if_true, simulated), str(measurement)
     if not worth_it:
         return (
-            f"No trials within `limits` separate the tied hypotheses by {least:g} σ; the best would separate"
+            f"No trials within `limits` separate the tied hypotheses by {least_sigma:g} σ; the best would separate"
             f" {promise}. {advice}".rstrip()
         )
     text = f"Make {trials_in_words(trials)}. Together with the trials so far, they are expected to separate {promise}."
     if any(trial["new_vine"] for trial in trials):
         text += " B of the new vine is predicted here by scaling and will be fitted; measure its yield pressure."
-    if left:
-        pairs = joined([pair.replace(" | ", " from ") for pair in left])
+    if unresolved:
+        pairs = joined([pair.replace(" | ", " from ") for pair in unresolved])
         text += f" They will not separate {pairs}. {advice}"
     elif advice:
         text += f" A measurement would decide as well: {advice}"
     return text.rstrip()
 
 
+def measure_first_text(faults: Sequence[str], measurement: Remark) -> str:
+    """Return the advice where only faults of the measurement are tied."""
+    are = "are errors" if len(faults) > 1 else "is an error"
+    return f"Measure before making more trials: {joined(faults)} {are} of measurement. {measurement}"
+
+
 # ------------------------------------------------------------------------------
 # Trials that would reveal most, in words.
-
-MOST_SIZES = 3  # Effects whose detectable sizes are stated beside recommended trials, at most (chosen)
 
 LEAST_STATED_GAIN = 1.1  # Factor by which a detectable size must fall to be stated (chosen)
 
@@ -430,7 +387,7 @@ def informative_text(plan: InformativeTrials) -> str:
         for entry in plan.then.effects
         if entry.effect in before and _is_plausible(entry)
     ]
-    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > LEAST_STATED_GAIN][:MOST_SIZES]
+    gains = [gain for gain in sorted(gains, key=lambda gain: -gain[2]) if gain[2] > LEAST_STATED_GAIN][:MOST_NAMED]
     lower = [
         f"{spaced_name(then.effect)} from {then.symbol or 'size'} = {size_text(now, now.size_at(0.9))} to "
         f"{size_text(then, then.size_at(0.9))}"

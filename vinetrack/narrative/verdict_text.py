@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.units import decimals, display_unit, number, with_error
 from vinetrack.diagnosis.candidates import slip_of
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND
+from vinetrack.diagnosis.remarks import joined
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.odd_trials import OddTrial
+    from vinetrack.diagnosis.remarks import Remark
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.diagnosis.selection import SelectionStep
 
@@ -173,6 +175,7 @@ class Fact:
     question: str
     answer: str
     note: str = ""
+    code: str = ""
 
 
 def spaced_name(effect: str) -> str:
@@ -183,11 +186,6 @@ def spaced_name(effect: str) -> str:
 def listed_names(names: Sequence[str], last: str = "and") -> str:
     """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`."""
     return joined([spaced_name(name) for name in names], last)
-
-
-def joined(names: Sequence[str], last: str = "and") -> str:
-    """Return names as a sentence lists them; blank for none."""
-    return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
@@ -252,7 +250,7 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
         scored = [row for row in ranking if is_finite(row.sigma)]
         best = max(scored, key=lambda row: abs(row.sigma), default=None)
         note = f"largest of {len(scored)} candidates: {spaced_name(best.effect)}" if best else ""
-        return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
+        return Fact("Most significant candidate", f"{_sigmas(best)} σ", note, "most_significant") if best else None
     if diagnosis.odd_trials:
         return None
     if verdict == UNEXPLAINED and best is not None:
@@ -272,7 +270,7 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
         # An implausible candidate, or one whose Δχ² is only predicted, may have the larger Δχ².
         note = f"next best: {spaced_name(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
         note += "" if rival.plausible else ", not plausible"
-    return Fact("Significance", f"{_sigmas(best)} σ", note)
+    return Fact("Significance", f"{_sigmas(best)} σ", note, "significance")
 
 
 def _gain(row: Candidate) -> float:
@@ -291,11 +289,16 @@ def value_text(entry: Number) -> str:
 
 
 def estimate_text(entry: Number) -> str:
-    """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`."""
+    """Return a fitted number with its symbol and standard error: `γ = 1.170 ± 0.004`."""
+    return f"{entry.title} = {quantity_text(entry)}"
+
+
+def quantity_text(entry: Number) -> str:
+    """Return a fitted number with its standard error in its display unit: `1.170 ± 0.004`."""
     unit, factor = display_unit(entry.unit)
     if is_finite(entry.bound):
-        return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
-    text = f"{entry.title} = {value_text(entry)} {unit}".strip()
+        return f"{number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
+    text = f"{value_text(entry)} {unit}".strip()
     if entry.value < entry.lower or entry.value > entry.upper:
         text += " (negative, which is impossible)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
     return text
@@ -316,6 +319,7 @@ def _sizes(diagnosis: Diagnosis) -> list[Fact]:
                 f"Size of {spaced_name(name)}",
                 estimate_text(n[0]),
                 interval_text(n[0]) + _confounded_interval(diagnosis, n[0].key),
+                "size",
             )
             for name, n in of.items()
             if n
@@ -339,11 +343,16 @@ def _confounded_interval(diagnosis: Diagnosis, key: str) -> str:
 
 
 def interval_text(entry: Number) -> str:
-    """Return the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
-    unit, factor = display_unit(entry.unit)
+    """Return the 95 % interval of a fitted number, said to be one, in its display unit."""
+    return f"95 %: {bounds_text(entry, display_unit(entry.unit)[0])}"
+
+
+def bounds_text(entry: Number, unit: str = "") -> str:
+    """Return the ends of the 95 % interval of a fitted number in its display unit, a bound that it ends at named."""
+    factor = display_unit(entry.unit)[1]
     if not (is_finite(entry.low) and is_finite(entry.high)):
-        return "95 %: open"
-    text = f"95 %: {number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
+        return "open"
+    text = f"{number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
     ends = entry.ends_at
     return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
@@ -366,7 +375,7 @@ def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
         "False alarms", f"at most {percent(power.false_alarm_rate)}", "of such campaigns if nothing is missing"
     )
     if power.wary or not power.effects:
-        return [alarm, Fact("Detectable effects", "not computed", power.wary)]
+        return [alarm, Fact("Detectable effects", "not computed", str(power.wary))]
     undetectable = unseen(power)
     listing = (
         f"; not even then: {listed_names(undetectable)}" if 0 < len(undetectable) <= MOST_UNDETECTABLE_LISTED else ""
@@ -404,8 +413,7 @@ def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
     return table.loc[[value not in (True, "True") for value in table["partial"]]]
 
 
-MEASUREMENT = "measurement"
-MOST_BIASED_NAMED = 3  # Biased parameters named in a sentence, at most (chosen)
+MOST_NAMED = 3  # Parameters or effects named in a sentence, at most (chosen)
 
 # Significance from which a fault of the measurement below its threshold is named as worth a check (chosen)
 WORTH_A_CHECK_SIGMA = 3.0
@@ -441,7 +449,7 @@ def _missing(step: SelectionStep, model: str, trials: str) -> str:
         f"({abs(best.sigma):.1f} σ)."
     )
     if step.note:
-        return f"{text} {step.note[0].upper()}{step.note[1:]} ({' and '.join(best.names)} together do)."
+        return f"{text} {_capital(step.note)} ({' and '.join(best.names)} together do)."
     if best.names[-1] == "tail_slack":
         return (
             f"{text} The model predicts compression in the tail, which thin film cannot carry: `tail_slack: free` in "
@@ -632,9 +640,9 @@ def _with_the_fault(step: SelectionStep) -> str:
     if not biased:
         return ""
     changes = [f"{estimate_text(number)} instead of {value_text(before[number.name])}" for number in biased]
-    more = len(changes) - MOST_BIASED_NAMED
+    more = len(changes) - MOST_NAMED
     others = f", and {more} more parameter{'s change' if more > 1 else ' changes'}" if more > 0 else ""
-    return f" Fitted together with {best.names[-1]}, {', '.join(changes[:MOST_BIASED_NAMED])}{others}."
+    return f" Fitted together with {best.names[-1]}, {', '.join(changes[:MOST_NAMED])}{others}."
 
 
 def _is_biased(before: Number, with_fault: Number) -> bool:
@@ -658,7 +666,7 @@ def _remedies(step: SelectionStep) -> str:
 def _adequate(step: SelectionStep, model: str, trials: str) -> str:
     tests = step.tests
     if step.note:
-        return f"{model} explains {trials} within the errors of position. {step.note[0].upper()}{step.note[1:]}."
+        return f"{model} explains {trials} within the errors of position. {_capital(step.note)}."
     text = f"{model} explains {trials}: no missing effect can be detected."
     if tests.one_sided_z.size:
         names = tests.sensitivities.effects
@@ -671,7 +679,7 @@ def _adequate(step: SelectionStep, model: str, trials: str) -> str:
             f"chance takes a candidate to its threshold in one of {1 / tests.level:.0f} campaigns{stricter}."
         )
         kind = next(effect.kind for effect in tests.effects if effect.name == names[best])
-        if kind == MEASUREMENT and tests.one_sided_z[best] >= WORTH_A_CHECK_SIGMA:
+        if kind == "measurement" and tests.one_sided_z[best] >= WORTH_A_CHECK_SIGMA:
             text += f" It is a fault of the measurement that is soon checked: see `vinetrack effects {names[best]}`."
     return f"{text}{_unstated(step)}"
 
@@ -711,6 +719,11 @@ def _runner_up(step: SelectionStep) -> str:
     return text
 
 
+def _capital(note: Remark) -> str:
+    text = str(note)
+    return f"{text[0].upper()}{text[1:]}"
+
+
 def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
     """Return the explanation for trials whose stated pressure is inconsistent with the other trials."""
     names = joined([trial.name for trial in odd])
@@ -726,6 +739,16 @@ def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
         f"{': ' if pressures else ''}{'; '.join(pressures)}. Check {'its row' if single else 'their rows'} in the "
         f"sheet and {'its recording' if single else 'their recordings'}; `use: no` leaves a trial out."
     )
+
+
+def odd_deciding_in_words(
+    odd: Sequence[OddTrial], count: int, others: Diagnosis, with_them: str, withdrawn: bool
+) -> str:
+    """Return the explanation where the verdict rests on trials that are inconsistent with the others."""
+    names = joined([trial.name for trial in odd])
+    text = f"{odd_in_words(odd, count)} Without {names} the verdict is `{others.verdict}`: {others.explanation}"
+    rests = f" the verdict would rest on {'it' if len(odd) == 1 else 'them'} alone." if withdrawn else ""
+    return f"{text} With {names}:{rests} {with_them}"
 
 
 def dropped_in_words(trials: Sequence[str]) -> str:

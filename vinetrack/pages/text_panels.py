@@ -14,7 +14,7 @@ from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.figures.diagnosis_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.verdict_text import estimate_text
+from vinetrack.narrative.verdict_text import quantity_text
 from vinetrack.pages.campaign import (
     Campaign,
     Fitted,
@@ -70,7 +70,7 @@ def comparison_table(campaign: Campaign, held: HeldModel | None, now: HeldModel)
     fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
     for name in dict.fromkeys(name for numbers in fits for name in numbers):
         title = next(numbers[name].title for numbers in fits if name in numbers)
-        rows.append((title, *(estimate_text(n[name]).partition(" = ")[2] if name in n else "–" for n in fits)))
+        rows.append((title, *(quantity_text(n[name]) if name in n else "–" for n in fits)))
     return table(rows, ("", "held", "now"), ())
 
 
@@ -280,7 +280,6 @@ class RankedCandidate:
     effect: str
     delta_chi2: float
     in_answer_set: bool
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -327,7 +326,7 @@ def read_summary(folder: Path) -> DiagnosisSummary | None:
         unexplained=UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict),
         explanation=diagnosis.explanation,
         answer_set=diagnosis.answer_set,
-        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set, c.reason) for c in diagnosis.ranking),
+        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set) for c in diagnosis.ranking),
         cosine_names=first.cosine_names if first else (),
         cosines=tuple(tuple(row) for row in first.cosines) if first else (),
         next_experiment=diagnosis.next_experiment,

@@ -9,7 +9,6 @@ import contextlib
 import itertools
 import logging
 import math
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,9 +21,9 @@ from vinetrack.core.problems import INTERNAL_ERROR
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.core.units import with_error
 from vinetrack.figures.style import rows as iter_rows
-from vinetrack.narrative.diagnosis_text import to_go_on, verdict_line
+from vinetrack.narrative.diagnosis_text import contradicted_in_words, sentences_of, to_go_on, verdict_line
 from vinetrack.narrative.power_text import power_brief
-from vinetrack.narrative.verdict_text import estimates_text, joined, listed_names, settled_rows, summary_facts
+from vinetrack.narrative.verdict_text import estimates_text, listed_names, settled_rows, summary_facts
 from vinetrack.pipeline.model_stage import measured_trials, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_diagnosis, read_json, read_result
 from vinetrack.results.folder_layout import read_diagnosis as stored_diagnosis
@@ -355,8 +354,6 @@ def _cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-CONTRADICTION_WARNING = "But the measurements contradict the sheet in"
-_BETWEEN_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
@@ -395,11 +392,10 @@ def with_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[
     contradictions = sheet_contradictions(results, pairs)
     if not contradictions:
         return diagnosis
-    columns = joined(list(contradictions))
-    warning = f"{CONTRADICTION_WARNING} {columns}: correct that before relying on this verdict."
     return replace(
         diagnosis,
-        explanation=f"{diagnosis.explanation} {warning}",
+        explanation=f"{diagnosis.explanation} {contradicted_in_words(tuple(contradictions))}",
+        contradicted_columns=tuple(contradictions),
         notes=(*diagnosis.notes, *contradictions.values()),
     )
 
@@ -564,14 +560,13 @@ def diagnosis_lines(folder: Path) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     power = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    reasons, _, contradicted_columns = diagnosis.explanation.partition(CONTRADICTION_WARNING)
-    sizes = [
-        fact.answer for fact in summary_facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))
-    ]
+    columns = diagnosis.contradicted_columns
+    warning = f" {contradicted_in_words(columns)}" if columns else ""
+    sizes = [fact.answer for fact in summary_facts(diagnosis, None) if fact.code in ("significance", "size")]
     headline = verdict_line(diagnosis) + (f" ({'; '.join(sizes)})" if sizes else "")
     return [
-        f"{headline}. {CONTRADICTION_WARNING}{contradicted_columns}" if contradicted_columns else headline,
-        *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
+        f"{headline}.{warning}" if columns else headline,
+        *(f"  {line}" for line in sentences_of(diagnosis.explanation.removesuffix(warning))),
         *([f"{power[0].upper()}{power[1:]}"] if power and power not in headline else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),

@@ -298,7 +298,9 @@ def _further_trials(request: PowerRequest, campaign: PowerCampaign) -> Iterator[
     for text in request.effects:
         name, _, size = text.partition("=")
         if not size or name in campaign.power.not_testable:
-            remedy = "write the size to detect, such as leak=0.5" if not size else campaign.power.not_testable[name]
+            remedy = (
+                "write the size to detect, such as leak=0.5" if not size else str(campaign.power.not_testable[name])
+            )
             message = "needs a size" if not size else "cannot be tested with the columns of these trials"
             raise ExperimentError([Problem(message=message, column="--effect", value=text, remedy=remedy)])
         value = _size_of(text, campaign.power[name])

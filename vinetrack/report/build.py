@@ -28,7 +28,7 @@ from vinetrack.narrative.diagnosis_text import (
     vine_table,
     vines_without_law,
 )
-from vinetrack.narrative.verdict_text import interval_text, listed_names
+from vinetrack.narrative.verdict_text import bounds_text, listed_names
 from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_section
 from vinetrack.report.section import (
     ReportFigure,
@@ -376,7 +376,7 @@ def _number(entry: Number) -> dict[str, str]:
         "vine": entry.vine,
         "parameter": entry.key,
         "value": with_error(factor * entry.value, factor * entry.sigma),
-        "interval": interval_text(entry).removeprefix("95 %: ").removesuffix(f" {unit}"),
+        "interval": bounds_text(entry),
         "unit": unit,
     }
 

@@ -14,10 +14,10 @@ from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.diagnosis_text import PREFERRED
 from vinetrack.narrative.power_text import POWER_COLUMNS, could_have_seen, false_alarm_sentence, power_rows
 from vinetrack.narrative.verdict_text import (
-    estimate_text,
     estimates_text,
     is_finite,
     listed_names,
+    quantity_text,
     spaced_name,
     summary_facts,
     verdict_meaning,
@@ -128,7 +128,7 @@ def _round(index: int, entry: Round) -> dict[str, Any]:
             number(row.sigma, 2),
             estimates_text(row) or "–",
             "fitted" if row.status == REFITTED else "predicted",
-            "; ".join(part for part in ("" if row.plausible else "not plausible", row.reason) if part),
+            "; ".join(part for part in ("" if row.plausible else "not plausible", str(row.reason)) if part),
         )
         for row in entry.ranking
         if row.status != NOT_TESTABLE
@@ -286,9 +286,9 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
     titles: dict[tuple[str, str], str] = {}
     for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
         key = (str(entry["parameter"]), str(entry["vine"]))
-        left, _, right = estimate_text(Number.from_json({str(k): v for k, v in entry.items()})).partition(" = ")
-        titles[key] = left
-        cells.setdefault(key, {})[str(entry["added"])] = right
+        fitted = Number.from_json({str(k): v for k, v in entry.items()})
+        titles[key] = fitted.title
+        cells.setdefault(key, {})[str(entry["added"])] = quantity_text(fitted)
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
     return ReportTable("Parameters of every model", head, rows, frozenset(range(1, len(head))))
 

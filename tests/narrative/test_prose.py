@@ -1,0 +1,84 @@
+"""Prose stands in one room: every code has its sentence, and nothing outside cuts a sentence up to learn from it."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import vinetrack
+from vinetrack.diagnosis.remarks import Remark, remark
+from vinetrack.narrative import SENTENCES
+from vinetrack.narrative.diagnosis_text import REMARKS
+
+PACKAGE = Path(vinetrack.__file__).parent
+FILES = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "narrative"]
+TOLD = {"reason", "explanation", "note", "sentence", "words", "why", "answer", "question"}
+"""Names of what holds a sentence."""
+CUTS = {"startswith", "endswith", "partition", "rpartition", "removesuffix", "removeprefix", "find", "index"}
+
+
+def name_of(node: ast.AST) -> str:
+    """What an expression is called: `row.reason`, `note`, `str(error.reason)`, `estimate_text(…)`."""
+    if isinstance(node, ast.Call):
+        is_text = isinstance(node.func, ast.Name) and node.func.id == "str" and bool(node.args)
+        return name_of(node.args[0] if is_text else node.func)
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def is_told(node: ast.AST) -> bool:
+    return name_of(node) in TOLD or (isinstance(node, ast.Call) and name_of(node).endswith("_text"))
+
+
+def cuts_prose(node: ast.AST) -> bool:
+    """Whether it looks for constant words in a sentence."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CUTS:
+        constant = bool(node.args) and isinstance(node.args[0], ast.Constant)
+        return constant and is_told(node.func.value)
+    if isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+        return isinstance(node.left, ast.Constant) and isinstance(node.left.value, str) and is_told(node.comparators[0])
+    return False
+
+
+def test_no_module_outside_the_room_of_prose_parses_it() -> None:
+    cut = [
+        (str(path.relative_to(PACKAGE)), ast.unparse(node)[:90])
+        for path in FILES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if cuts_prose(node)
+    ]
+    # A window's reason is a sentence of `kinematics`.
+    assert [one for one in cut if one[0] != "kinematics/summary.py"] == []
+
+
+def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:
+    source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name == "diagnosis")
+    assert set(re.findall(r'[Rr]emark\(\s*"(\w+)"', source)) <= SENTENCES.keys() | REMARKS.keys()
+    assert [code for code in (*SENTENCES, *REMARKS) if f'"{code}"' not in source] == []
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (Remark(), ""),
+        (remark("contains", name="leak"), "it contains leak as a limit"),
+        (remark("columns_partly_blank", columns=["chamber_l", "inlet_mm"]),
+         "it needs `chamber_l` and `inlet_mm`, which the sheet leaves blank for some trials"),
+        (remark("no_tube", column="inlet_mm"),
+         "it acts on the gas of a chamber, and a body that moves as a whole has none"),
+        (remark("implausible_size", symbol="K", value=40.0, unit="", low=0.0, high=3.0),
+         "it would need K = 40, and 0 to 3 is plausible"),
+        (remark("implausible_size", symbol="M", value=4.0, unit="kg", low=0.0, high=3.0),
+         "it would need M = 4 kg, and 0 to 3 is plausible"),
+        (remark("several_missing", count=2), "two effects are missing: none alone removes the misfit"),
+        (remark("left_out_error_without", left_out="conditions", count=2, reason="it stops"),
+         "The error on left-out conditions is without 2 trials, unlike that in sample: it stops"),
+        (remark("not_tried", names=["leak", "lens"]),
+         "Not tried, because the sheet does not state what they need: leak and lens."),
+    ],
+)  # fmt: skip
+def test_a_remark_in_words(told: Remark, words: str) -> None:
+    assert str(told) == words
+    assert Remark.from_json(told.to_json()) == told
