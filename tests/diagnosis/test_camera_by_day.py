@@ -14,6 +14,8 @@ from vinetrack.core.records import Trial
 from vinetrack.inference.parameters import group_names, groups_of, make_layout
 from vinetrack.inference.prediction_band import values_for_trial
 
+pytestmark = pytest.mark.slow
+
 RATE = "time_base.eps"
 
 

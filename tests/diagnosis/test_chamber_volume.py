@@ -8,6 +8,8 @@ from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
 
+pytestmark = pytest.mark.slow
+
 RIVALS = ("reservoir_depletion", "supply_refill", "area_scale", "film_mass", "tail_friction", "leak")
 
 

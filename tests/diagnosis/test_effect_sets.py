@@ -21,6 +21,8 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.narrative.diagnosis_text import diagnosis_text
 from vinetrack.narrative.verdict_text import settled_rows
 
+pytestmark = pytest.mark.slow
+
 CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
 TRUTH = {
     "reservoir_depletion.gamma": 1.3,

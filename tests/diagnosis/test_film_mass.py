@@ -30,6 +30,8 @@ from vinetrack.diagnosis.remarks import Remark
 from vinetrack.effects import catalogue
 from vinetrack.inference.robust_covariance import FILM_ERROR
 
+pytestmark = pytest.mark.slow
+
 FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
 TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
 

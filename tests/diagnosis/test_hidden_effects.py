@@ -16,6 +16,8 @@ from hidden import Hidden, make
 import vinetrack as vt
 from vinetrack.diagnosis.result import DROPPED_FRAMES, Diagnosis
 
+pytestmark = pytest.mark.slow
+
 
 @lru_cache
 def asked(kind: str, seed: int, *, once: bool = False) -> tuple[Hidden, Diagnosis]:

@@ -1,0 +1,74 @@
+"""What people read, one stored text of each kind; a change of words shows here and nowhere else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hand_diagnosis import diagnosis
+
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, FurtherTrials, NumberWidth, Power, PowerInput
+from vinetrack.diagnosis.remarks import remark
+from vinetrack.diagnosis.result import VERDICTS, Diagnosis
+from vinetrack.narrative.power_text import further_lines
+from vinetrack.narrative.verdict_text import summary_facts, verdict_meaning, verdict_sentence
+
+
+def effect(name: str, symbol: str, at_half: float, largest: float) -> EffectPower:
+    sizes = tuple(float(size) for size in at_half * np.linspace(0.5, 1.5, len(PROBABILITIES)))
+    return EffectPower(name, "physical", f"{name}.size", symbol, "1", 0.0, 0.0, largest, sizes, {"inlet_loss": 0.26})
+
+
+POWER = Power(
+    n_trials=6,
+    threshold=4.0,
+    false_alarms={"scores of all candidates": 0.003, "any smooth force": 0.0012},
+    effects=(effect("fold_inertia", "η", 0.7, 1.0), effect("air_drag", "C_D", 150.0, 3.0)),
+    not_testable={"payload_drag": remark("column_blank", column="payload_g")},
+    numbers=(NumberWidth("n", "", 0.37, 0.0075), NumberWidth("B", "tube", 6.4, 0.034)),
+    inputs=(PowerInput("frame rate", "1069 /s", "sheet"),),
+    model=("gravity", "eversion_damping"),
+)
+
+
+def verdicts() -> str:
+    told = [Diagnosis.from_json(diagnosis(verdict)) for verdict in VERDICTS]
+    facts = [[f"{f.question}: {f.answer} ({f.note})" for f in summary_facts(said, None)] for said in told]
+    parts = [
+        "\n".join([verdict_sentence(said), verdict_meaning(said), *of_it, "", str(said)])
+        for said, of_it in zip(told, facts, strict=True)
+    ]
+    return "\n\n----\n".join(parts)
+
+
+def power() -> str:
+    wary = replace(POWER, effects=(), wary=remark("excess_counted_as_noise"))
+    return f"{POWER}\n\n----\n{wary}"
+
+
+def plan() -> str:
+    entry = POWER["fold_inertia"]
+    none = FurtherTrials("fold_inertia", "eta", "η", "1", 0.5, 0.9, 0.2, power=entry)
+    enough = replace(none, before=0.95)
+    never = replace(none, unlimited=0.4, n_conditions=12)
+    trials = [{"replicates": 2, "pressure_kPa": 30.0, "payload_g": 20.0, "diameter_mm": 24.0, "thickness_um": 200.0,
+               "length_mm": 280.0, "chamber_l": 3.7, "inlet_mm": 5.7, "growth_angle_deg": math.nan,
+               "new_vine": False, "changed": ["inlet_mm"]}]  # fmt: skip
+    pair = "air_drag | inlet_loss"
+    facts = {"trials": trials, "if_true": {pair: {"air_drag": 10.0, "inlet_loss": 4.3}}, "least_sigma": 3.0}
+    facts |= {"simulated": {pair: (4.0, 0.5)}, "unresolved": [], "measurement": remark("")}
+    made = [remark(code, **facts) for code in ("trials_to_make", "no_trials_separate")]
+    first = remark("measure_first", faults=["length_scale", "time_base"], measurement=remark(""))
+    return "\n".join(
+        [*(line for one in (none, enough, never) for line in further_lines(one)), *map(str, [*made, first])]
+    )
+
+
+@pytest.mark.parametrize("make", [verdicts, power, plan])
+def test_the_text_is_the_stored_one(make: Callable[[], str]) -> None:
+    stored = Path(__file__).with_name(f"{make.__name__}.txt")
+    assert make() + "\n" == stored.read_text(encoding="utf-8"), f"if it is meant to be so, store it in {stored.name}"
