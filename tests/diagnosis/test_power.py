@@ -34,6 +34,7 @@ from vinetrack.diagnosis.linear_power import (
 )
 from vinetrack.diagnosis.misfit_tests import FALSE_ALARM_LEVEL_FIRST_ROUND, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
+from vinetrack.diagnosis.remarks import remark
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.diagnosis.score_test import fit_columns, informations_at, scores_of
 from vinetrack.inference import sensitivity
@@ -65,7 +66,7 @@ def six() -> MisfitTests:
 
 @pytest.fixture(scope="module")
 def power(six: MisfitTests) -> Power:
-    return power_of(six, {"payload_drag": "no payload"})
+    return power_of(six, {"payload_drag": remark("column_blank", column="payload_g")})
 
 
 def place_of(questions: MisfitTests, name: str) -> int:
