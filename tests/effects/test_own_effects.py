@@ -152,6 +152,7 @@ def test_what_fails_wherever_it_is_asked_is_told_in_a_sentence(tmp_path: Path) -
     ("old", "new", "told"),
     [
         ("def tail_force", "def pull", "defines none of the functions"),
+        ("import numpy as np\n", "import numpy as np\ndef :\n", "cannot be read (SyntaxError"),
         ("(s, rig, q)", "(s, rig)", "must be tail_force(s, rig, q)"),
         ("    tail force −q √x\n", "", "show the formula on an indented line"),
         ("import numpy as np\n", "import numpy as np\n1/0\n", "ZeroDivisionError"),
