@@ -5,23 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.text import Text
+from figure_frames import assert_nothing_is_cut_off, words
 
 from vinetrack.figures.paper_figures import (
     draw_paper_damping,
     draw_paper_position,
     draw_paper_reservoir,
     draw_paper_rms,
+    draw_paper_speeds,
 )
-from vinetrack.figures.style import look
 
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
 PRINTED_CM = {7: 1.90, 14: 0.29, 28: 0.31}
-
-
-def words(figure: Figure) -> str:
-    return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 
 def motions() -> pd.DataFrame:
@@ -45,23 +40,18 @@ ERRORS = pd.DataFrame({"pressure_kPa": [7.0], "rms_mean_m": [0.0032]})
 
 
 def test_every_pressure_has_a_panel_with_its_errors() -> None:
-    figure = draw_paper_position(motions(), means(), ERRORS, PRINTED_CM)
+    figure = draw_paper_position(motions(), means(), ERRORS)
     assert len(figure.axes) == 3
     assert "7 kPa\nrms: printed 1.90 cm, ours 0.32 cm" in words(figure)
     assert "28 kPa\nrms: printed 0.31 cm, not among the trials" in words(figure)
 
 
 def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
-    ax = draw_paper_position(motions(), means(), ERRORS, PRINTED_CM).axes[0]
+    ax = draw_paper_position(motions(), means(), ERRORS).axes[0]
     (eq2,) = (line for line in ax.lines if line.get_label().startswith("Eq. (2)"))
     assert eq2.get_ydata()[-1] == pytest.approx(28.0)
     (mean,) = (line for line in ax.lines if line.get_marker() == "o")
     assert np.allclose(mean.get_ydata(), 28 * 7 * np.asarray(mean.get_xdata()))
-
-
-def test_without_trials_the_motions_stand_alone() -> None:
-    figure = draw_paper_position(motions(), means().iloc[:0], ERRORS.iloc[:0], PRINTED_CM)
-    assert words(figure).count("not among the trials") == 3
 
 
 def points() -> pd.DataFrame:
@@ -83,30 +73,19 @@ def damping() -> dict:
 
 
 def test_both_rules_have_a_panel_with_their_own_points() -> None:
-    figure = draw_paper_damping(points(), damping(), {1: 0.57, 4: 6.44}, 0.37)
-    counts = [[len(line.get_xdata()) for line in ax.lines if line.get_marker() in ("o", "s")] for ax in figure.axes]
+    figure = draw_paper_damping(points(), damping())
+    counts = [[len(line.get_xdata()) for line in ax.lines if line.get_marker() in ("o", "D")] for ax in figure.axes]
     assert counts == [[4, 4], [3, 3]]
     assert "n = 0.380 (95 %: 0.360 to 0.384), printed 0.37" in words(figure)
     assert "R = 4: B 6.40, printed 6.44; N = 3" in words(figure)
 
 
 def test_printed_lines_have_the_printed_slope() -> None:
-    ax = draw_paper_damping(points(), damping(), {1: 0.57, 4: 6.44}, 0.37).axes[0]
+    ax = draw_paper_damping(points(), damping()).axes[0]
     dashed = [line for line in ax.lines if line.get_linestyle() == "--"]
     assert len(dashed) == 2
     x, y = (np.log(values) for values in dashed[0].get_data())
     assert np.polyfit(x, y, 1) == pytest.approx([0.37, np.log(0.57)])
-
-
-def test_trials_of_other_sizes_have_no_place_beside_fig_6() -> None:
-    assert "printed size" in words(draw_paper_damping(points().iloc[-1:], damping(), {1: 0.57}, 0.37))
-
-
-def test_trials_without_a_steady_speed_are_reported() -> None:
-    never = points().assign(used=False, eligible=False)
-    assert "steady speed" in words(draw_paper_damping(never, damping(), {1: 0.57, 4: 6.44}, 0.37))
-    literal = draw_paper_damping(points().assign(used=False), damping(), {1: 0.57, 4: 6.44}, 0.37)
-    assert [ax.get_legend() is None for ax in literal.axes] == [False, True]
 
 
 def pressures() -> pd.DataFrame:
@@ -149,24 +128,31 @@ def test_published_errors_stand_beside_ours() -> None:
     assert "m/s" in right.get_ylabel()
 
 
-def every_figure() -> list[tuple[str, Figure]]:
-    return [
-        ("position", draw_paper_position(motions(), means(), ERRORS, PRINTED_CM)),
-        ("damping", draw_paper_damping(points(), damping(), {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}, 0.37)),
-        ("reservoir", draw_paper_reservoir(pressures())),
-        ("rms", draw_paper_rms(paper(), departures())),
+def speeds() -> pd.DataFrame:
+    row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
+    rows = [
+        row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
+        for kPa in (14.0, 28.0)
+        for g in (0.0, 20.0, 35.6)
     ]
+    return pd.DataFrame(rows)
 
 
-@pytest.mark.parametrize(("name", "figure"), every_figure(), ids=lambda value: value if isinstance(value, str) else "")
-def test_no_words_are_cut_off_and_no_legend_covers_an_axis(name: str, figure: Figure) -> None:
-    with look():
-        figure.draw_without_rendering()
-        drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
-        assert edge.x0 <= drawn.x0, name
-        assert drawn.x1 <= edge.x1, name
-        assert edge.y0 <= drawn.y0, name
-        assert drawn.y1 <= edge.y1, name
-        for legend in [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]:
-            for ax in figure.axes:
-                assert not legend.get_window_extent().padded(-1).overlaps(ax.get_window_extent().padded(-1)), name
+def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
+    (ax,) = draw_paper_speeds(speeds(), speeds().assign(final_lead_velocity_m_s=1.0)).axes
+    assert [len(container.lines[0].get_xdata()) for container in ax.containers] == [3, 3]
+    assert len([line for line in ax.lines if list(line.get_ydata()) == [1.0] * 3]) == 2
+    assert draw_paper_speeds(speeds().assign(pressure_kPa=range(6)), speeds()) is None
+
+
+def test_without_trials_of_a_printed_size_there_is_no_fig_6() -> None:
+    assert draw_paper_damping(points().iloc[-1:], damping()) is None
+    assert draw_paper_damping(points().assign(used=False, eligible=False), damping()) is None
+
+
+def test_nothing_is_cut_off() -> None:
+    assert_nothing_is_cut_off(draw_paper_position(motions(), means(), ERRORS))
+    assert_nothing_is_cut_off(draw_paper_damping(points(), damping()))
+    assert_nothing_is_cut_off(draw_paper_reservoir(pressures()))
+    assert_nothing_is_cut_off(draw_paper_rms(paper(), departures()))
+    assert_nothing_is_cut_off(draw_paper_speeds(speeds(), speeds()))

@@ -6,22 +6,16 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import pandas as pd
 import pytest
+from figure_frames import assert_nothing_is_cut_off, words
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
-from vinetrack.figures.damping_figures import draw_efficiency, draw_payload_speed, draw_speed_scaling
-from vinetrack.figures.style import look
+from vinetrack.figures.damping_figures import draw_efficiency, draw_speed_scaling
 
 LINE = {"slope": 0.1, "slope_95": [0.02, 0.18], "intercept": 0.5, "intercept_95": [0, 1], "R2": 0.935, "p": 0.033}
 POWER = {**LINE, "slope": 0.7, "slope_95": [0.1, 1.3], "intercept": math.log(0.3), "p": 0.04}
 NO_LINES = {"power": None, "line": None, "refused": "2 sizes; at least 3"}
-
-
-def words(figure: Figure) -> str:
-    return "\n".join(text.get_text() for text in figure.findobj(Text))
 
 
 def speed_family(sizes: list[float], pressure_kPa: float = 24.0) -> dict:
@@ -55,23 +49,6 @@ def efficiency_family(n_diameters: int = 2) -> dict:
         "conditions": [""] * len(sizes),
         "trend": dict.fromkeys(("efficiency", "efficiency_payload", "efficiency_with_weight"), trend),
     }
-
-
-def conditions(vines: int = 1) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "vine": f"vine{i}",
-            "pressure_kPa": pressure,
-            "payload_g": payload,
-            "n_final": 4,
-            "final_at_mm": 120.0,
-            "final_lead_velocity_m_s": pressure / (10 + payload),
-            "final_lead_velocity_sigma_m_s": 0.1,
-        }
-        for i in range(vines)
-        for pressure in (14.0, 28.0)
-        for payload in (10.0, 20.0, 40.0)
-    )
 
 
 def points(figure: Figure, axis: int = 0) -> list[np.ndarray]:
@@ -114,16 +91,6 @@ def test_two_points_of_nearly_one_value_stand_inside_the_axes() -> None:
     assert "does not include replicate scatter" in words(figure).replace("\n", " ")
 
 
-def test_single_trials_have_no_standard_error() -> None:
-    family = {**efficiency_family(), "n_efficiency": [1] * 6}
-    refused = {"refused": "6 conditions; a power of wall with an error takes 7", "n": 6}
-    family["trend"] = dict.fromkeys(family["trend"], refused)
-    said = words(draw_efficiency({"efficiency": [family]})).replace("\n", " ")
-    assert "N = 1 trial per point" in said
-    assert "standard error" not in said
-    assert "no trend: 6 conditions" in said
-
-
 def test_three_ways_to_count_efficiency() -> None:
     figure = draw_efficiency({"efficiency": [efficiency_family(), efficiency_family()]})
     assert len(figure.axes) == 6
@@ -139,48 +106,20 @@ def test_one_diameter_is_drawn_against_the_wall_alone() -> None:
     assert [ax.get_xlabel() for ax in figure.axes] == ["wall thickness (µm)"] * 3
 
 
-def test_final_speeds_stand_beside_the_model() -> None:
-    measured = conditions()
-    figure = draw_payload_speed(measured, measured.drop(columns="n_final"), line="the law")
-    assert [len(part) for part in points(figure)] == [3, 3]
-    (ax,) = figure.axes
-    curves = [curve for curve in ax.lines if curve.get_linewidth() == 1.5 and len(curve.get_xdata()) == 3]
-    assert [curve.get_ydata()[0] for curve in curves] == pytest.approx([0.7, 1.4])
-    assert words(figure).count("the law") == 1
-    assert "vine0, after 120 mm\nN = 4 trials per point" in words(figure)
-
-
-def test_vines_with_one_payload_at_each_pressure_are_not_drawn() -> None:
-    lonely = conditions().assign(pressure_kPa=range(6))
-    assert "No vine was grown with more than one payload" in words(draw_payload_speed(lonely, lonely.iloc[:0]))
-
-
-def test_without_families_the_figures_say_why() -> None:
-    assert "scaled copies" in words(draw_speed_scaling({"steady_speed": []}))
-    assert "the same length" in words(draw_efficiency({}))
-
-
 FAMILIES = [speed_family([6.0, 12.0, 18.0, 24.0]), speed_family([6.0, 12.0], 30.0)]
 NOTE = "Alvarez et al. (2025): a sentence that is set below"
 EVERY_FIGURE: dict[str, Callable[[], Figure]] = {
     "speed": lambda: draw_speed_scaling({"steady_speed": FAMILIES}, NOTE),
     "efficiency": lambda: draw_efficiency({"efficiency": [efficiency_family()]}, NOTE),
     "efficiency of one diameter": lambda: draw_efficiency({"efficiency": [efficiency_family(1)]}),
-    "payload": lambda: draw_payload_speed(conditions(), conditions(), NOTE),
-    "payload of five vines": lambda: draw_payload_speed(conditions(5), conditions(5)),
 }
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_nothing_is_cut_off_and_no_legend_covers_the_axes(name: str) -> None:
-    figure = EVERY_FIGURE[name]()
-    with look():
-        figure.draw_without_rendering()
-        drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
-        assert edge.x0 <= drawn.x0, name
-        assert drawn.x1 <= edge.x1, name
-        assert edge.y0 <= drawn.y0, name
-        assert drawn.y1 <= edge.y1, name
-        for legend in [ax.get_legend() for ax in figure.axes if ax.get_legend()]:
-            for ax in figure.axes:
-                assert not legend.get_window_extent().padded(-1).overlaps(ax.get_window_extent().padded(-1)), name
+def test_nothing_is_cut_off(name: str) -> None:
+    assert_nothing_is_cut_off(EVERY_FIGURE[name]())
+
+
+def test_without_content_there_is_no_figure() -> None:
+    assert draw_speed_scaling({"steady_speed": []}) is None
+    assert draw_efficiency({}) is None

@@ -60,7 +60,7 @@ def test_a_figure_of_one_trial_takes_its_name(loaded: LoadedResults) -> None:
 
 
 def test_a_figure_without_content_is_neither_drawn_nor_written(loaded: LoadedResults, small_run: Path) -> None:
-    with pytest.raises(ResultsError, match="those with content are damping_law"):
+    with pytest.raises(ResultsError, match="no figure 'missing_force'"):
         loaded.plot("missing_force")
     assert not (small_run / "figures" / "missing_force.svg").exists()
     assert (small_run / "figures" / "ladder.svg").exists()

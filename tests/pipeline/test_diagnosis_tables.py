@@ -12,24 +12,22 @@ import pytest
 from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 from vinetrack.diagnosis.result import Round
-from vinetrack.figures import registry
-from vinetrack.figures.registry import draw
+from vinetrack.figures.registry import diagnosis_figures, draw
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_stage import (
+    DiagnosisTables,
     cosines_by_rank,
-    figure_tables,
     predicted_trials,
     ranking_table,
     read_diagnosis_tables,
     round_heading,
     worst_condition,
 )
-from vinetrack.pipeline.report_stage import figure_inputs, with_final_model
+from vinetrack.pipeline.report_stage import with_final_model
 from vinetrack.results.folder_layout import Results
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2
 TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
-PICTURES = {"ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift"}
 
 
 def conditions() -> pd.DataFrame:
@@ -80,7 +78,7 @@ def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: boo
 def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Path) -> None:
     found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
     assert found is not None
-    assert found.worst == "slow"
+    assert found.worst == "12 mm, 24 kPa"
     assert set(found.before_after["trial"]) == {"a", "b"}
     assert worst_condition(found.before_after.iloc[:0]) == ""
 
@@ -113,30 +111,17 @@ def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: 
 def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, verdict: str) -> None:
     found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
     assert found is not None
-    inputs = figure_inputs(found)
-    assert set(inputs) == set(figure_tables(found)) <= PICTURES
-    for name, values in inputs.items():
-        assert render(draw(name, *values), ["svg"])["svg"]
-    tables = figure_tables(found)
-    assert {"ladder", "before_after", "where", "candidates", "cosines"} <= set(tables)
-    assert "drift" not in tables
-
-
-def test_a_registered_figure_of_the_diagnosis_without_a_table_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
-    added = {**registry.DIAGNOSIS_FIGURES, "pie": registry.RegisteredFigure("pie", "where", "Pie", "Pie")}
-    monkeypatch.setattr(registry, "DIAGNOSIS_FIGURES", added)
-    with pytest.raises(RuntimeError, match="pie: not both in"):
-        figure_tables(found)
+    drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
+    assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
+    for name, figure in drawn.items():
+        assert render(figure, ["svg"])["svg"]
+        assert len(getattr(found, diagnosis_figures()[name].data)) > 0
 
 
 @pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
 def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dict | None) -> None:
-    found = read_diagnosis_tables(folder(tmp_path / "r", content), conditions())
-    assert found is None
-    assert figure_tables(found) == {}
+    assert read_diagnosis_tables(folder(tmp_path / "r", content), conditions()) is None
+    assert not any(draw(name, DiagnosisTables()) for name in diagnosis_figures())
 
 
 def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
@@ -144,8 +129,7 @@ def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
     (tmp_path / "diagnosis.json").write_text(json.dumps(diagnosis()))
     found = read_diagnosis_tables(results, conditions())
     assert found is not None
-    assert set(figure_tables(found)) == {"candidates", "cosines"}
-    assert set(figure_inputs(found)) == {"candidates", "cosines"}
+    assert {name for name in diagnosis_figures() if draw(name, found)} == {"candidates", "cosines"}
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:

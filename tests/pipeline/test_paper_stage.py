@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.figures.registry import PAPER_FIGURES
+from vinetrack.figures.registry import figures_of
 from vinetrack.laboratory.tracks import grow, read_ground_truth, write_experiment
 from vinetrack.pipeline.workflow import PAPER_TABLES
 
@@ -67,7 +67,7 @@ def test_every_table_and_figure_is_there(beside: tuple[Path, str]) -> None:
     results, _ = beside
     for name in PAPER_TABLES:
         assert len(pd.read_csv(results / f"{name}.csv")) > 0, name
-    for name in PAPER_FIGURES:
+    for name in figures_of("paper"):
         assert "<svg" in (results / "figures" / f"{name}.svg").read_text(encoding="utf-8"), name
 
 

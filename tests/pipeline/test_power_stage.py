@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
-from vinetrack.figures.registry import draw
+from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.pipeline import power_stage
 from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
@@ -115,7 +115,7 @@ def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> No
 
 def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:
     power = power_of_target(PowerRequest(folder))
-    ax, told = draw("power", power).axes[:2]
+    ax, told = draw_power(power).axes[:2]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["leak, 1/τ", "air drag, C_D"]
     texts = {text.get_text() for text in told.texts}
     assert "3.0" in texts

@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 
 from vinetrack.core.problems import ExperimentError
-from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
-from vinetrack.report.build import figure_caption
 
 ROOT = Path(__file__).parents[2]
 
@@ -112,14 +110,6 @@ def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
     after = make_plan({"experiment": folder, "damping": {"seed": 99}}, tmp_path)
     assert before.stage_settings("steady") == after.stage_settings("steady")
     assert before.stage_settings("damping") != after.stage_settings("damping")
-
-
-def test_every_figure_has_a_caption_for_both_reports() -> None:
-    captions = {path.stem for path in (workflow.PACKAGE / "report" / "captions").glob("*.rst")}
-    assert captions == set(FIGURES)
-    assert not {name for name in FIGURES if len(figure_caption(name)) < 50}
-    root = workflow.PACKAGE.parent
-    assert not {name for name, figure in FIGURES.items() if not (root / figure.caption_file).is_file()}
 
 
 def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path: Path) -> None:

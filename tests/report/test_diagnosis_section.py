@@ -12,7 +12,7 @@ from test_report import EVIL, SVG, Tags, page
 
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis, Round
-from vinetrack.figures.registry import DIAGNOSIS_FIGURES
+from vinetrack.figures.registry import diagnosis_figures
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative import verdict_text
 from vinetrack.narrative.verdict_text import Fact, listed_names
@@ -301,13 +301,13 @@ def test_a_diagnosis_with_nothing_but_a_verdict_makes_a_page(verdict: str) -> No
 
 
 def test_pictures_stand_in_the_parts_they_belong_to() -> None:
-    figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in DIAGNOSIS_FIGURES]
+    figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in diagnosis_figures()]
     html = page(diagnosis=DiagnosisResult(read(diagnosis()), ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', "figure-cosines", 'id="drift"', "figure-drift"]
     places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
     assert places == sorted(places)
-    for key in DIAGNOSIS_FIGURES:
+    for key in diagnosis_figures():
         assert f'download="{key}.csv"' in html
 
 

@@ -10,14 +10,13 @@ from test_report import EVIL, SVG, Tags, page, trials
 from vinetrack.report import build as report_trials
 from vinetrack.report.build import (
     MAX_CLIP_BYTES,
-    MAX_SVG_BYTES,
     SHARED_ERROR,
     Clip,
     TrackedRecording,
     calibration_table,
     count_frames,
 )
-from vinetrack.report.section import inline_svg
+from vinetrack.report.section import inline_picture
 
 BOARD = {
     "kind": "charuco",
@@ -51,21 +50,11 @@ def test_how_edge_and_scale_were_found_is_said_where_there_are_recordings() -> N
     assert "<h3>Edge</h3>" not in page()
 
 
-def test_an_experiment_of_tracks_has_neither_section() -> None:
-    html = page()
-    assert "A strip is the recording" not in html
-    assert 'id="calibration"' not in html
-
-
 def test_the_calibration_is_listed_with_its_error_and_what_it_rests_on() -> None:
     html = page(recordings={"a": recording()})
     for words in ("ChArUco board", "calibration/board.png", "0.240700", "0.0090 %", "0.031 px", "52 in 1", "40 %"):
         assert words in html
     assert SHARED_ERROR.replace("'", "&#39;") in html
-
-
-def test_the_error_of_the_scale_is_stated_separately_from_random_error() -> None:
-    assert "stated separately from the random error" in SHARED_ERROR
 
 
 def test_recordings_of_one_target_share_a_row_and_its_largest_error() -> None:
@@ -100,7 +89,7 @@ def test_a_failed_recording_shows_its_reason_and_no_picture() -> None:
 def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("a", "b", "c")
     recordings = {name: recording() for name in names}
-    weight = len(inline_svg(SVG, "s-a", "Strip of a with its tracked edge"))
+    weight = len(inline_picture(SVG, "s-a", "Strip of a with its tracked edge"))
     monkeypatch.setattr(report_trials, "MAX_TRIAL_FIGURES_BYTES", 2 * weight)
     html = page(trials=trials(*names), recordings=recordings)
     assert html.count('aria-label="Strip of') == 2
@@ -118,11 +107,6 @@ def test_a_clip_beside_the_page_is_linked_and_one_plays_in_it() -> None:
 
 def test_a_clip_too_large_for_the_page_does_not_play_in_it() -> None:
     assert "<video" not in page(clip=Clip("a", bytes(MAX_CLIP_BYTES + 1), "c"))
-
-
-def test_a_strip_too_large_for_the_page_is_left_out() -> None:
-    html = page(recordings={"a": TrackedRecording(SVG + " " * MAX_SVG_BYTES, [""])})
-    assert "Strip of a" not in html
 
 
 def test_frames_are_counted_by_their_flags() -> None:

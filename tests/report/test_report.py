@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import re
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -11,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.narrative.diagnosis_text import damping_headline, status_tally, vines_without_law
 from vinetrack.report.build import (
     MAX_DATA_ROWS,
     ReportContent,
@@ -21,7 +21,7 @@ from vinetrack.report.build import (
     build_report,
     speed_sparkline,
 )
-from vinetrack.report.section import data_uri, inline_svg
+from vinetrack.report.section import data_uri, inline_picture
 
 EVIL = "<script>alert('x')</script>&\"'"
 SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
@@ -108,37 +108,6 @@ def downloaded(href: str | None) -> str:
     head, _, data = (href or "").partition(",")
     assert head.startswith("data:")
     return base64.b64decode(data).decode() if head.endswith("base64") else unquote(data)
-
-
-def test_the_first_screen_says_n_with_its_error_and_how_many_trials() -> None:
-    html = page(damping=damping("v", "w"), trials=trials("a", "b"))
-    heading = re.search(r"<h1>(.*?)</h1>", html)
-    assert heading is not None
-    law = "one damping exponent fits all vines: n = 0.371 (95 %: 0.361 to 0.381), from 8 trials of 2 vines."
-    assert heading[1] == f"From steady speeds: {law}"
-    assert "2 trials: 2 ok." in html
-
-
-def test_one_vine_has_b_in_the_headline() -> None:
-    assert "B = 2.00 (95 %: 1.90 to 2.10) N·(s/m)ⁿ" in damping_headline(damping("v"))
-
-
-def test_a_refusal_is_the_headline() -> None:
-    assert (
-        damping_headline(damping(refused="no vine has enough trials")) == "No damping law: no vine has enough trials."
-    )
-
-
-def test_every_status_is_counted() -> None:
-    mixed = pd.concat([trials("a"), trials("b", "c", status="failed"), trials("d", status="left_out")])
-    assert status_tally(mixed) == "4 trials: 1 ok, 2 failed, 1 left out on request."
-
-
-def test_vines_that_the_fit_left_out_are_named() -> None:
-    fit = damping("v")
-    fit["both_axes"] = {**fit["both_axes"], "left_out": {"w": "2 steady trials"}}
-    assert vines_without_law(fit) == ["w: 2 steady trials"]
-    assert "No B for w: 2 steady trials." in page(damping=fit)
 
 
 def test_every_trial_stands_with_status_and_reason() -> None:
@@ -247,7 +216,7 @@ def test_a_further_section_comes_before_the_trials() -> None:
 
 
 def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None:
-    svg = inline_svg(SVG, "law", 'a "law"')
+    svg = inline_picture(SVG, "law", 'a "law"')
     assert svg.startswith("<svg")
     assert "currentColor" in svg
     assert "var(--blue)" in svg
@@ -282,7 +251,26 @@ def test_500_trials_stay_below_two_megabytes() -> None:
     assert len(html.encode()) < 2e6
 
 
-def test_a_blank_direction_of_growth_is_said() -> None:
-    note = "growth_angle_deg is blank (all trials): taken as 0, straight down"
-    assert f"<p>{note}.</p>" in page(notes=[note])
-    assert "straight down" not in page()
+def png(width_px: int = 300, shade: tuple[int, ...] = (200, 10, 10)) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.new("RGB", (width_px, 20), shade).save(file, "PNG", dpi=(150, 150))
+    return file.getvalue()
+
+
+def test_a_figure_that_is_only_a_png_is_on_the_page_as_large_as_it_was_drawn() -> None:
+    html = page(figures=[ReportFigure("law", "Law", "caption", png())], trial_figures={"a": png()})
+    images = [attributes for tag, attributes in Tags(html).tags if tag == "img"]
+    assert [image["style"] for image in images] == ["--wide:192px"] * 2  # 2 in of 96 px
+    assert all(str(image["src"]).startswith("data:image/webp;base64,") for image in images)
+
+
+def test_coordinates_are_shortened_and_images_keep_the_decimals_that_place_them() -> None:
+    data = base64.b64encode(png()).decode()
+    placed = f'<image xlink:href="data:image/png;base64,{data}" transform="matrix(0.123456 0 0 1 0 0)"/></svg>'
+    svg = inline_picture(SVG.replace("M 0 0 L 5 5", "M 0.123456 0 L 5 5").replace("</svg>", placed), "s", "s")
+    assert "M 0.12 0 L 5 5" in svg
+    assert "matrix(0.123456 0" in svg
+    assert "data:image/webp" in svg
+    assert data not in svg

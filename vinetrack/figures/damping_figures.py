@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.units import interval, number, with_interval
+from vinetrack.figures.registry import figure
 from vinetrack.figures.style import (
     DASHED,
     INK,
@@ -22,16 +23,13 @@ from vinetrack.figures.style import (
     PAPER,
     VINE_COLOURS,
     VineStyle,
-    blank,
     counted,
     error_points,
     legend_above,
     line_key,
-    look,
+    new_figure,
     note_below,
-    panel_grid,
     plain_log_ticks,
-    rows,
     up_from_zero,
     vine_styles,
 )
@@ -44,35 +42,36 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 _TWO_LINE_VINES = 6  # Chosen: a legend with two lines for each of six vines is 2.5 in high, of 5.6 in of figure
 
 _MAX_LEGEND_VINES = 14  # Chosen: with one line each, and those of both methods, they fill the height of the figure
 
 
-def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure:
-    """Draw F against x_ss for every vine."""
-    from matplotlib.figure import Figure
-
+@figure("damping_law", "damping", "Steady force and steady speed", data="damping_points.csv")
+def draw_damping_law(points: pd.DataFrame, damping: dict[str, Any]) -> Figure | None:
+    """Steady force against steady tail speed of every vine, on logarithmic axes, where F = B·x_ssⁿ is a straight
+    line of slope n. Bars are one standard error. Dashed: least squares on logarithms, as in the paper; solid:
+    errors on both axes; bands are 95 % confidence bands. Hollow: trials not used in the fit; the table of trials
+    states the reason.
+    """
     drawable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
     if drawable.empty:
-        return blank("No trial has a steady speed and a force above zero, so there is no damping law to draw.")
+        return None
     styles = vine_styles(points["vine"])
-    with look():
-        fig = Figure(figsize=(8.6, 5.6), layout="constrained")
-        ax = fig.add_subplot()
-        ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
-        for vine, group in drawable.groupby("vine", sort=False):
-            _draw_points(ax, group, styles[str(vine)])
-        for method in METHOD_NAMES:
-            fit = damping.get(method) or {}
-            for vine, law in (fit.get("vines") or {}).items():
-                used = drawable[(drawable["vine"] == vine) & drawable["used"]]
-                if len(used):
-                    _draw_law(ax, fit, method, vine, law["B"], used["x_ss_m_s"].to_numpy(), styles[vine])
-        plain_log_ticks(ax)
-        ax.set_title(_law_title(damping))
-        _law_legend(fig, drawable, damping, styles)
+    fig = new_figure(8.6, 5.6)
+    ax = fig.add_subplot()
+    ax.set(xscale="log", yscale="log", xlabel="steady tail speed x_ss (m/s)", ylabel="force F = B·x_ssⁿ (N)")
+    for vine, group in drawable.groupby("vine", sort=False):
+        _draw_points(ax, group, styles[str(vine)])
+    for method in METHOD_NAMES:
+        fit = damping.get(method) or {}
+        for vine, law in (fit.get("vines") or {}).items():
+            used = drawable[(drawable["vine"] == vine) & drawable["used"]]
+            if len(used):
+                _draw_law(ax, fit, method, vine, law["B"], used["x_ss_m_s"].to_numpy(), styles[vine])
+    plain_log_ticks(ax)
+    ax.set_title(_law_title(damping))
+    _law_legend(fig, drawable, damping, styles)
     return fig
 
 
@@ -166,31 +165,28 @@ _OFFSETS = {"log_log": -0.17, "both_axes": 0.17}
 _MAX_VINES = 40  # Chosen: at half an inch per vine, 40 make a figure of 22 in, the longest that a page shows whole
 
 
-def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
-    """Draw n and B with their 95 % intervals, B as deviation from its best estimate. Thick bars come from a bootstrap
-    of whole trials, or from Student's t if they are too few; thin ones add the stated error of the yield pressure,
-    which all trials of a vine share and a bootstrap cannot show.
+@figure("exponents", "damping", "The exponent and the coefficients, by both methods", data="damping.json")
+def draw_exponents(damping: dict[str, Any]) -> Figure | None:
+    """The exponent n, one for all vines, and the coefficient B of each, by both methods, with 95 % intervals. Thick
+    bars come from a bootstrap of whole trials, or from Student's t if they are too few; thin ones add the stated
+    error of the yield pressure.
     """
-    from matplotlib.figure import Figure
-
     fits = {name: fit for name in METHOD_NAMES if (fit := damping.get(name) or {}).get("vines")}
     if not fits:
-        return blank("No damping law could be fitted, so there is no exponent to show.")
+        return None
     best = {vine: law for fit in fits.values() for vine, law in fit["vines"].items()}
     vines = sorted(best, key=lambda vine: (best[vine]["diameter_mm"], best[vine]["thickness_um"], vine))[:_MAX_VINES]
-    with look():
-        fig = Figure(figsize=(9.4, 1.9 + max(0.5 * len(vines), 1.2)), layout="constrained")
-        left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))
-        for method, fit in fits.items():
-            n = with_interval(fit["n"], fit.get("n_95"))
-            label = f"{METHOD_NAMES[method]}: n = {n}"
-            _draw_estimate(left, method, 0, fit["n"], fit.get("n_95"), fit.get("n_95_total"), label)
-            for i, vine in enumerate(vines):
-                if law := fit["vines"].get(vine):
-                    _draw_estimate(right, method, i, *(_deviation(law.get(key), best[vine]["B"]) for key in _B_KEYS))
-        _finish_exponents(left, right, {vine: best[vine] for vine in vines})
-        _draw_published_law(left, right, vines, best, published)
-        legend_above(left, n_columns=1)
+    fig = new_figure(9.4, 1.9 + max(0.5 * len(vines), 1.2))
+    left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))
+    for method, fit in fits.items():
+        n = with_interval(fit["n"], fit.get("n_95"))
+        label = f"{METHOD_NAMES[method]}: n = {n}"
+        _draw_estimate(left, method, 0, fit["n"], fit.get("n_95"), fit.get("n_95_total"), label)
+        for i, vine in enumerate(vines):
+            if law := fit["vines"].get(vine):
+                _draw_estimate(right, method, i, *(_deviation(law.get(key), best[vine]["B"]) for key in _B_KEYS))
+    _finish_exponents(left, right, {vine: best[vine] for vine in vines})
+    legend_above(left, n_columns=1)
     return fig
 
 
@@ -236,19 +232,6 @@ def _finish_exponents(left: Axes, right: Axes, best: dict[str, dict[str, Any]]) 
     left.locator_params(axis="x", nbins=5)
 
 
-def _draw_published_law(
-    left: Axes, right: Axes, vines: list[str], best: dict[str, dict[str, Any]], published: dict[str, Any] | None
-) -> None:
-    if not published:
-        return
-    line: dict[str, Any] = {"color": MUTED, "ls": (0, (3, 2)), "lw": 1.3, "zorder": 1}
-    left.axvline(published["n"], label=f"{published['source']}: n = {published['n']}", **line)
-    for i, vine in enumerate(vines):
-        if vine in published["B"]:
-            deviation = _deviation(published["B"][vine], best[vine]["B"])
-            right.plot([deviation, deviation], [i - 0.4, i + 0.4], **line)
-
-
 # ------------------------------------------------------------------------------
 # Damping, steady speed, efficiency and final speed against the size and the load of the vine.
 #
@@ -259,26 +242,26 @@ _TITLES = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
 _MAX_SCALING_FAMILIES = 4  # Chosen: four families have twelve lines of legend above the axes
 
 
-def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure:
-    """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter."""
-    from matplotlib.figure import Figure
-
+@figure("scaling", "damping", "Damping against size", data="scaling.json")
+def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure | None:
+    """B of each vine against its size, on logarithmic axes: against diameter for vines that are scaled copies of
+    each other, against wall thickness for vines of one diameter. Solid: power law; dashed: straight line.
+    """
     kinds = [kind for kind in _TITLES if scaling.get(kind)]
     if not kinds:
-        return blank(f"Nothing to draw B against: {scaling.get('reason') or 'no vine has a damping coefficient'}.")
-    with look():
-        fig = Figure(figsize=(6.6 if len(kinds) == 1 else 11.0, 5.2), layout="constrained")
-        for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
-            families = scaling[kind][:_MAX_SCALING_FAMILIES]
-            ax.set(xscale="log", yscale="log", xlabel=_LABELS[families[0]["along"]], ylabel="B (N·(s/m)ⁿ)")
-            for i, family in enumerate(families):
-                _draw_B_family(ax, family, i)
-            _draw_published_B(ax, families, published)
-            _finish_scaling(ax, families)
-            left_out = len(scaling[kind]) - len(families)
-            title = _TITLES[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
-            legend_above(ax, n_columns=1, title=title, alignment="left")
-        note_below(fig, note)
+        return None
+    fig = new_figure(6.6 if len(kinds) == 1 else 11.0, 5.2)
+    for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
+        families = scaling[kind][:_MAX_SCALING_FAMILIES]
+        ax.set(xscale="log", yscale="log", xlabel=_LABELS[families[0]["along"]], ylabel="B (N·(s/m)ⁿ)")
+        for i, family in enumerate(families):
+            _draw_B_family(ax, family, i)
+        _draw_published_B(ax, families, published)
+        _finish_scaling(ax, families)
+        left_out = len(scaling[kind]) - len(families)
+        title = _TITLES[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
+        legend_above(ax, n_columns=1, title=title, alignment="left")
+    note_below(fig, note)
     return fig
 
 
@@ -329,27 +312,28 @@ _SPEED_PANELS = (
 )
 
 
-def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
-    """Draw x_ss and x_ss/D against D: straight lines full, power laws dashed. Error bars are standard errors; that of a
-    single trial does not include replicate scatter.
+@figure("speed_scaling", "damping", "Steady speed against size", data="conditions.csv")
+def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure | None:
+    """Steady tail speed of scaled copies (one t/D) at one pressure without payload, against diameter, and the same
+    divided by the diameter. Points are means over a vine's steady trials with their standard errors (that of a
+    single trial does not include replicate scatter); straight lines (full) and power laws (dashed) are fitted to
+    the means of vines, so N is the number of vines, and p is the probability of a slope at least as large if there
+    is none. Pressures that agree within 1 % count as one.
     """
-    from matplotlib.figure import Figure
-
     families = scaling.get("steady_speed") or []
     if not families:
-        return blank("No two vines that are scaled copies of each other have a steady speed at one pressure.")
-    with look():
-        fig = Figure(figsize=(11.0, 5.2 + 0.45 * min(len(families), _MAX_SPEED_FAMILIES)), layout="constrained")
-        for ax, (key, sigma, label, title) in zip(fig.subplots(1, 2), _SPEED_PANELS, strict=True):
-            for i, family in enumerate(families[:_MAX_SPEED_FAMILIES]):
-                lines = family if key == "x_ss_m_s" else family["over_diameter"]
-                _draw_speed_family(ax, family, key, sigma, lines, i)
-            ax.set(xlabel="diameter (mm)", ylabel=label)
-            up_from_zero(ax, x=True)
-            left_out = len(families) - _MAX_SPEED_FAMILIES
-            more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
-            legend_above(ax, n_columns=1, title=title + more, alignment="left", fontsize=9)
-        note_below(fig, " ".join(filter(None, [note, _single_trial_note(families[:_MAX_SPEED_FAMILIES])])))
+        return None
+    fig = new_figure(11.0, 5.2 + 0.45 * min(len(families), _MAX_SPEED_FAMILIES))
+    for ax, (key, sigma, label, title) in zip(fig.subplots(1, 2), _SPEED_PANELS, strict=True):
+        for i, family in enumerate(families[:_MAX_SPEED_FAMILIES]):
+            lines = family if key == "x_ss_m_s" else family["over_diameter"]
+            _draw_speed_family(ax, family, key, sigma, lines, i)
+        ax.set(xlabel="diameter (mm)", ylabel=label)
+        up_from_zero(ax, x=True)
+        left_out = len(families) - _MAX_SPEED_FAMILIES
+        more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
+        legend_above(ax, n_columns=1, title=title + more, alignment="left", fontsize=9)
+    note_below(fig, " ".join(filter(None, [note, _single_trial_note(families[:_MAX_SPEED_FAMILIES])])))
     return fig
 
 
@@ -393,29 +377,31 @@ _SIZE_AXES = {"thickness_um": ("wall thickness (µm)", "wall"), "diameter_mm": (
 _SIZE_UNITS = {"thickness_um": "µm", "diameter_mm": "mm"}
 
 
-def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
-    """Draw the largest family of conditions that differ only in size."""
-    from matplotlib.figure import Figure
-
+@figure("efficiency", "damping", "Energy efficiency", data="conditions.csv")
+def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure | None:
+    """Energy efficiency against wall thickness and diameter at one pressure, payload, length and growth: kinetic
+    energy of all moving mass divided by the work of the gas P₀Ay; of the payload alone; and with the work of the
+    weight added to the denominator. Points are means with standard errors; the powers of wall and diameter are
+    fitted together, on logarithms, so that each is that of one size with the other held constant.
+    """
     families = scaling.get("efficiency") or []
     if not families:
-        return blank("No two vines of different size were grown to the same length at one pressure with one payload.")
+        return None
     family = families[0]
     along = [name for name in _SIZE_AXES if len(set(family[name])) > 1]
     shown = [key for key in _EFFICIENCIES if np.any(np.array(family[key], dtype=float) > 0)]
-    with look():
-        fig = Figure(figsize=(0.9 + 3.6 * len(shown), 1.0 + 3.5 * len(along)), layout="constrained")
-        axes = fig.subplots(len(along), len(shown), squeeze=False, sharey=True)
-        for row, x in enumerate(along):
-            for ax, key in zip(axes[row], shown, strict=True):
-                _draw_efficiency(ax, family, key, x)
-                ax.set_xlabel(_SIZE_AXES[x][0])
-                if row == 0:
-                    ax.set_title(_EFFICIENCIES[key], fontsize=10.5)
-            axes[row][0].set(ylabel="energy efficiency (%)", ylim=(0, 1.08 * max(ax.dataLim.y1 for ax in axes[row])))
-            axes[row][-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
-        fig.suptitle(_efficiency_title(family, len(families)), fontsize=11, x=0.01, ha="left")
-        note_below(fig, note)
+    fig = new_figure(0.9 + 3.6 * len(shown), 1.0 + 3.5 * len(along))
+    axes = fig.subplots(len(along), len(shown), squeeze=False, sharey=True)
+    for row, x in enumerate(along):
+        for ax, key in zip(axes[row], shown, strict=True):
+            _draw_efficiency(ax, family, key, x)
+            ax.set_xlabel(_SIZE_AXES[x][0])
+            if row == 0:
+                ax.set_title(_EFFICIENCIES[key], fontsize=10.5)
+        axes[row][0].set(ylabel="energy efficiency (%)", ylim=(0, 1.08 * max(ax.dataLim.y1 for ax in axes[row])))
+        axes[row][-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
+    fig.suptitle(_efficiency_title(family, len(families)), fontsize=11, x=0.01, ha="left")
+    note_below(fig, note)
     return fig
 
 
@@ -451,56 +437,3 @@ def _efficiency_title(family: dict[str, Any], n_families: int) -> str:
         f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
         f"N = {counted(min(counts), max(counts), 'trial')} per point{error}{more}"
     )
-
-
-_SIZE_FIGURES_MAX_VINES = 6  # Chosen: two rows of three panels
-PAYLOAD_LINE = "model and its 95 %"  # Name of the model's curve in the legend
-
-
-def draw_payload_speed(
-    conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = PAYLOAD_LINE
-) -> Figure:
-    """Draw final speeds of vines grown with more than one payload."""
-    from matplotlib.figure import Figure
-
-    reached = conditions[conditions["final_lead_velocity_m_s"] > 0]
-    reached = reached[reached.groupby(["vine", "pressure_kPa"])["payload_g"].transform("nunique") > 1]
-    vines = [str(vine) for vine in dict.fromkeys(reached["vine"])][:_SIZE_FIGURES_MAX_VINES]
-    if not vines:
-        return blank("No vine was grown with more than one payload at one pressure.")
-    with look():
-        n_columns = min(len(vines), 3)
-        width_in = 6.6 if len(vines) == 1 else 4.4 * n_columns
-        fig = Figure(figsize=(width_in, 0.6 + 4.2 * math.ceil(len(vines) / n_columns)), layout="constrained")
-        for ax, vine in zip(panel_grid(fig, len(vines), n_columns), vines, strict=True):
-            _draw_vine(ax, reached[reached["vine"] == vine], model[model["vine"] == vine], line)
-        note_below(fig, note)
-    return fig
-
-
-def _draw_vine(ax: Axes, measured: pd.DataFrame, model: pd.DataFrame, line: str) -> None:
-    for i, (pressure_kPa, group) in enumerate(measured.groupby("pressure_kPa")):
-        colour = VINE_COLOURS[i % len(VINE_COLOURS)]
-        speed, sigma = (group[f"final_lead_velocity{part}_m_s"] for part in ("", "_sigma"))
-        error_points(ax, group["payload_g"], speed, sigma, i, f"{float(str(pressure_kPa)):.4g} kPa")
-        curve = model[np.isclose(model["pressure_kPa"], float(str(pressure_kPa)))].sort_values("payload_g")
-        if len(curve):
-            _draw_curve(ax, curve, colour, line if i == 0 else "")
-    first = next(rows(measured))
-    counts = measured["n_final"].astype(int)
-    times = counted(int(counts.min()), int(counts.max()), "trial")
-    ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
-    up_from_zero(ax)
-    error = ", ± standard error" if counts.max() > 1 else ""
-    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} per point{error}"
-    legend_above(ax, n_columns=2, title=title, alignment="left", fontsize=9)
-
-
-def _draw_curve(ax: Axes, curve: pd.DataFrame, colour: str, label: str) -> None:
-    payload_g, speed_m_s, sigma_m_s = (
-        curve[name].to_numpy(float)
-        for name in ("payload_g", "final_lead_velocity_m_s", "final_lead_velocity_sigma_m_s")
-    )
-    half_width = 1.96 * np.nan_to_num(sigma_m_s)
-    ax.plot(payload_g, speed_m_s, color=colour, lw=1.5, label=label or None)
-    ax.fill_between(payload_g, speed_m_s - half_width, speed_m_s + half_width, color=colour, alpha=0.2, lw=0)

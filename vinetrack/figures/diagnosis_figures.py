@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.units import number
+from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 from vinetrack.figures.style import (
     BLUE,
     DASHED,
@@ -21,10 +22,9 @@ from vinetrack.figures.style import (
     ORANGE,
     VERMILLION,
     VINE_MARKERS,
-    blank,
     fitting_size,
     line_key,
-    look,
+    new_figure,
     panel_grid,
     plain_log_ticks,
     rows,
@@ -60,30 +60,33 @@ _WIDTH_IN = 5.2  # Chosen: both figures fit side by side on a page of 11 in
 _STEP_IN = 1.55  # Width per model of the ladder; chosen: the longest name of an effect, wrapped at 18 letters of 10 pt
 
 
-def draw_ladder(ladder: pd.DataFrame) -> Figure:
-    """Draw the errors of the initial model and of every further model of the ladder."""
-    from matplotlib.figure import Figure
-
+@figure("ladder", "verdict", "The ladder of errors", data="ladder")
+def draw_ladder(ladder: pd.DataFrame) -> Figure | None:
+    """Root mean square error of position of the initial model and with every effect that was added, on a
+    logarithmic axis: in sample; on conditions left out of the fit in turn; and on the left-out highest pressure of
+    each vine. The dotted line is the replicate scatter over all conditions: when the error has fallen to it,
+    nothing is left to explain. With few replicates it is uncertain, so an error may end below it; at the highest
+    pressures replicates often scatter less.
+    """
     if not len(ladder):
-        return blank("No model was fitted: there are no errors to show.", _WIDTH_IN)
+        return None
     steps = np.arange(len(ladder))
     errors_mm = {key: 1e3 * ladder[key].to_numpy(dtype=float) for key in _ERRORS}
     floor_mm = 1e3 * ladder["floor_m"].to_numpy(dtype=float)
-    with look():
-        fig = Figure(figsize=(max(_WIDTH_IN, 2.4 + _STEP_IN * len(ladder)), 3.9), layout="constrained")
-        ax = fig.add_subplot()
-        ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
-        ax.set_ylim(*_error_limits([*errors_mm.values(), floor_mm]))
-        _draw_floor(ax, floor_mm)
-        for key, (_, colour, marker, line) in _ERRORS.items():
-            ax.plot(steps, errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3)
-        _write_values(ax, errors_mm)
-        partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
-        labels = [_step_label(*step) for step in zip(range(len(ladder)), ladder["added"], partial, strict=True)]
-        ax.set_xticks(steps, labels)
-        ax.grid(axis="x", visible=False)
-        plain_log_ticks(ax, "y")
-        _ladder_legend(ax, errors_mm)
+    fig = new_figure(max(_WIDTH_IN, 2.4 + _STEP_IN * len(ladder)), 3.9)
+    ax = fig.add_subplot()
+    ax.set(yscale="log", ylabel="error of position, rms (mm)", xlim=(-0.5, len(ladder) - 0.5))
+    ax.set_ylim(*_error_limits([*errors_mm.values(), floor_mm]))
+    _draw_floor(ax, floor_mm)
+    for key, (_, colour, marker, line) in _ERRORS.items():
+        ax.plot(steps, errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3)
+    _write_values(ax, errors_mm)
+    partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
+    labels = [_step_label(*step) for step in zip(range(len(ladder)), ladder["added"], partial, strict=True)]
+    ax.set_xticks(steps, labels)
+    ax.grid(axis="x", visible=False)
+    plain_log_ticks(ax, "y")
+    _ladder_legend(ax, errors_mm)
     return fig
 
 
@@ -156,32 +159,33 @@ _BEFORE_LINE: Any = (0, (5, 2))  # Dashes of five line widths
 _MAX_POINTS = 160  # Points per trial; chosen
 
 
-def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figure:
-    """Draw one condition."""
-    from matplotlib.figure import Figure
-
-    if trials.empty:
-        return blank("There is no prediction to compare with a measurement.", _WIDTH_IN)
-    parts = [_moving(part) for _, part in trials.groupby("trial", sort=False)]
-    has_after = bool(np.isfinite(trials["model_after_m"]).any())
-    with look():
-        fig = Figure(figsize=(_WIDTH_IN, 4.3), layout="constrained")
-        growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
-        for part in parts:
-            time_ms, measured_mm = 1e3 * part["time_s"].to_numpy(), 1e3 * part["lead_position_m"].to_numpy()
-            growth.plot(time_ms, measured_mm, ".", color=MUTED, ms=4.5, mew=0)
-            misfit.plot(time_ms, measured_mm - 1e3 * part["model_before_m"], color=BEFORE, lw=1.3, ls=_BEFORE_LINE)
-            if has_after:
-                misfit.plot(time_ms, measured_mm - 1e3 * part["model_after_m"], color=AFTER, lw=1.3)
-        for part in parts:
-            growth.plot(1e3 * part["time_s"], 1e3 * part["model_before_m"], color=BEFORE, lw=1.6, ls=_BEFORE_LINE)
-            if has_after:
-                growth.plot(1e3 * part["time_s"], 1e3 * part["model_after_m"], color=AFTER, lw=1.6)
-        misfit.axhline(0, color=INK, lw=0.8)
-        growth.set_ylabel("growth (mm)")
-        misfit.set(xlabel="time since release (ms)", ylabel="misfit (mm)")
-        growth.set_title(title, fontsize=10)
-        _before_after_legend(growth, trials, len(parts), has_after, added)
+@figure("before_after", "verdict", "The worst condition", data="before_after", if_refuted=DASHED_REFUTED)
+def draw_before_after(worst: str, before_after: pd.DataFrame, added: str) -> Figure | None:
+    """The condition that the initial model predicts worst. Above, growth of the leading edge since release: every
+    replicate (dots), the model before (dashed) and with what was added (full). Below, the misfit, measured minus
+    model. Release and origin are fitted for each trial.
+    """
+    if before_after.empty:
+        return None
+    parts = [_moving(part) for _, part in before_after.groupby("trial", sort=False)]
+    has_after = bool(np.isfinite(before_after["model_after_m"]).any())
+    fig = new_figure(_WIDTH_IN, 4.3)
+    growth, misfit = fig.subplots(2, 1, sharex=True, height_ratios=(2.1, 1))
+    for part in parts:
+        time_ms, measured_mm = 1e3 * part["time_s"].to_numpy(), 1e3 * part["lead_position_m"].to_numpy()
+        growth.plot(time_ms, measured_mm, ".", color=MUTED, ms=4.5, mew=0)
+        misfit.plot(time_ms, measured_mm - 1e3 * part["model_before_m"], color=BEFORE, lw=1.3, ls=_BEFORE_LINE)
+        if has_after:
+            misfit.plot(time_ms, measured_mm - 1e3 * part["model_after_m"], color=AFTER, lw=1.3)
+    for part in parts:
+        growth.plot(1e3 * part["time_s"], 1e3 * part["model_before_m"], color=BEFORE, lw=1.6, ls=_BEFORE_LINE)
+        if has_after:
+            growth.plot(1e3 * part["time_s"], 1e3 * part["model_after_m"], color=AFTER, lw=1.6)
+    misfit.axhline(0, color=INK, lw=0.8)
+    growth.set_ylabel("growth (mm)")
+    misfit.set(xlabel="time since release (ms)", ylabel="misfit (mm)")
+    growth.set_title(worst, fontsize=10)
+    _before_after_legend(growth, before_after, len(parts), has_after, added)
     return fig
 
 
@@ -237,22 +241,23 @@ _CANDIDATE_FIGURES_WIDTH_IN = 8.6  # Chosen: bars of 4 in beside names of 22 let
 _ROW_IN = 0.33  # Chosen: two lines of 9 pt would fit, so rows stay apart
 
 
-def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
-    """Draw √Δχ² of every candidate, with its fitted size."""
-    from matplotlib.figure import Figure
-
+@figure("candidates", "candidates", "Candidates", data="ranking")
+def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure | None:
+    """Improvement of the fit with each candidate, as √Δχ², with its fitted size and standard error. In colour:
+    hypotheses in the answer set, which the data cannot exclude. Hollow: predicted from the sensitivities, not
+    fitted. One panel per round; the next round tests the model with all effects added so far.
+    """
     drawn = [(title, _drawable(table)) for title, table in rounds]
     drawn = [(title, table) for title, table in drawn if len(table)]
     if not drawn:
-        return blank("No candidate could be tested on these data.")
+        return None
     heights_in = [_ROW_IN * len(table) + 0.95 for _, table in drawn]
-    with look():
-        fig = Figure(figsize=(_CANDIDATE_FIGURES_WIDTH_IN, sum(heights_in) + 0.35), layout="constrained")
-        axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
-        for ax, (title, table) in zip(axes, drawn, strict=True):
-            _draw_round(ax, title, table)
-        axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
-        _candidate_legend(fig, [table for _, table in drawn])
+    fig = new_figure(_CANDIDATE_FIGURES_WIDTH_IN, sum(heights_in) + 0.35)
+    axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
+    for ax, (title, table) in zip(axes, drawn, strict=True):
+        _draw_round(ax, title, table)
+    axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
+    _candidate_legend(fig, [table for _, table in drawn])
     return fig
 
 
@@ -322,40 +327,40 @@ TIED_COSINE = 0.95  # Chosen: above it two candidates count as tied
 MAX_EFFECTS = 22  # Chosen: 0.36 in each make a square of 8 in, and cells that hold two digits of 7.5 pt
 
 
-def draw_cosines(effects: Sequence[str], matrix: Sequence[Sequence[float]]) -> Figure:
-    """Draw the matrix of cosines. Shapes: matrix (n_effects, n_effects)."""
-    from matplotlib.figure import Figure
+@figure("cosines", "tied", "Candidates that these trials cannot tell apart", data="cosines")
+def draw_cosines(cosines: pd.DataFrame) -> Figure | None:
+    """Cosine between the effects of two candidates on the trajectories, after projecting out the fitted parameters:
+    1 the same, −1 the same with opposite sign, 0 nothing in common. Framed: these trials cannot tell the two apart.
+    """
     from matplotlib.patches import Rectangle
 
-    n = min(len(effects), MAX_EFFECTS)
-    if n < 2:
-        return blank("Fewer than two candidates could be tested: there are no pairs to compare.")
-    cosines = np.asarray(matrix, dtype=float)[:n, :n]
-    names = [str(name).replace("_", " ") for name in effects[:n]]
-    with look():
-        side_in = 0.36 * n
-        fig = Figure(figsize=(side_in + 2.3, side_in + 2.0), layout="constrained")
-        ax = fig.add_subplot()
-        for i in range(n):
-            for j in range(i):
-                value = cosines[i, j]
-                if not np.isfinite(value):
-                    continue
-                colour, tied = BLUE if value > 0 else VERMILLION, abs(value) >= TIED_COSINE
-                box = Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, alpha=min(abs(value), 1.0) ** 2 * 0.8, lw=0)
-                ax.add_patch(box)
-                if tied:
-                    outline = Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=INK, lw=1.4)
-                    ax.add_patch(outline)
-                words = f"{value:.2f}".replace("0.", ".", 1).replace("-", "−")
-                ax.text(j, i, words, ha="center", va="center", fontsize=7.5, fontweight="bold" if tied else "normal")
-        size = min(fitting_size(name, 115, 9, bold=False) for name in names)
-        ax.set_xticks(range(n - 1), names[:-1], rotation=55, ha="right", rotation_mode="anchor", fontsize=size)
-        ax.set_yticks(range(1, n), names[1:], fontsize=size)
-        ax.set(xlim=(-0.5, n - 1.5), ylim=(n - 0.5, 0.5), aspect="equal")
-        ax.tick_params(length=0)
-        ax.grid(visible=False)
-        ax.set_title(f"cosine; framed: tied (|cos| ≥ {TIED_COSINE:g})", fontsize=9, fontweight="normal")
+    if not len(cosines):
+        return None
+    effects = list(dict.fromkeys([*cosines["other"], *cosines["effect"]]))[:MAX_EFFECTS]
+    place, n = {name: i for i, name in enumerate(effects)}, len(effects)
+    names = [str(name).replace("_", " ") for name in effects]
+    side_in = 0.36 * n
+    fig = new_figure(side_in + 2.3, side_in + 2.0)
+    ax = fig.add_subplot()
+    for effect, other, value in cosines.itertuples(index=False):
+        if effect not in place or other not in place or not math.isfinite(value):
+            continue
+        i, j = place[effect], place[other]
+        colour, tied = BLUE if value > 0 else VERMILLION, abs(value) >= TIED_COSINE
+        box = Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, alpha=min(abs(value), 1.0) ** 2 * 0.8, lw=0)
+        ax.add_patch(box)
+        if tied:
+            outline = Rectangle((j - 0.45, i - 0.45), 0.9, 0.9, facecolor="none", edgecolor=INK, lw=1.4)
+            ax.add_patch(outline)
+        words = f"{value:.2f}".replace("0.", ".", 1).replace("-", "−")
+        ax.text(j, i, words, ha="center", va="center", fontsize=7.5, fontweight="bold" if tied else "normal")
+    size = min(fitting_size(name, 115, 9, bold=False) for name in names)
+    ax.set_xticks(range(n - 1), names[:-1], rotation=55, ha="right", rotation_mode="anchor", fontsize=size)
+    ax.set_yticks(range(1, n), names[1:], fontsize=size)
+    ax.set(xlim=(-0.5, n - 1.5), ylim=(n - 0.5, 0.5), aspect="equal")
+    ax.tick_params(length=0)
+    ax.grid(visible=False)
+    ax.set_title(f"cosine; framed: tied (|cos| ≥ {TIED_COSINE:g})", fontsize=9, fontweight="normal")
     return fig
 
 
@@ -373,15 +378,15 @@ _CONDITIONS = {
 _MODELS = {"before": (BEFORE, "before", -0.06), "after": (AFTER, "after", 0.06)}
 
 
-def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
-    """Draw the best value of a parameter in each group of trials, relative to the common law, against a condition. With
-    a complete model all groups are at 1.
+@figure("drift", "drift", "Parameters that change with a condition", data="drift")
+def draw_drift(drift: pd.DataFrame, added: str) -> Figure | None:
+    """The best value of each parameter in groups of trials, relative to the common law, against a condition on
+    which it should not depend; bars are one standard error from the scatter of replicates. With a complete model
+    all are 1.
     """
-    from matplotlib.figure import Figure
-
-    known = groups[np.isfinite(groups["ratio"].astype(float))] if len(groups) else groups
+    known = drift[np.isfinite(drift["ratio"].astype(float))] if len(drift) else drift
     if not len(known):
-        return blank("No parameter could be tested for drift.")
+        return None
     # A parameter that only the larger model has cannot show what adding the effect changed.
     shown = known[known["model"] == "before"] if (known["model"] == "before").any() else known
     panels = list(dict.fromkeys(zip(shown["parameter"], shown["against"], strict=True)))[:_MAX_DRIFT_PANELS]
@@ -389,13 +394,12 @@ def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
     markers = {vine: VINE_MARKERS[i % len(VINE_MARKERS)] for i, vine in enumerate(vines)} | {"": "o"}
     n_columns = min(len(panels), 3)
     n_rows = math.ceil(len(panels) / n_columns)
-    with look():
-        fig = Figure(figsize=(1.0 + 3.2 * n_columns, 0.9 + 2.6 * n_rows), layout="constrained")
-        for ax, (parameter, against) in zip(panel_grid(fig, len(panels), n_columns), panels, strict=True):
-            chosen = known[(known["parameter"] == parameter) & (known["against"] == against)]
-            _draw_drift_panel(ax, chosen, str(against), markers)
-        fig.supylabel("value / common law", fontsize=11)
-        _drift_legend(fig, known, markers, added)
+    fig = new_figure(1.0 + 3.2 * n_columns, 0.9 + 2.6 * n_rows)
+    for ax, (parameter, against) in zip(panel_grid(fig, len(panels), n_columns), panels, strict=True):
+        chosen = known[(known["parameter"] == parameter) & (known["against"] == against)]
+        _draw_drift_panel(ax, chosen, str(against), markers)
+    fig.supylabel("value / common law", fontsize=11)
+    _drift_legend(fig, known, markers, added)
     return fig
 
 
@@ -451,30 +455,32 @@ _NUMBERED_ROWS = 26  # Chosen: with more conditions, the figure is scaled down u
 _COLUMNS = {"misfit_before_m": "before", "misfit_after_m": "after"}
 
 
-def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
-    """Draw the misfit by condition and position."""
-    from matplotlib.figure import Figure
-
-    shown = [c for c in _COLUMNS if len(table) and np.isfinite(table[c].to_numpy(dtype=float)).any()]
+@figure("where", "where", "Misfit by condition and position", data="where")
+def draw_where(where: pd.DataFrame, added: str) -> Figure | None:
+    """Misfit (measured minus model, mean over replicates) of every condition along its growth, before and, if
+    effects were added, after. Blue: the vine is ahead of the model; vermillion: behind. Numbers, in millimetres,
+    are written where the misfit exceeds twice its standard error from replicate scatter. A pattern common to all
+    conditions, or growing towards one pressure, is systematic; isolated patches are chance.
+    """
+    shown = [c for c in _COLUMNS if len(where) and np.isfinite(where[c].to_numpy(dtype=float)).any()]
     if not shown:
-        return blank("There is no prediction to compare with a measurement.")
-    labels, n_conditions = _largest_misfits(table, shown), table["condition_label"].nunique()
-    known_mm = 1e3 * np.abs(table[shown].to_numpy(dtype=float))
+        return None
+    labels, n_conditions = _largest_misfits(where, shown), where["condition_label"].nunique()
+    known_mm = 1e3 * np.abs(where[shown].to_numpy(dtype=float))
     full_mm = max(float(np.nanpercentile(known_mm, 97)), 1e-6)
-    with look():
-        width_in = 2.6 + 4.3 * len(shown)
-        fig = Figure(figsize=(width_in, 0.3 * len(labels) + 1.75), layout="constrained")
-        axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-        for ax, column in zip(axes, shown, strict=True):
-            _draw_cells(ax, table, column, labels, full_mm)
-            words = _COLUMNS[column] + (f": with {added}" if column == "misfit_after_m" and added else "")
-            ax.set_title(words, fontsize=10)
-            ax.set_xlabel("along the growth (%)")
-        axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
-        left_out = f"the {len(labels)} of {n_conditions} conditions with the largest misfit"
-        numbers = "; numbers in mm, where beyond scatter" if len(labels) <= _NUMBERED_ROWS else ""
-        legend = f"full colour: {full_mm:.2g} mm{numbers}", left_out if n_conditions > len(labels) else ""
-        _misfit_legend(fig, legend, 3 if len(shown) > 1 else 2)
+    width_in = 2.6 + 4.3 * len(shown)
+    fig = new_figure(width_in, 0.3 * len(labels) + 1.75)
+    axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for ax, column in zip(axes, shown, strict=True):
+        _draw_cells(ax, where, column, labels, full_mm)
+        words = _COLUMNS[column] + (f": with {added}" if column == "misfit_after_m" and added else "")
+        ax.set_title(words, fontsize=10)
+        ax.set_xlabel("along the growth (%)")
+    axes[0].set_yticks(range(len(labels)), _row_names(where, labels), fontsize=9)
+    left_out = f"the {len(labels)} of {n_conditions} conditions with the largest misfit"
+    numbers = "; numbers in mm, where beyond scatter" if len(labels) <= _NUMBERED_ROWS else ""
+    legend = f"full colour: {full_mm:.2g} mm{numbers}", left_out if n_conditions > len(labels) else ""
+    _misfit_legend(fig, legend, 3 if len(shown) > 1 else 2)
     return fig
 
 
@@ -549,20 +555,23 @@ FORCE_AXES = {
 _MAX_FORCE_PANELS = 4  # Chosen: two rows of two panels
 
 
-def draw_missing_force(table: pd.DataFrame) -> Figure:
-    """Draw the missing force."""
-    from matplotlib.figure import Figure
-
-    panels = [name for name in FORCE_AXES if len(table) and (table["against"] == name).any()][:_MAX_FORCE_PANELS]
+@figure("missing_force", "where", "The missing force", data="missing_force", if_refuted=SHOWS_REFUTED)
+def draw_missing_force(missing_force: pd.DataFrame) -> Figure | None:
+    """The force that would have to be added to the model to explain the misfit, against position, speed, time and
+    pressure: grey for single conditions, blue for their mean with one standard error. Where all conditions fall on
+    one curve, the force depends on that alone.
+    """
+    panels = [name for name in FORCE_AXES if len(missing_force) and (missing_force["against"] == name).any()][
+        :_MAX_FORCE_PANELS
+    ]
     if not panels:
-        return blank("No missing force was found that could be drawn.")
+        return None
     n_columns = min(len(panels), 2)
     n_rows = -(-len(panels) // n_columns)
-    with look():
-        fig = Figure(figsize=(1.0 + 4.0 * n_columns, 0.5 + 2.7 * n_rows), layout="constrained")
-        for ax, against in zip(panel_grid(fig, len(panels), n_columns, sharey=True), panels, strict=True):
-            _draw_force(ax, table[table["against"] == against], against)
-        fig.supylabel("missing force (N)", fontsize=11)
+    fig = new_figure(1.0 + 4.0 * n_columns, 0.5 + 2.7 * n_rows)
+    for ax, against in zip(panel_grid(fig, len(panels), n_columns, sharey=True), panels, strict=True):
+        _draw_force(ax, missing_force[missing_force["against"] == against], against)
+    fig.supylabel("missing force (N)", fontsize=11)
     return fig
 
 
@@ -588,24 +597,35 @@ _BAND = 1.96  # Half width of a 95 % band in standard errors (derived)
 _LEVELS, _LABELLED = 11, 5  # Shades from zero to the largest force, and labelled contour lines (chosen)
 
 
-def draw_learned_force(table: pd.DataFrame) -> Figure:
-    """Draw the learned force."""
-    from matplotlib.figure import Figure
-
-    variables = [name for name in FORCE_AXES if name in table and table[name].notna().any()]
-    if not len(table) or not variables:
-        return blank("No missing force was learned.")
-    grid, along = (table[table["condition"].fillna("") == ""], table[table["condition"].fillna("") != ""])
-    with look():
-        if len(variables) == 1:
-            fig = Figure(figsize=(6.4, 3.6), layout="constrained")
-            _draw_curve(fig.subplots(), grid, along, variables[0])
-            return fig
-        fig = Figure(figsize=(9.6, 4.4), layout="constrained")
-        left, right = fig.subplots(1, 2, sharex=True, sharey=True)
-        _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
-        _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
-        right.set_ylabel("")
+@figure(
+    "learned_force",
+    "where",
+    "The missing force, learned inside the fit",
+    data="learned_force",
+    if_refuted=SHOWS_REFUTED,
+)
+def draw_learned_force(learned_force: pd.DataFrame) -> Figure | None:
+    """The missing force, learned within the fit as a smooth function of the variables on which it most likely
+    depends: for one variable a curve with its 95 % band, for two a map next to its standard error, both only in the
+    range of the trials. The part that B, n and the yield pressure could absorb is undetermined, and included in the
+    band.
+    """
+    variables = [name for name in FORCE_AXES if name in learned_force and learned_force[name].notna().any()]
+    if not len(learned_force) or not variables:
+        return None
+    grid, along = (
+        learned_force[learned_force["condition"].fillna("") == ""],
+        learned_force[learned_force["condition"].fillna("") != ""],
+    )
+    if len(variables) == 1:
+        fig = new_figure(6.4, 3.6)
+        _draw_curve(fig.subplots(), grid, along, variables[0])
+        return fig
+    fig = new_figure(9.6, 4.4)
+    left, right = fig.subplots(1, 2, sharex=True, sharey=True)
+    _draw_map(left, grid, along, variables, "force_N", "missing force (N)")
+    _draw_map(right, grid, along, variables, "sigma_N", "its standard error (N)")
+    right.set_ylabel("")
     return fig
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
 from vinetrack.core.units import with_error
+from vinetrack.figures.registry import DASHED_REFUTED, SHOWS_REFUTED, figure
 from vinetrack.figures.style import (
     DASHED,
     GREEN,
@@ -21,9 +22,9 @@ from vinetrack.figures.style import (
     RULE_COLOURS,
     RULE_NAMES,
     VERMILLION,
-    blank,
     fitting_size,
     look,
+    new_figure,
     page_columns,
     panel_font,
     panel_grid,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
 
 # ------------------------------------------------------------------------------
 # All trials: speed against growth in small panels, replicates superposed, steady windows thick.
@@ -72,41 +72,39 @@ class _Curve:
     speed_m_s: np.ndarray
 
 
-def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw the speed of every trial."""
-    from matplotlib.figure import Figure
-
+@figure("overview", "damping", "All trials at a glance", data="trials.csv")
+def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) -> Figure | None:
+    """Speed of the leading edge against growth, replicates superposed. Thick: the steady window of the gated rule."""
     shown = trials[trials["status"] != "left_out"]
     drawn = [name for name in shown["trial"] if _has_points(kinematics.get(name))]
     n_points = min(max(_MAX_POINTS_IN_ALL // max(len(drawn), 1), _MIN_POINTS), _MAX_POINTS)
     curves = {name: _curve(kinematics[name], n_points) for name in drawn}
     if not curves:
-        return blank("No trial has positions from which a speed could be computed.")
+        return None
     by_condition = shown["condition"].nunique() <= MAX_CONDITION_PANELS
     panels = _panels(shown, by_condition)
     n_columns = page_columns(len(panels), 10)
     n_rows = math.ceil(len(panels) / n_columns)
     panel_in = _WIDTH_IN / n_columns
-    with look():
-        font = panel_font(n_columns)
-        row_in = min(max(0.72 * panel_in, 1.15), 3.6)
-        height_in = n_rows * row_in + 1.15
-        fig = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
-        axes = panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
-        colours = _colours(shown, by_condition)
-        for ax, panel in zip(axes, panels, strict=True):
-            _draw_panel(ax, panel, curves, colours, font)
-            if by_condition:
-                _limit_speed(ax, [curves[name] for name in panel.trials["trial"] if name in curves])
-        for ax in axes[-n_columns:]:
-            ax.tick_params(labelbottom=True)
-        axes[0].set_xlim(0, 1.02 * max(float(np.nanmax(curve.growth_mm)) for curve in curves.values()))
-        fig.supxlabel("growth (mm)", fontsize=11)
-        fig.supylabel("leading-edge speed (m/s)", fontsize=11)
-        fig.suptitle(_title(shown, curves, len(panels), by_condition), fontsize=11, x=0.01, ha="left")
-        if not by_condition:
-            _limit_speed(axes[0], list(curves.values()), logarithmic=True)
-            _pressure_bar(fig, shown)
+    font = panel_font(n_columns)
+    row_in = min(max(0.72 * panel_in, 1.15), 3.6)
+    height_in = n_rows * row_in + 1.15
+    fig = new_figure(_WIDTH_IN, height_in)
+    axes = panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
+    colours = _colours(shown, by_condition)
+    for ax, panel in zip(axes, panels, strict=True):
+        _draw_panel(ax, panel, curves, colours, font)
+        if by_condition:
+            _limit_speed(ax, [curves[name] for name in panel.trials["trial"] if name in curves])
+    for ax in axes[-n_columns:]:
+        ax.tick_params(labelbottom=True)
+    axes[0].set_xlim(0, 1.02 * max(float(np.nanmax(curve.growth_mm)) for curve in curves.values()))
+    fig.supxlabel("growth (mm)", fontsize=11)
+    fig.supylabel("leading-edge speed (m/s)", fontsize=11)
+    fig.suptitle(_title(shown, curves, len(panels), by_condition), fontsize=11, x=0.01, ha="left")
+    if not by_condition:
+        _limit_speed(axes[0], list(curves.values()), logarithmic=True)
+        _pressure_bar(fig, shown)
     return fig
 
 
@@ -226,36 +224,34 @@ _TEXT_COLUMNS = 106  # Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt m
 
 _LINE_IN = 0.175  # Derived: 8.8 pt · 1.43 spacing / 72 pt
 
-_MAX_DOTS = 600  # Chosen: on 5.5 in, 600 dots of 3.5 pt overlap
+_MAX_DOTS = 300  # Chosen: on 5.5 in, dots of 3.5 pt touch from 113 on
 
 
+@look()
 def draw_trial_motion(
     title: str, track: pd.DataFrame, kinematics: pd.DataFrame, windows: pd.DataFrame, travel_ratio: float = 2.0
-) -> Figure:
+) -> Figure | None:
     """Draw one trial."""
-    from matplotlib.figure import Figure
-
     if kinematics.empty:
-        return blank(f"{title}: no positions to draw.", _TRIAL_MOTION_WIDTH_IN)
+        return None
     unusable = _unusable(track)
     by_hand = hand_corrected(track["flag"].fillna(""))
     notes = [
         _counts(len(kinematics), int(unusable.sum()), int(by_hand.sum())),
         *(line for row in rows(windows) for line in _verdict(row)),
     ]
-    with look():
-        text_in = _LINE_IN * len(notes) + 0.1
-        strip_in = 0.24 * max(len(windows), 1)
-        heights_in = {"position": 1.75, "speed": 2.1, "strip": strip_in, "text": text_in}
-        height_in = sum(heights_in.values()) + 1.2
-        fig = Figure(figsize=(_TRIAL_MOTION_WIDTH_IN, height_in))
-        lead, speed, strip = _three_rows(fig, heights_in, height_in)
-        _draw_position(lead, track, kinematics, unusable)
-        lead.set_title(title, pad=8, fontsize=fitting_size(title, 0.8 * 72 * _TRIAL_MOTION_WIDTH_IN, 11))
-        _draw_speed(speed, kinematics, windows, travel_ratio)
-        _draw_strip(strip, windows)
-        for i, (colour, line) in enumerate(notes):
-            fig.text(0.012, (text_in - 0.05 - i * _LINE_IN) / height_in, line, color=colour, fontsize=8.8, va="top")
+    text_in = _LINE_IN * len(notes) + 0.1
+    strip_in = 0.24 * max(len(windows), 1)
+    heights_in = {"position": 1.75, "speed": 2.1, "strip": strip_in, "text": text_in}
+    height_in = sum(heights_in.values()) + 1.2
+    fig = new_figure(_TRIAL_MOTION_WIDTH_IN, height_in, layout=None)
+    lead, speed, strip = _three_rows(fig, heights_in, height_in)
+    _draw_position(lead, track, kinematics, unusable)
+    lead.set_title(title, pad=8, fontsize=fitting_size(title, 0.8 * 72 * _TRIAL_MOTION_WIDTH_IN, 11))
+    _draw_speed(speed, kinematics, windows, travel_ratio)
+    _draw_strip(strip, windows)
+    for i, (colour, line) in enumerate(notes):
+        fig.text(0.012, (text_in - 0.05 - i * _LINE_IN) / height_in, line, color=colour, fontsize=8.8, va="top")
     return fig
 
 
@@ -378,13 +374,22 @@ _NO_FIT = "The model in use was not fitted: there is no prediction to compare wi
 _Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
 
 
-def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw positions since release: replicates, their band, and the model."""
+@figure("model_comparison", "model", "Model and measurement", data="curves", if_refuted=DASHED_REFUTED)
+def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure | None:
+    """Position of the leading edge since release, one panel per condition: every replicate (thin lines), the band
+    of one standard deviation around their mean, and the model in use (dashed; full: with the added effects).
+    Release and origin are fitted for each trial; pressure and B are those of the fit. Each panel states the root
+    mean square of model minus measurement, and in brackets its ratio to the replicate scatter.
+    """
     return _model_comparison_panels(comparison, trajectories, _draw_positions, "time since release (ms)", "growth (mm)")
 
 
-def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw measurement minus model against growth."""
+@figure("model_residuals", "model", "Residuals of the model", data="comparison.csv", if_refuted=SHOWS_REFUTED)
+def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure | None:
+    """Measurement minus model against the growth, one panel per condition, one line per trial, with the band of one
+    standard deviation of the replicates. With a complete model the lines cross zero within the band; a bend that
+    all trials of a panel share, or that grows with pressure, shows a missing effect.
+    """
     return _model_comparison_panels(
         comparison, trajectories, _draw_residuals, "growth (mm)", "measurement − model (mm)"
     )
@@ -392,37 +397,34 @@ def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd
 
 def _model_comparison_panels(
     comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], draw: _Drawing, x_label: str, y_label: str
-) -> Figure:
-    from matplotlib.figure import Figure
-
+) -> Figure | None:
     known = [row for row in rows(comparison) if row.condition in trajectories]
     farthest = sorted(known, key=lambda row: -np.nan_to_num(row.rms_position_m))[:MODEL_COMPARISON_MAX_PANELS]
     chosen = {row.condition for row in farthest}
     shown = [row for row in known if row.condition in chosen]
     if not shown:
-        return blank(_NO_FIT)
+        return None
     n_columns = page_columns(len(shown), 8)
     n_rows = math.ceil(len(shown) / n_columns)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
     n_points = min(max(_MAX_POINTS_IN_ALL // n_trials, 25), 150)
     styles = vine_styles([row.vine for row in shown])
-    with look():
-        font = panel_font(n_columns)
-        panel_in = min(_WIDTH_IN / n_columns, 6.0)
-        row_in = min(max(0.78 * panel_in, 1.35), 3.6)
-        fig = Figure(figsize=(n_columns * panel_in, n_rows * row_in + 0.95), layout="constrained")
-        for ax, row in zip(panel_grid(fig, len(shown), n_columns), shown, strict=True):
-            draw(ax, trajectories[row.condition], styles[row.vine].colour, n_points)
-            _label(ax, row, trajectories[row.condition]["trial"].nunique(), font, 72 * (panel_in - 0.45), draw)
-        fig.supxlabel(x_label, fontsize=11)
-        fig.supylabel(y_label, fontsize=11)
-        title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
-        if draw is _draw_positions and "model_after_m" in trajectories[shown[0].condition]:
-            title += "; dashed: this model, full: with the effects that were added"
-        if len(known) > len(shown):
-            title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
-        wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
-        fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
+    font = panel_font(n_columns)
+    panel_in = min(_WIDTH_IN / n_columns, 6.0)
+    row_in = min(max(0.78 * panel_in, 1.35), 3.6)
+    fig = new_figure(n_columns * panel_in, n_rows * row_in + 0.95)
+    for ax, row in zip(panel_grid(fig, len(shown), n_columns), shown, strict=True):
+        draw(ax, trajectories[row.condition], styles[row.vine].colour, n_points)
+        _label(ax, row, trajectories[row.condition]["trial"].nunique(), font, 72 * (panel_in - 0.45), draw)
+    fig.supxlabel(x_label, fontsize=11)
+    fig.supylabel(y_label, fontsize=11)
+    title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
+    if draw is _draw_positions and "model_after_m" in trajectories[shown[0].condition]:
+        title += "; dashed: this model, full: with the effects that were added"
+    if len(known) > len(shown):
+        title += f"; the {len(shown)} of {len(known)} conditions with the largest error"
+    wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
+    fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
     return fig
 
 

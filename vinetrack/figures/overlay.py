@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
 from vinetrack.core.units import number
+from vinetrack.figures.registry import figure
 from vinetrack.figures.style import (
     DASHED,
     GREEN,
@@ -29,6 +30,7 @@ from vinetrack.figures.style import (
     VINE_COLOURS,
     legend_above,
     look,
+    new_figure,
     note_below,
 )
 
@@ -73,30 +75,31 @@ def periodic_error(subpixel_px: Floats) -> tuple[float, float]:
     return float(length) / math.pi, math.sqrt(math.log(20) / len(subpixel_px)) / math.pi
 
 
-def draw_pixel_places(subpixel_px: Floats) -> Figure:
-    """Draw the histogram of edges within a pixel, with the two-standard-deviation band of a uniform distribution.
-    Shapes: subpixel_px (n_edges,).
+@figure("pixel_places", "damping", "Positions of edges within a pixel")
+def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
+    """Histogram of the edges of all unflagged moving frames within a pixel along their axes. Band: two standard
+    deviations around a uniform distribution. Peaks would indicate pixel locking, a bias of edges towards whole or
+    half pixels.
     """
-    from matplotlib.figure import Figure
-
     count = len(subpixel_px)
+    if count < MIN_EDGES:
+        return None
     even = count / BINS
     half_width = 2 * math.sqrt(even * (1 - 1 / BINS))
     amplitude, chance = periodic_error(subpixel_px)
     comparison = "more than chance" if amplitude > chance else "no more than chance"
-    with look():
-        fig = Figure(figsize=(6.6, 3.6), layout="constrained")
-        ax = fig.subplots()
-        ax.hist(subpixel_px, bins=BINS, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
-        ax.axhspan(even - half_width, even + half_width, color=MUTED, alpha=0.25, lw=0)
-        ax.axhline(even, color=MUTED, ls=DASHED)
-        ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1))
-        ax.set_title(f"N = {count} frames", loc="left")
-        note_below(
-            fig,
-            f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
-            f"{number(chance, 2)} px are exceeded by chance in 5 % of cases.",
-        )
+    fig = new_figure(6.6, 3.6)
+    ax = fig.subplots()
+    ax.hist(subpixel_px, bins=BINS, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
+    ax.axhspan(even - half_width, even + half_width, color=MUTED, alpha=0.25, lw=0)
+    ax.axhline(even, color=MUTED, ls=DASHED)
+    ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1))
+    ax.set_title(f"N = {count} frames", loc="left")
+    note_below(
+        fig,
+        f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
+        f"{number(chance, 2)} px are exceeded by chance in 5 % of cases.",
+    )
     return fig
 
 
@@ -110,22 +113,20 @@ _FRAME_PX = 320  # Pixels per side of a frame; chosen: frames are a third as wid
 _IGNORED_FLAGS = frozenset({"before_release"})
 
 
+@look()
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     """Draw the strip of one tracked recording."""
-    from matplotlib.figure import Figure
-
-    with look():
-        aspect = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2)
-        pictures_in = 7.2 / len(tracking.pictures) * aspect + 0.35
-        fig = Figure(figsize=(7.2, 3.9 + pictures_in), layout="constrained")
-        above, below = np.asarray(fig.subfigures(2, 1, height_ratios=[3.9, pictures_in]))
-        above.patch.set_alpha(0)
-        below.patch.set_alpha(0)
-        ax = above.add_subplot()
-        _draw_kymograph(ax, title, tracking, m_per_px)
-        frames = below.subplots(1, len(tracking.pictures), squeeze=False)[0]
-        for axes, (frame, picture) in zip(frames, tracking.pictures, strict=True):
-            _draw_frame(axes, tracking, frame, picture)
+    aspect = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2)
+    pictures_in = 7.2 / len(tracking.pictures) * aspect + 0.35
+    fig = new_figure(7.2, 3.9 + pictures_in)
+    above, below = np.asarray(fig.subfigures(2, 1, height_ratios=[3.9, pictures_in]))
+    above.patch.set_alpha(0)
+    below.patch.set_alpha(0)
+    ax = above.add_subplot()
+    _draw_kymograph(ax, title, tracking, m_per_px)
+    frames = below.subplots(1, len(tracking.pictures), squeeze=False)[0]
+    for axes, (frame, picture) in zip(frames, tracking.pictures, strict=True):
+        _draw_frame(axes, tracking, frame, picture)
     return fig
 
 

@@ -18,9 +18,9 @@ from vinetrack.figures.style import (
     VERMILLION,
     VINE_COLOURS,
     VINE_MARKERS,
-    blank,
     fitting_size,
     look,
+    new_figure,
     plain_log_ticks,
 )
 from vinetrack.narrative.power_text import size_text
@@ -50,33 +50,31 @@ class FilmChoice:
     odds: float
 
 
+@look()
 def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
     """Draw the films side by side: speed against diameter, and the certainty of the choice."""
-    from matplotlib.figure import Figure
-
     label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
-    with look():
-        fig = Figure(figsize=(9.6, 4.4))
-        curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-        for k, film in enumerate(films):
-            colour, marker = VINE_COLOURS[k % len(VINE_COLOURS)], VINE_MARKERS[k % len(VINE_MARKERS)]
-            curves.plot(film.diameters_mm, film.speeds_m_s, color=colour, label=f"{film.thickness_um:g} µm")
-            curves.plot(*film.best, marker, color=colour, ms=8, clip_on=False)
-            bars.plot([k, k], film.band, color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
-            bars.plot(k, film.best[1], marker, color=colour, ms=8)
-            bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), textcoords="offset points", ha="center",
-                          fontsize=10)  # fmt: skip
-        curves.set_xlabel("diameter (mm)")
-        curves.set_ylabel(label)
-        curves.set_ylim(0.0, 1.12 * max(film.band[1] for film in films))
-        curves.set_title("best length and pressure at each diameter", fontsize=10, fontweight="normal")
-        curves.legend(title="film", fontsize=9.5)
-        bars.set_xlim(-0.6, len(films) - 0.4)
-        bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
-        bars.set_xlabel("film (µm)")
-        bars.set_title("90 % band; percentage of draws in which it is the fastest", fontsize=10, fontweight="normal")
-        fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
-        fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
+    fig = new_figure(9.6, 4.4, layout=None)
+    curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    for k, film in enumerate(films):
+        colour, marker = VINE_COLOURS[k % len(VINE_COLOURS)], VINE_MARKERS[k % len(VINE_MARKERS)]
+        curves.plot(film.diameters_mm, film.speeds_m_s, color=colour, label=f"{film.thickness_um:g} µm")
+        curves.plot(*film.best, marker, color=colour, ms=8, clip_on=False)
+        bars.plot([k, k], film.band, color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
+        bars.plot(k, film.best[1], marker, color=colour, ms=8)
+        bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), textcoords="offset points", ha="center",
+                      fontsize=10)  # fmt: skip
+    curves.set_xlabel("diameter (mm)")
+    curves.set_ylabel(label)
+    curves.set_ylim(0.0, 1.12 * max(film.band[1] for film in films))
+    curves.set_title("best length and pressure at each diameter", fontsize=10, fontweight="normal")
+    curves.legend(title="film", fontsize=9.5)
+    bars.set_xlim(-0.6, len(films) - 0.4)
+    bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
+    bars.set_xlabel("film (µm)")
+    bars.set_title("90 % band; percentage of draws in which it is the fastest", fontsize=10, fontweight="normal")
+    fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
+    fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
     return fig
 
 
@@ -91,36 +89,34 @@ class GasLawLoss:
     losses: np.ndarray
 
 
+@look()
 def draw_reservoir(
     volumes_m3: np.ndarray, laws: Sequence[GasLawLoss], loss: float, swept_m3: float, chosen_m3: float | None
 ) -> Figure:
     """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume. Shapes: volumes_m3
     (n_volumes,).
     """
-    from matplotlib.figure import Figure
-
     factor, unit = (1e3, "L") if volumes_m3[0] >= _MIN_LITRE_AXIS / 10 else (1e6, "mL")
-    with look():
-        fig = Figure(figsize=(7.2, 4.4), layout="constrained")
-        ax = fig.subplots()
-        for law, colour, style in zip(laws, (BLUE, VERMILLION), ("-", DASHED), strict=False):
-            ax.plot(factor * volumes_m3, 100 * law.losses, color=colour, ls=style, label=law.name)
-        slow, fast = (100 * law.losses for law in laws[:2])
-        ax.fill_between(factor * volumes_m3, slow, fast, color=MUTED, alpha=0.12, lw=0)
-        ax.axhline(100 * loss, color=INK, lw=1.0)
-        ax.annotate(f"allowed: {100 * loss:g} %", (0.99, 100 * loss), (0, 3), ("axes fraction", "data"),
-                    textcoords="offset points", ha="right", fontsize=9.5)  # fmt: skip
-        if chosen_m3 is not None and volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
-            ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
-            ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", (factor * chosen_m3, 0.97), (5, 0),
-                        ("data", "axes fraction"), textcoords="offset points", va="top", fontsize=9.5)  # fmt: skip
-        ax.set_xscale("log")
-        ax.set_ylim(0.0, min(8 * 100 * loss, 100.0))
-        ax.set_xlim(factor * volumes_m3[0], factor * volumes_m3[-1])
-        plain_log_ticks(ax, "x")
-        ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
-        ax.set_ylabel("gauge pressure lost (%)")
-        ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9))
+    fig = new_figure(7.2, 4.4)
+    ax = fig.subplots()
+    for law, colour, style in zip(laws, (BLUE, VERMILLION), ("-", DASHED), strict=False):
+        ax.plot(factor * volumes_m3, 100 * law.losses, color=colour, ls=style, label=law.name)
+    slow, fast = (100 * law.losses for law in laws[:2])
+    ax.fill_between(factor * volumes_m3, slow, fast, color=MUTED, alpha=0.12, lw=0)
+    ax.axhline(100 * loss, color=INK, lw=1.0)
+    ax.annotate(f"allowed: {100 * loss:g} %", (0.99, 100 * loss), (0, 3), ("axes fraction", "data"),
+                textcoords="offset points", ha="right", fontsize=9.5)  # fmt: skip
+    if chosen_m3 is not None and volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
+        ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
+        ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", (factor * chosen_m3, 0.97), (5, 0),
+                    ("data", "axes fraction"), textcoords="offset points", va="top", fontsize=9.5)  # fmt: skip
+    ax.set_xscale("log")
+    ax.set_ylim(0.0, min(8 * 100 * loss, 100.0))
+    ax.set_xlim(factor * volumes_m3[0], factor * volumes_m3[-1])
+    plain_log_ticks(ax, "x")
+    ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
+    ax.set_ylabel("gauge pressure lost (%)")
+    ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9))
     return fig
 
 
@@ -145,29 +141,25 @@ class PredictionPicture:
     final: tuple[float, float, float]
 
 
+@look()
 def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
     """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed."""
-    from matplotlib.figure import Figure
-
     drawn = pictures[:MAX_CURVES]
-    with look():
-        fig = Figure(figsize=(_PREDICTION_WIDTH_IN, 7.2))
-        axes = fig.subplots(2, 2)
-        for colour, picture in zip(VINE_COLOURS, drawn, strict=False):
-            _draw_curves(axes, picture, colour)
-        _label_prediction(axes, drawn, at_fraction)
-        if len(drawn) == 1:
-            _draw_shares(axes[1, 1], drawn[0])
-        else:
-            _list_conditions(axes[1, 1], pictures)
-        title = drawn[0].title if len(drawn) == 1 else f"{len(pictures)} conditions"
-        fig.text(
-            0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * _PREDICTION_WIDTH_IN, 12)
-        )
-        words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
-        fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
-        fig.align_ylabels(axes[:, 0])
-        fig.subplots_adjust(left=0.075, right=0.985, top=0.91, bottom=0.105, hspace=0.3, wspace=0.27)
+    fig = new_figure(_PREDICTION_WIDTH_IN, 7.2, layout=None)
+    axes = fig.subplots(2, 2)
+    for colour, picture in zip(VINE_COLOURS, drawn, strict=False):
+        _draw_curves(axes, picture, colour)
+    _label_prediction(axes, drawn, at_fraction)
+    if len(drawn) == 1:
+        _draw_shares(axes[1, 1], drawn[0])
+    else:
+        _list_conditions(axes[1, 1], pictures)
+    title = drawn[0].title if len(drawn) == 1 else f"{len(pictures)} conditions"
+    fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * _PREDICTION_WIDTH_IN, 12))
+    words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
+    fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
+    fig.align_ylabels(axes[:, 0])
+    fig.subplots_adjust(left=0.075, right=0.985, top=0.91, bottom=0.105, hspace=0.3, wspace=0.27)
     return fig
 
 
@@ -265,32 +257,30 @@ def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
 _EFFECT_WIDTH_IN = 7.2  # Chosen: one panel that fits a page of A4
 
 
+@look()
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     """Draw position and speed of the leading edge with and without one effect, and the difference."""
-    from matplotlib.figure import Figure
-
     time_ms = 1e3 * table["time_s"].to_numpy()
-    with look():
-        fig = Figure(figsize=(_EFFECT_WIDTH_IN, 7.0))
-        position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
-        for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
-            axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label="without")
-            axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label="with")
-        difference_mm = 1e3 * table["difference_m"].to_numpy()
-        gap.axhline(0.0, color=INK, lw=0.8)
-        gap.plot(time_ms, difference_mm, color=VERMILLION)
-        gap.fill_between(time_ms, 0.0, difference_mm, color=VERMILLION, alpha=0.15, lw=0)
-        speed.set_ylim(*_bulk_limits(table))
-        position.set_ylabel("leading edge y (mm)")
-        speed.set_ylabel("its speed ẏ (m/s)")
-        gap.set_ylabel("difference (mm)")
-        gap.set_xlabel("time since release (ms)")
-        title = name + (f": {size}" if size else "")
-        fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * _EFFECT_WIDTH_IN, 11))
-        position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-        fig.align_ylabels()
-        fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
-        fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
+    fig = new_figure(_EFFECT_WIDTH_IN, 7.0, layout=None)
+    position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
+    for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
+        axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label="without")
+        axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label="with")
+    difference_mm = 1e3 * table["difference_m"].to_numpy()
+    gap.axhline(0.0, color=INK, lw=0.8)
+    gap.plot(time_ms, difference_mm, color=VERMILLION)
+    gap.fill_between(time_ms, 0.0, difference_mm, color=VERMILLION, alpha=0.15, lw=0)
+    speed.set_ylim(*_bulk_limits(table))
+    position.set_ylabel("leading edge y (mm)")
+    speed.set_ylabel("its speed ẏ (m/s)")
+    gap.set_ylabel("difference (mm)")
+    gap.set_xlabel("time since release (ms)")
+    title = name + (f": {size}" if size else "")
+    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * _EFFECT_WIDTH_IN, 11))
+    position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+    fig.align_ylabels()
+    fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
+    fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
     return fig
 
 
@@ -315,13 +305,12 @@ _TEXT_COLUMN_X = (0.0, 0.35, 0.7)  # Abscissae of the columns of sizes, relative
 _ROW_IN, _WIDTH_IN = 0.31, 9.6  # Chosen: one line of 10 pt per row; a map of 4 in between names and sizes
 
 
-def draw_power(power: Power) -> Figure:
+@look()
+def draw_power(power: Power) -> Figure | None:
     """Draw the power to detect each effect against its size."""
-    from matplotlib.figure import Figure
-
     entries = sorted(power.effects, key=_order)
     if not entries or power.wary:
-        return blank(f"Detectable sizes were not computed: {power.wary or 'no candidate acts here'}.")
+        return None
     parts = np.geomspace(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS)
     probabilities = np.array(
         [
@@ -329,21 +318,20 @@ def draw_power(power: Power) -> Figure:
             for entry in entries
         ]
     )
-    with look():
-        fig = Figure(figsize=(_WIDTH_IN, _ROW_IN * len(entries) + 1.75), layout="constrained")
-        ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
-        edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, N_COLUMNS + 1)
-        mesh = ax.pcolormesh(
-            edges, np.arange(len(entries) + 1) - 0.5, probabilities, cmap=_colours(), vmin=0, vmax=1, rasterized=True
-        )
-        _mark_rows(ax, entries)
-        _list_sizes(sizes, entries)
-        bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
-        bar.set_label("power: probability of detection (%)")
-        bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
-        bar.outline.set_visible(False)
-        trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
-        ax.set_title(f"What {trials} can detect", loc="left", pad=26)
+    fig = new_figure(_WIDTH_IN, _ROW_IN * len(entries) + 1.75)
+    ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
+    edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, N_COLUMNS + 1)
+    mesh = ax.pcolormesh(
+        edges, np.arange(len(entries) + 1) - 0.5, probabilities, cmap=_colours(), vmin=0, vmax=1, rasterized=True
+    )
+    _mark_rows(ax, entries)
+    _list_sizes(sizes, entries)
+    bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
+    bar.set_label("power: probability of detection (%)")
+    bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
+    bar.outline.set_visible(False)
+    trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
+    ax.set_title(f"What {trials} can detect", loc="left", pad=26)
     return fig
 
 

@@ -113,14 +113,18 @@ def rows(table: pd.DataFrame) -> Iterator[Any]:
     return iter(table.itertuples(index=False))
 
 
-def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure:
-    """Return a figure with a message in place of a figure that cannot be drawn."""
+def new_figure(width_in: float, height_in: float, layout: Any = "constrained") -> Figure:
+    """Return an empty figure."""
     from matplotlib.figure import Figure
 
-    with look():
-        fig = Figure(figsize=(width_in, height_in))
-        wrapped = textwrap.fill(message, int(width_in * 11))
-        fig.text(0.5, 0.5, wrapped, ha="center", va="center", color=MUTED)
+    return Figure(figsize=(width_in, height_in), layout=layout)
+
+
+@look()
+def blank(message: str) -> Figure:
+    """Return a figure with a message, in place of one that is promised and has nothing to show."""
+    fig = new_figure(7.0, 1.6, layout=None)
+    fig.text(0.5, 0.5, textwrap.fill(message, 77), ha="center", va="center", color=MUTED)
     return fig
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,8 @@ import numpy as np
 from vinetrack.diagnosis.ladder import Comparison
 from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
-from vinetrack.figures.registry import draw
+from vinetrack.figures.prediction_figures import draw_power
+from vinetrack.figures.registry import campaign_figures, draw
 from vinetrack.inference.fit_result import Fit
 from vinetrack.interface.loaded import LoadedResults
 from vinetrack.results.folder_layout import ResultsError
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
     from vinetrack.core.records import Trial
     from vinetrack.pipeline.diagnosis_stage import DiagnosisTables
-
-MODEL_FIGURES = ("model_comparison", "model_residuals")
 
 
 def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
@@ -34,23 +33,31 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
 
         shown = compare(shown)
     if isinstance(shown, Power):
-        return _draw_figure({"power": (shown,)}, name or "power")
-    inputs = _comparison_inputs(shown) if isinstance(shown, Comparison) else _diagnosis_inputs(shown)
-    return _draw_figure(inputs, name or next(iter(inputs), "none"))
+        return _with_content(draw_power(shown), "power")
+    if isinstance(shown, Comparison):
+        return _draw_figure(_comparison_tables(shown), name or "model_comparison")
+    return _draw_figure(_tables_in_memory(shown) if shown.rounds else None, name)
 
 
-def _draw_figure(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
-    if name not in inputs:
-        available = ", ".join(inputs) or "none"
-        raise ResultsError(f"There is no figure {name!r} with content; those with content are {available}.")
-    return draw(name, *inputs[name])
+def _draw_figure(tables: Any, name: str = "") -> Figure:
+    """Draw a figure, or the first with content."""
+    known = {one: entry for one, entry in campaign_figures().items() if all(hasattr(tables, t) for t in entry.reads)}
+    names = [name] if name else list(known)
+    return _with_content(next((drawn for one in names if one in known and (drawn := draw(one, tables))), None), name)
 
 
-def _comparison_inputs(shown: Comparison) -> dict[str, tuple[Any, ...]]:
+def _with_content(drawn: Figure | None, name: str) -> Figure:
+    if drawn is None:
+        names = ", ".join(campaign_figures())
+        raise ResultsError(f"There is no figure {name!r} with content; figures are {names}, trial_motion and power.")
+    return drawn
+
+
+def _comparison_tables(shown: Comparison) -> SimpleNamespace:
     from vinetrack.pipeline.report_stage import label_conditions
 
     table = label_conditions(shown.table, _condition_labels([compared.trial for compared in shown.trials]))
-    return {name: (table, dict(shown.trajectories)) for name in MODEL_FIGURES}
+    return SimpleNamespace(comparison=table, trajectories=dict(shown.trajectories))
 
 
 def _condition_labels(trials: list[Trial]) -> Any:
@@ -67,13 +74,6 @@ def _condition_labels(trials: list[Trial]) -> Any:
         }
     )
     return describe_conditions(rows, tuple(trials))
-
-
-def _diagnosis_inputs(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
-    """Return the data of the figures of a diagnosis; one read from a file has no trajectories."""
-    from vinetrack.pipeline.report_stage import figure_inputs
-
-    return figure_inputs(_tables_in_memory(shown)) if shown.rounds else {}
 
 
 def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
@@ -111,7 +111,7 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
 
 
 def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
-    from vinetrack.pipeline.report_stage import campaign_inputs, draw_trial
+    from vinetrack.pipeline.report_stage import FigureTables, draw_trial
 
     trials: tuple[Trial, ...] = ()
     try:
@@ -123,7 +123,7 @@ def _results_figure(shown: LoadedResults, name: str, trial: str) -> Figure:
         names = list(shown.trials["trial"])
         if trial not in names:
             raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        return draw_trial(shown.folder, next((row for row in trials if row.name == trial), None), trial)
-    inputs = campaign_inputs(shown.folder, trials)
-    chosen = name or ("ladder" if "ladder" in inputs else "damping_law")
-    return _draw_figure(inputs, chosen)
+        drawn = draw_trial(shown.folder, next((row for row in trials if row.name == trial), None), trial)
+        return _with_content(drawn, name)
+    tables = FigureTables(shown.folder, trials)
+    return _draw_figure(tables, name or ("ladder" if len(tables.ladder) else "damping_law"))

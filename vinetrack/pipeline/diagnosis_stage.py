@@ -49,26 +49,37 @@ if TYPE_CHECKING:
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
+def _no_table() -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame()
+
+
 @dataclass(frozen=True)
 class DiagnosisTables:
     """Data of the figures; a table is empty if there is nothing to draw. `rounds` are (heading, ranking) pairs, `worst`
-    is the condition that `before_after` shows, `cosines` are names and matrix, `added` the added effects in words,
-    `labels` the labels of conditions by name.
+    is the label of the condition that `before_after` shows, `added` the added effects in words.
     """
 
-    ladder: pd.DataFrame
-    trials: pd.DataFrame
-    before_after: pd.DataFrame
-    where: pd.DataFrame
-    cells: pd.DataFrame
-    drift: pd.DataFrame
-    force: pd.DataFrame
+    ladder: pd.DataFrame = field(default_factory=_no_table)
+    trials: pd.DataFrame = field(default_factory=_no_table)
+    before_after: pd.DataFrame = field(default_factory=_no_table)
+    where: pd.DataFrame = field(default_factory=_no_table)
+    cosines: pd.DataFrame = field(default_factory=_no_table)
+    drift: pd.DataFrame = field(default_factory=_no_table)
+    missing_force: pd.DataFrame = field(default_factory=_no_table)
+    learned_force: pd.DataFrame = field(default_factory=_no_table)
     rounds: Sequence[tuple[str, pd.DataFrame]] = ()
-    cosines: tuple[Sequence[str], Sequence[Sequence[float]]] = ((), ())
     worst: str = ""
     added: str = ""
-    labels: Mapping[str, str] = field(default_factory=dict)
-    learned: pd.DataFrame | None = None
+
+    @property
+    def ranking(self) -> pd.DataFrame:
+        """The rankings of all rounds in one table."""
+        import pandas as pd
+
+        parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(self.rounds) if len(table)]
+        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
 def read_diagnosis_tables(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
@@ -102,17 +113,15 @@ def assemble_tables(
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
         where=_where_table(trials, labels, located),
-        cells=_cosine_cells(names, matrix),
+        cosines=_cosine_cells(names, matrix),
         drift=drifting,
-        force=force,
+        missing_force=force,
         rounds=[
             (round_heading(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)
         ],
-        cosines=(names, matrix),
-        worst=worst,
+        worst=labels.get(worst, worst),
         added=listed_names(diagnosis.effects),
-        labels=labels,
-        learned=learned,
+        learned_force=pd.DataFrame() if learned is None else learned,
     )
 
 
@@ -150,30 +159,6 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
         with contextlib.suppress(EffectError):
             effects[name] = find_effect(name, user_effects)
     return effects
-
-
-def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
-    """Return the data table of each figure with content, by name of the figure."""
-    import pandas as pd
-
-    from vinetrack.figures.registry import DIAGNOSIS_FIGURES
-
-    if diagnosed is None:
-        return {}
-    parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(diagnosed.rounds) if len(table)]
-    tables = {
-        "ladder": diagnosed.ladder,
-        "before_after": diagnosed.before_after,
-        "where": diagnosed.where,
-        "missing_force": diagnosed.force,
-        "learned_force": pd.DataFrame() if diagnosed.learned is None else diagnosed.learned,
-        "candidates": pd.concat(parts, ignore_index=True) if parts else diagnosed.ladder.iloc[:0],
-        "cosines": diagnosed.cells,
-        "drift": diagnosed.drift,
-    }
-    if unmatched := sorted(set(tables) ^ set(DIAGNOSIS_FIGURES)):
-        raise RuntimeError(f"{', '.join(unmatched)}: not both in figures.registry and in figure_tables")
-    return {name: table for name, table in tables.items() if len(table)}
 
 
 def _table(path: Any) -> pd.DataFrame:
@@ -230,7 +215,7 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean misfit of every condition in sections of its growth, for `misfit_figures.draw_where`. The misfit
+    """Return the mean misfit of every condition in sections of its growth, for the figure `where`. The misfit
     of the initial model and its error are taken from the diagnosis if it contains them.
     """
     import pandas as pd

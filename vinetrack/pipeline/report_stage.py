@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,12 @@ import numpy as np
 
 from vinetrack.core.tables import write_bytes, write_csv, write_json, write_text
 from vinetrack.experiment.provenance import describe_run
-from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
-from vinetrack.pipeline.diagnosis_stage import figure_tables, read_diagnosis_section, read_diagnosis_tables
+from vinetrack.figures.registry import RegisteredFigure, campaign_figures, draw, figures_of
+from vinetrack.narrative.diagnosis_text import METHOD_NAMES
+from vinetrack.pipeline.diagnosis_stage import DiagnosisTables, read_diagnosis_section, read_diagnosis_tables
 from vinetrack.pipeline.tracks_stage import map_trials
 from vinetrack.pipeline.workflow import SHARED_FILES
-from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit, read_json, read_result
+from vinetrack.results.folder_layout import Results, ResultsError, read_fit, read_json, read_result
 from vinetrack.results.folder_layout import read_diagnosis as stored_diagnosis
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
-    from vinetrack.pipeline.diagnosis_stage import DiagnosisTables
     from vinetrack.report.build import Clip, ModelResult, ReportContent, ReportFigure, ReportSection, TrackedRecording
 
 
@@ -75,17 +75,20 @@ def draw_trials(
 
 
 def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettings) -> None:
-    _write(_trial_figure(picture, results), partial(results.trial_figure, picture.name), settings)
+    from vinetrack.figures.style import blank
+
+    drawn = _trial_figure(picture, results) or blank(f"{picture.title}: no positions to draw.")
+    _write(drawn, partial(results.trial_figure, picture.name), settings)
 
 
-def _trial_figure(picture: _TrialPicture, results: Results) -> Figure:
-    from vinetrack.figures.registry import draw
+def _trial_figure(picture: _TrialPicture, results: Results) -> Figure | None:
+    from vinetrack.figures.motion_figures import draw_trial_motion
 
     track, kinematics = read_result(results.track(picture.name)), read_result(results.kinematics(picture.name))
-    return draw("trial_motion", picture.title, track, kinematics, picture.windows, picture.travel_ratio)
+    return draw_trial_motion(picture.title, track, kinematics, picture.windows, picture.travel_ratio)
 
 
-def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
+def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure | None:
     """Draw position, speed and steady windows of one trial of a results folder."""
     results = Results(folder)
     windows = read_result(results.steady)
@@ -95,61 +98,96 @@ def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
     """Draw the figures of the whole experiment that have content; remove those of an earlier run."""
-    from vinetrack.figures.registry import CAMPAIGN_FIGURES, draw
-
     results = Results(folder)
-    for name in CAMPAIGN_FIGURES:
+    for name in campaign_figures():
         for form in ("png", "svg", "pdf"):
             results.figure(name, f".{form}").unlink(missing_ok=True)
-    inputs = campaign_inputs(folder, experiment.trials)
-    for name, values in inputs.items():
-        _write(draw(name, *values), partial(results.figure, name), settings)
-        log.info("drew %s", name)
-    write_json(results.figure_list, {"figures": list(inputs)})
-    return list(inputs)
+    tables, drawn = FigureTables(folder, experiment.trials), []
+    for name in campaign_figures():
+        if picture := draw(name, tables):
+            _write(picture, partial(results.figure, name), settings)
+            drawn.append(name)
+            log.info("drew %s", name)
+    write_json(results.figure_list, {"figures": drawn})
+    return drawn
 
 
-def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[Any, ...]]:
-    """Read the data of all figures of a whole experiment. Returns arguments of the drawing function by name of the
-    figure, for figures with content.
+class FigureTables:
+    """The tables of a results folder by the names that figures give them; each is read when a figure first needs it.
+    Those of the diagnosis are empty if there is none; those named `paper…` are the files of that name.
     """
-    from vinetrack.figures.overlay import MIN_EDGES, subpixel_positions
-    from vinetrack.figures.registry import CAMPAIGN_FIGURES
-    from vinetrack.narrative.diagnosis_text import METHOD_NAMES
-    from vinetrack.pipeline.diagnosis_stage import read_diagnosis_tables
 
-    results = Results(folder)
-    damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
-    described = describe_conditions(trials, known)
-    names = described.loc[described["status"] != "left_out", "trial"]
-    moved = {name: read_result(results.kinematics(name)) for name in names}
-    places = subpixel_positions({name: read_result(results.track(name)) for name in names})
-    in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
-    points = points.assign(used=points["used"] & bool(in_fit))
-    compared = label_conditions(read_result(results.comparison), described)
-    trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
-    scaling, diagnosed = read_json(results.scaling), read_diagnosis_tables(results, described)
-    conditions = read_result(results.conditions)
-    reached = conditions[conditions["final_lead_velocity_m_s"] > 0]
-    grown = reached[["vine", "pressure_kPa", "payload_g"]].drop_duplicates()
-    several_payloads = grown.duplicated(["vine", "pressure_kPa"]).any()
-    diagnosis = read_diagnosis(results)
-    if diagnosis is not None and diagnosis.refutes:
-        compared = compared.assign(model="refuted initial model: " + compared["model"])
-    inputs: dict[str, tuple[Any, ...]] = {
-        "damping_law": (points, damping) if len(points) else (),
-        "exponents": (damping,) if in_fit else (),
-        "scaling": (scaling,) if scaling["isometric"] or scaling["thickness"] else (),
-        "speed_scaling": (scaling,) if scaling["steady_speed"] else (),
-        "efficiency": (scaling,) if scaling["efficiency"] else (),
-        "payload_speed": (conditions, conditions.iloc[:0]) if several_payloads else (),
-        "overview": (described, moved) if moved else (),
-        "pixel_places": (places,) if len(places) >= MIN_EDGES else (),
-        "model_comparison": (compared, with_final_model(trajectories, diagnosed)) if len(compared) else (),
-        "model_residuals": (compared, trajectories) if len(compared) else (),
-    }
-    inputs |= {} if diagnosed is None else figure_inputs(diagnosed)
-    return {name: inputs[name] for name in CAMPAIGN_FIGURES if inputs.get(name)}
+    def __init__(self, folder: Path, known: tuple[Trial, ...]) -> None:
+        self.results = Results(folder)
+        self.known = known
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("paper"):
+            return read_result(self.results.folder / f"{name}.csv")
+        return getattr(self.diagnosed or DiagnosisTables(), name)
+
+    @cached_property
+    def damping(self) -> dict[str, Any]:
+        """The damping law, `damping.json`."""
+        return read_json(self.results.damping)
+
+    @cached_property
+    def scaling(self) -> dict[str, Any]:
+        """Powers of the size, `scaling.json`."""
+        return read_json(self.results.scaling)
+
+    @cached_property
+    def points(self) -> pd.DataFrame:
+        """Points of the damping law; none counts as used if there is no fit."""
+        points = read_result(self.results.points)
+        is_fitted = any(self.damping[method]["vines"] for method in METHOD_NAMES)
+        return points.assign(used=points["used"] & is_fitted)
+
+    @cached_property
+    def trials(self) -> pd.DataFrame:
+        """`trials.csv` with pressure and label of the condition."""
+        return describe_conditions(read_result(self.results.trials), self.known)
+
+    @cached_property
+    def kinematics(self) -> dict[str, pd.DataFrame]:
+        """Motion of every trial that is not left out, by name."""
+        return {name: read_result(self.results.kinematics(name)) for name in self._names}
+
+    @property
+    def _names(self) -> list[str]:
+        return self.trials.loc[self.trials["status"] != "left_out", "trial"].tolist()
+
+    @property
+    def subpixel_px(self) -> np.ndarray:
+        """Positions of all edges within a pixel."""
+        from vinetrack.figures.overlay import subpixel_positions
+
+        return subpixel_positions({name: read_result(self.results.track(name)) for name in self._names})
+
+    @cached_property
+    def comparison(self) -> pd.DataFrame:
+        """`comparison.csv` with vines and labels; a refuted model says so in its name."""
+        compared = label_conditions(read_result(self.results.comparison), self.trials)
+        diagnosis = stored_diagnosis(self.results)
+        if diagnosis is not None and diagnosis.refutes:
+            compared = compared.assign(model="refuted initial model: " + compared["model"])
+        return compared
+
+    @cached_property
+    def trajectories(self) -> dict[str, pd.DataFrame]:
+        """Measurement and models by condition, with the final model if effects were added."""
+        tables = {name: read_result(self.results.trajectories(name)) for name in self.comparison["condition"]}
+        return with_final_model(tables, self.diagnosed)
+
+    @property
+    def curves(self) -> pd.DataFrame:
+        """Measured and modelled growth of all trials, at most `MAX_CURVE_ROWS` rows at an even stride."""
+        return _curves(self.results)
+
+    @cached_property
+    def diagnosed(self) -> DiagnosisTables | None:
+        """Tables of the diagnosis; None if there is none."""
+        return read_diagnosis_tables(self.results, self.trials)
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
@@ -203,27 +241,6 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
     return table.iloc[order].reset_index(drop=True)
 
 
-def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
-    """Return the data of the figures of a diagnosis that have content, by name. Returns arguments of the drawing
-    function.
-    """
-    from vinetrack.figures.registry import DIAGNOSIS_FIGURES
-    from vinetrack.pipeline.diagnosis_stage import figure_tables
-
-    inputs: dict[str, tuple[Any, ...]] = {
-        "ladder": (tables.ladder,),
-        "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
-        "where": (tables.where, tables.added),
-        "missing_force": (tables.force,),
-        "learned_force": (tables.learned,),
-        "candidates": (tables.rounds,),
-        "cosines": tables.cosines,
-        "drift": (tables.drift, tables.added),
-    }
-    with_content = figure_tables(tables)
-    return {name: inputs[name] for name in DIAGNOSIS_FIGURES if name in with_content}
-
-
 def with_final_model(
     trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None
 ) -> dict[str, pd.DataFrame]:
@@ -245,23 +262,6 @@ def with_final_model(
 
 # ------------------------------------------------------------------------------
 # Comparison of a results folder with the published numbers and figures: `paper.csv`, figures, and their tables.
-
-TABLES_FOR_FIGURES = ("paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures")
-SPEED_TABLES = ("paper_speeds", "paper_speed_curves")
-
-FIG5_NOTE = (
-    "B of this vine and the payloads other than 35.6 g are not printed; the paper shows its points only in a plot"
-)
-FIG7_VIRTUAL = (
-    "Of the 12 mm vines only that of 100 µm has a printed B. Virtual vines with other walls were simulated with B "
-    "proportional to the wall: their straight line is an input"
-)
-FIG8_NOTE = (
-    "Alvarez et al. (2025): linear, R² = 0.935, from which p = 0.033 (printed: 0.32). The B printed in Fig. 6 do not "
-    "give linearly increasing speeds"
-)
-FIG8_VIRTUAL = ": virtual vines simulated with them cannot test one figure against the other"
-FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are only plotted"
 
 
 def compare_with_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
@@ -324,59 +324,12 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
     """Draw the figures of the comparison from the tables of `compare_with_paper`."""
-    from vinetrack.figures.registry import draw
-    from vinetrack.figures.style import render
+    from vinetrack.figures.style import blank
 
-    for name, inputs in _figure_inputs(Results(folder)).items():
-        for form, data in render(draw(name, *inputs), settings.formats, settings.dpi).items():
-            write_bytes(Results(folder).figure(name, f".{form}"), data)
-
-
-def _figure_inputs(results: Results) -> dict[str, tuple[Any, ...]]:
-    """Return the data of each figure of the comparison, by its name in the registry."""
-    from vinetrack.core import published
-    from vinetrack.paper.arithmetic import SIMULATED
-
-    tables = {name: read_result(results.folder / f"{name}.csv") for name in (*TABLES_FOR_FIGURES, *SPEED_TABLES)}
-    damping, scaling = read_json(results.damping), read_json(results.scaling)
-    virtual = (tables["paper"]["mark"] == SIMULATED).any()
-    fig7, fig8 = (FIG7_VIRTUAL, FIG8_NOTE + FIG8_VIRTUAL) if virtual else ("", FIG8_NOTE)
-    speed = {"steady_speed": _near(scaling["steady_speed"], published.STEADY_SPEED_KPA)}
-    efficiency = {"efficiency": _near(scaling["efficiency"], published.EFFICIENCY_KPA)}
-    motions = (tables[f"paper_{name}"] for name in ("motions", "means", "positions"))
-    printed_B = {"B": _printed_B(damping), "source": f"{published.SOURCE}, printed"}
-    return {
-        "paper_fig4": (*motions, published.POSITION_RMS_CM),
-        "paper_fig5": (
-            tables["paper_speeds"],
-            tables["paper_speed_curves"],
-            FIG5_NOTE,
-            "Eq. (2), B proportional to the wall",
-        ),
-        "paper_fig6": (read_result(results.points), damping, published.DAMPING_B, published.EXPONENT),
-        "paper_fig7": (scaling, printed_B, fig7),
-        "paper_fig8": (speed, fig8),
-        "paper_fig9": (efficiency, FIG9_NOTE),
-        "paper_reservoir": (tables["paper_pressures"],),
-        "paper_table2": (tables["paper"], tables["paper_departures"]),
-    }
-
-
-def _near(families: list[dict[str, Any]], pressure_kPa: float) -> list[dict[str, Any]]:
-    return [family for family in families if abs(family["pressure_kPa"] / pressure_kPa - 1) < 0.02]
-
-
-def _printed_B(damping: dict[str, Any]) -> dict[str, float]:
-    """Return the printed B of those vines that are in Table I, by the name of the vine here."""
-    from vinetrack.core import published
-
-    printed = {}
-    for law in damping.values():
-        for name, vine in (law.get("vines") or {}).items():
-            scale = published.scale_of(vine["diameter_mm"], vine["thickness_um"])
-            if scale is not None:
-                printed[name] = published.DAMPING_B[scale]
-    return printed
+    tables = FigureTables(folder, ())
+    for name in figures_of("paper"):
+        drawn = draw(name, tables) or blank("No trial of this experiment is compared with this figure.")
+        _write(drawn, partial(Results(folder).figure, name), settings)
 
 
 def _experiment_results(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
@@ -394,14 +347,7 @@ def _experiment_results(mark: str, results: Results, tables: Mapping[str, pd.Dat
     )
 
 
-_SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
-_DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
-# Addition to the caption of a figure that shows the initial model, if that is refuted
-OF_INITIAL_MODEL = {
-    **dict.fromkeys(("model_residuals", "missing_force", "learned_force"), _SHOWS_REFUTED),
-    **dict.fromkeys(("model_comparison", "before_after"), _DASHED_REFUTED),
-}
-
+MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 MAX_CURVE_ROWS = 6000  # Largest number of rows of the downloadable curves (chosen)
 
 
@@ -425,9 +371,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
     trials = read_result(results.trials)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
-    diagnosed = read_diagnosis_tables(results, describe_conditions(trials, experiment.trials))
-    own_data = {name: _as_csv(table) for name, table in figure_tables(diagnosed).items()}
-    own_data["model_comparison"] = _as_csv(_curves(results))
+    tables = FigureTables(folder, experiment.trials)
     return ReportContent(
         name=experiment.name,
         trials=trials,
@@ -435,14 +379,14 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         damping=read_json(results.damping),
         provenance=_provenance(experiment, settings),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[_figure(results, figure, own_data.get(figure.name, "")) for figure in _drawn(results)],
+        figures=[_figure(tables, figure) for figure in _drawn(results)],
         trial_figures=_trial_figures(results, drawn),
         recordings={name: _recording(results, name) for name in filmed},
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
-        clip=_clip(results, diagnosed, trials),
+        clip=_clip(results, tables.diagnosed, trials),
         model=_model_result(results),
         diagnosis=read_diagnosis_section(results, experiment),
-        sections=[_paper_section(results)] if experiment.settings.published else [],
+        sections=[_paper_section(tables)] if experiment.settings.published else [],
         notes=experiment.blank_notes,
     )
 
@@ -463,35 +407,46 @@ def _model_result(results: Results) -> ModelResult:
     return ModelResult(read_fit(results), compared, checked, stored_diagnosis(results))
 
 
-def _paper_section(results: Results) -> ReportSection:
+def _paper_section(tables: FigureTables) -> ReportSection:
     from vinetrack.report.paper_section import paper_section
 
-    figures = [_figure(results, figure) for figure in PAPER_FIGURES.values() if _svg(results, figure).exists()]
-    table, departures = (read_result(results.folder / f"{name}.csv") for name in ("paper", "paper_departures"))
-    return paper_section(table, departures, figures)
+    figures = [
+        _figure(tables, one)
+        for one in figures_of("paper").values()
+        if _picture(partial(tables.results.figure, one.name))
+    ]
+    return paper_section(tables.paper, tables.paper_departures, figures)
 
 
 def _drawn(results: Results) -> list[RegisteredFigure]:
     """Return the figures of the whole experiment that were drawn."""
     names = set(read_json(results.figure_list)["figures"])
-    return [figure for name, figure in CAMPAIGN_FIGURES.items() if name in names and _svg(results, figure).exists()]
+    figures = campaign_figures().items()
+    return [figure for name, figure in figures if name in names and _picture(partial(results.figure, name))]
 
 
-def _svg(results: Results, figure: RegisteredFigure) -> Path:
-    return results.figure(figure.name, ".svg")
+def _picture(path: Callable[[str], Path]) -> str | bytes:
+    """Return a figure for the page: its SVG, or its PNG if there is none or it is too large; empty if there is none."""
+    svg, png = path(".svg"), path(".png")
+    if svg.exists() and svg.stat().st_size <= MAX_SVG_BYTES:
+        return svg.read_text(encoding="utf-8")
+    return png.read_bytes() if png.exists() else b""
 
 
-def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> ReportFigure:
-    """Return a figure for the page, with the file of its data, or with `own_data`."""
-    from vinetrack.report.build import ReportFigure, figure_caption
+def _figure(tables: FigureTables, figure: RegisteredFigure) -> ReportFigure:
+    """Return a figure for the page, with its data: a file of the results, or a table of its own."""
+    from vinetrack.report.build import ReportFigure
 
-    data = (results.folder / figure.data).read_text(encoding="utf-8") if figure.data else own_data
-    svg = _svg(results, figure).read_text(encoding="utf-8")
-    caption, data_name = figure_caption(figure.name), figure.data or f"{figure.name}.csv"
-    diagnosis = stored_diagnosis(results)
-    if diagnosis is not None and diagnosis.refutes and figure.name in OF_INITIAL_MODEL:
-        caption = f"{caption} {OF_INITIAL_MODEL[figure.name]}"
-    return ReportFigure(figure.name, figure.title, caption, svg, data_name, data)
+    is_file = "." in figure.data
+    data_name = figure.data if is_file else f"{figure.name}.csv" if figure.data else ""
+    data = ""
+    if figure.data:
+        path = tables.results.folder / figure.data
+        data = path.read_text(encoding="utf-8") if is_file else _as_csv(getattr(tables, figure.data))
+    picture = _picture(partial(tables.results.figure, figure.name))
+    diagnosis = stored_diagnosis(tables.results)
+    refuted = figure.if_refuted if diagnosis is not None and diagnosis.refutes else ""
+    return ReportFigure(figure.name, figure.title, f"{figure.caption} {refuted}".strip(), picture, data_name, data)
 
 
 def _as_csv(table: pd.DataFrame) -> str:
@@ -518,8 +473,8 @@ def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFr
     with_clip = trials[[results.overlay(name).exists() for name in trials["trial"]]]
     if not len(with_clip):
         return None
-    worst = diagnosed.worst if diagnosed is not None else ""
-    chosen = with_clip[with_clip["condition"] == worst] if (with_clip["condition"] == worst).any() else with_clip
+    worst = diagnosed.before_after["trial"] if diagnosed is not None and len(diagnosed.before_after) else ()
+    chosen = with_clip[with_clip["trial"].isin(worst)] if with_clip["trial"].isin(worst).any() else with_clip
     name = str(chosen["trial"].iloc[0])
     note = " The condition is the one that the model predicts worst." if len(chosen) < len(with_clip) else ""
     edges = "the tracked edge (yellow)"
@@ -551,14 +506,12 @@ def _poster(path: Path) -> bytes:
 def _recording(results: Results, name: str) -> TrackedRecording:
     from vinetrack.report.build import TrackedRecording
 
-    strip = results.strip_figure(name, ".svg")
     return TrackedRecording(
-        strip=strip.read_text(encoding="utf-8") if strip.exists() else "",
+        strip=_picture(partial(results.strip_figure, name)),
         flags=read_result(results.track(name))["flag"].tolist(),
         calibration=read_json(results.analysed(name)).get("calibration"),
     )
 
 
-def _trial_figures(results: Results, names: list[str]) -> dict[str, str]:
-    paths = {name: results.trial_figure(name, ".svg") for name in names}
-    return {name: path.read_text(encoding="utf-8") for name, path in paths.items() if path.exists()}
+def _trial_figures(results: Results, names: list[str]) -> dict[str, str | bytes]:
+    return {name: picture for name in names if (picture := _picture(partial(results.trial_figure, name)))}

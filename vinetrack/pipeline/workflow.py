@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.tables import is_readable, write_text
-from vinetrack.figures.registry import PAPER_FIGURES
+from vinetrack.figures.registry import figures_of
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -334,7 +334,10 @@ class WorkflowPlan:
 
     def paper_figures(self) -> list[tuple[str, str, str]]:
         """Figures of the comparison with the paper: name, format and path."""
-        return self._figures(PAPER_FIGURES, "") if self.published else []
+        if not self.published:
+            return []
+        titles = {name: one.title for name, one in figures_of("paper").items()}
+        return [(titles[name], form, path) for name, form, path in self._figures(titles, "")]
 
     def trial_figures(self, trials: Iterable[str] | None = None) -> list[tuple[str, str, str]]:
         """Return the figures of single trials."""

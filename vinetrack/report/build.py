@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import split_flags
 from vinetrack.core.units import display_unit, number, with_error
-from vinetrack.figures.registry import FIGURES
+from vinetrack.figures.registry import all_figures
 from vinetrack.figures.style import RULE_NAMES, page_tokens, rows
 from vinetrack.narrative.diagnosis_text import (
     DIAGNOSIS_METHODS,
@@ -36,7 +36,7 @@ from vinetrack.report.section import (
     ReportTable,
     data_uri,
     figure_entry,
-    inline_svg,
+    inline_picture,
     section_entry,
 )
 
@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 
 # ------------------------------------------------------------------------------
 # Trials in the report: values, status and reason, strip, motion, data, and calibration.
-
-MAX_SVG_BYTES = 1_500_000  # Chosen: a tenth of the 15 MB that a report may have
 
 CALIBRATION_NAMES = {
     "charuco": "ChArUco board",
@@ -94,12 +92,12 @@ METHODS = (
 
 @dataclass(frozen=True)
 class TrackedRecording:
-    """A recording in the report: its strip as SVG ("" for none), the flags of its frames, and its calibration.
+    """A recording in the report: its strip as SVG or PNG (empty for none), the flags of its frames, its calibration.
     `calibration` was written by the recording's stage: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
     n_corners, n_pictures, notes`; None if there is none.
     """
 
-    strip: str
+    strip: str | bytes
     flags: Sequence[str]
     calibration: Mapping[str, Any] | None = None
 
@@ -187,18 +185,14 @@ def _marked(**pictures: str) -> dict[str, Any]:
 def _trial_pictures(row: Any, content: ReportContent) -> tuple[str, str]:
     """Strip and motion figure of one trial, ready for the page; blank if there is none."""
     name = row.trial
-    recording, motion = content.recordings.get(name), content.trial_figures.get(name, "")
-    strip = recording.strip if recording is not None else ""
     if row.status == "failed":
         return "", ""
+    recording, motion = content.recordings.get(name), content.trial_figures.get(name, "")
+    strip = recording.strip if recording is not None else ""
     return (
-        inline_svg(strip, f"s-{name}", f"Strip of {name} with its tracked edge") if _fits(strip) else "",
-        inline_svg(motion, f"t-{name}", f"Motion of {name}") if _fits(motion) else "",
+        inline_picture(strip, f"s-{name}", f"Strip of {name} with its tracked edge") if strip else "",
+        inline_picture(motion, f"t-{name}", f"Motion of {name}") if motion else "",
     )
-
-
-def _fits(svg: str) -> bool:
-    return 0 < len(svg) <= MAX_SVG_BYTES
 
 
 def _trial_numbers(row: Any, content: ReportContent) -> dict[str, Any]:
@@ -440,7 +434,7 @@ class ReportContent:
     provenance: Mapping[str, Any]
     kinematics: Mapping[str, pd.DataFrame]
     figures: Sequence[ReportFigure] = ()
-    trial_figures: Mapping[str, str] = field(default_factory=dict)
+    trial_figures: Mapping[str, str | bytes] = field(default_factory=dict)
     recordings: Mapping[str, TrackedRecording] = field(default_factory=dict)
     clips: Mapping[str, str] = field(default_factory=dict)
     clip: Clip | None = None
@@ -475,7 +469,7 @@ def build_report(content: ReportContent) -> str:
         diagnosis=diagnosis_section(content.diagnosis),
         figures=_figures(content),
         clip=_clip(content.clip),
-        sections=[section_entry(section, MAX_SVG_BYTES) for section in content.sections],
+        sections=[section_entry(section) for section in content.sections],
         trials=trials,
         n_left_out=n_left_out,
         calibrations=calibration_table(content.recordings),
@@ -491,19 +485,12 @@ def build_report(content: ReportContent) -> str:
     )
 
 
-def figure_caption(name: str) -> str:
-    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text."""
-    path = files("vinetrack.report") / "captions" / f"{name}.rst"
-    return " ".join(path.read_text(encoding="utf-8").split())
-
-
 def _figures(content: ReportContent) -> dict[str, list[dict[str, Any]]]:
     """Figures for the template, by section of the page."""
-    by_section: dict[str, list[dict[str, Any]]] = {figure.section: [] for figure in FIGURES.values()}
+    sections = {name: figure.section for name, figure in all_figures().items()}
+    by_section: dict[str, list[dict[str, Any]]] = {section: [] for section in sections.values()}
     for figure in content.figures:
-        if len(figure.svg) <= MAX_SVG_BYTES:
-            section = FIGURES[figure.key].section if figure.key in FIGURES else "damping"
-            by_section[section].append(figure_entry(figure))
+        by_section[sections.get(figure.key, "damping")].append(figure_entry(figure))
     return by_section
 
 
