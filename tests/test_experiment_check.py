@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from hand_sheet import GOOD, HEADER, TRACK, two_vines, write
 
+from vinetrack.core.problems import Problem, format_problems
 from vinetrack.core.records import Trial
-from vinetrack.experiment.folder import Experiment, Problem, check_experiment, format_problems, read_experiment
+from vinetrack.experiment.folder import Experiment, check_experiment, read_experiment
 
 
 @pytest.fixture
@@ -86,11 +87,27 @@ def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder: P
         (folder / name).write_bytes(b"film")
     rows = "a,d12_24kPa_1.mp4,24,200,280,28,3,\nb,d12_24kP_2.mp4,24,200,280,28,3,\nc,other.avi,24,200,280,28,3,\n"
     write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 1000\n")
-    remedies = {problem.trial: problem.remedy for problem in check_experiment(folder)}
+    remedies = {problem.trial: problem.remedy for problem in check_experiment(folder) if problem.trial}
     assert remedies == {
         "b": "did you mean d12_24kPa_2.MP4?",
         "c": "check the path and its upper and lower case",
     }
+
+
+def test_a_recording_that_no_row_names_is_named(folder: Path) -> None:
+    burst = [f"burst/{i}.png" for i in range(5)]
+    for name in ("a.mp4", "left.mov", "day 2/extra.avi", "calibration/board.mp4", "target.mp4", *burst):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"film")
+    rows = "a,./a.mp4,24,200,280,28,3,,\nb,left.mov,24,200,280,28,3,,no\n"
+    target = "calibration: {kind: checkerboard, image: target.mp4, squares: [5, 5], square_mm: 5}\n"
+    write(folder, f"{HEADER.replace('track', 'video')},use\n{rows}", "capture_fps: 1000\n" + target)
+    (problem,) = check_experiment(folder)
+    assert (problem.severity, problem.file, problem.column) == ("warning", "trials.csv", "video")
+    assert problem.message.endswith(" burst, day 2/extra.avi")
+    more = "c,burst/0.png,24,200,280,28,3,,\nd,day 2/extra.avi,24,200,280,28,3,,\n"
+    write(folder, f"{HEADER.replace('track', 'video')},use\n{rows}{more}")
+    assert check_experiment(folder) == []
 
 
 def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder: Path) -> None:

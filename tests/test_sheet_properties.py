@@ -15,9 +15,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from vinetrack.core.problems import format_problems
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import TableError, decode_text, parse_number, parse_table, result_file, safe_join
-from vinetrack.experiment.folder import ExperimentError, check_experiment, format_problems, read_experiment
+from vinetrack.experiment.folder import ExperimentError, check_experiment, read_experiment
 from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.tracks.importers import TrackError, read_pressure_trace, read_track

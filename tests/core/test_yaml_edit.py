@@ -43,7 +43,7 @@ def test_a_blank_key_takes_a_block() -> None:
 
 
 def test_a_value_is_cleared_and_its_comment_stays() -> None:
-    assert with_value("chamber_l: 2  # of glass\n", "chamber_l", None) == "chamber_l:  # of glass\n"
+    assert with_value("chamber_l: 2  # of glass\n", "chamber_l", None) == "chamber_l:    # of glass\n"
 
 
 def test_a_block_is_cleared() -> None:
@@ -58,7 +58,7 @@ def test_the_same_value_leaves_every_character() -> None:
 
 
 def test_a_key_is_added_to_a_file_without_a_last_line_end() -> None:
-    assert with_value("a: 1", "b", "of: text") == 'a: 1\nb: "of: text"\n'
+    assert with_value("a: 1", "b", "of: text") == "a: 1\nb: 'of: text'\n"
 
 
 def test_what_cannot_be_set_without_harm_is_refused() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hand_sheet import GOOD, HEADER, TRACK, one, stopped, two_vines, write
 
+from vinetrack.core.problems import format_problems
 from vinetrack.core.records import Bend, Trial
 from vinetrack.experiment.folder import read_experiment
 
@@ -211,8 +212,8 @@ def test_a_pressure_that_looks_like_bar_is_a_warning(folder: Path) -> None:
 
 def test_the_same_oddity_in_many_rows_is_said_once(folder: Path) -> None:
     rows = "".join(f"t{i},a.csv,24,200,280,28,3,0.05\n" for i in range(30))
-    (problem,) = read_experiment(write(folder, f"{HEADER}\n{rows}")).problems
-    assert "29 more rows" in problem.message
+    (line,) = format_problems(read_experiment(write(folder, f"{HEADER}\n{rows}")).problems)
+    assert "t0 and 29 more" in line
 
 
 def test_names_that_differ_in_case_alone_are_a_warning(folder: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from vinetrack.core.tables import list_recordings
 from vinetrack.pages.clip_names import (
     columns_from_names,
     list_pictures,
-    list_recordings,
     list_tables,
     trial_names,
     units_of,

@@ -86,7 +86,7 @@ def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
 
 def test_shared_values_are_set_in_place_and_in_the_unit_chosen() -> None:
     after = with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
-    assert after.startswith("# of the lab\nyield_pressure_psi: 0.5  # measured twice\n")
+    assert after.startswith("# of the lab\nyield_pressure_psi: 0.5 # measured twice\n")
     assert parse_yaml(after, "").content == {
         "yield_pressure_psi": 0.5, "thickness_um": 100, "capture_fps": 1069,
     }  # fmt: skip

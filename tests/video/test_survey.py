@@ -10,8 +10,8 @@ import av
 import numpy as np
 import pytest
 
-from vinetrack.core.problems import Problem
-from vinetrack.experiment.folder import check_experiment, format_problems
+from vinetrack.core.problems import Problem, format_problems
+from vinetrack.experiment.folder import check_experiment
 from vinetrack.video.survey import survey
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"
@@ -206,6 +206,7 @@ def test_fifty_recordings_take_twenty_lines_however_many_are_bad(folder: Path) -
         shutil.copy(folder / "a.mp4", folder / name)
         if i % 2:
             (folder / name).write_text("text")
+    (folder / "a.mp4").unlink()
     problems = check(folder, *names)
     assert len(problems) == 25
     assert len(format_problems(problems)) == 20

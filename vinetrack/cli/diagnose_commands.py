@@ -50,8 +50,8 @@ def _diagnose(
 ) -> None:
     """Diagnose what the model lacks: verdict, candidates with sizes, errors before and after, next experiment."""
     with errors_as_sentences(log):
+        from vinetrack.core.tables import PROVENANCE
         from vinetrack.diagnosis.diagnose import diagnose
-        from vinetrack.experiment.provenance import PROVENANCE
         from vinetrack.pipeline.workflow import find_experiment
 
         with _progress_line() as report:

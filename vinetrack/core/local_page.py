@@ -13,8 +13,6 @@ from vinetrack.core.problems import UserError
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30  # Chosen: not used by well-known services; 30 pages on one machine, then any free port
 
-TOKEN_BYTES = 16  # Chosen: 128 bits, which cannot be guessed; half would suffice
-
 THREAD_PREFIX = "vinetrack-"  # Prefix of the names of a page's threads that need not finish before the process exits
 
 Server = TypeVar("Server")
@@ -26,7 +24,7 @@ class PageError(UserError, RuntimeError):
 
 def secret_path() -> str:
     """Return a random first part of a page's path, so that only users who know the address have access."""
-    return f"/{secrets.token_urlsafe(TOKEN_BYTES)}"
+    return f"/{secrets.token_urlsafe(16)}"
 
 
 def allowed_hosts(port: int) -> frozenset[str]:

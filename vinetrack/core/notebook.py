@@ -14,9 +14,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Module whose function `figure_of(object, name, **options)` draws objects of this package
-PLOTTING_BACKEND = "vinetrack.interface.plotting"
-
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", notes: Sequence[str] = ()) -> str:
     """Return a table as HTML with all text escaped."""
@@ -29,5 +26,5 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str = 
 
 def plot(shown: Any, name: str = "", **options: Any) -> Figure:
     """Draw an object as in the report."""
-    figure: Figure = import_module(PLOTTING_BACKEND).figure_of(shown, name, **options)
+    figure: Figure = import_module("vinetrack.interface.plotting").figure_of(shown, name, **options)
     return figure

@@ -38,9 +38,10 @@ class Problem:
 
     @classmethod
     def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
-        """Make a problem of an error whose text is `message: remedy`."""
-        message, _, remedy = str(error).partition(": ")
-        return cls(message=message, file=file, remedy=remedy, **details)
+        """Make a problem of an error, with the fields of an InputError."""
+        if isinstance(error, InputError):
+            return cls(message=error.message, file=file, remedy=error.remedy, allowed=error.allowed, **details)
+        return cls(message=str(error), file=file, **details)
 
     @property
     def reason(self) -> str:
@@ -66,6 +67,14 @@ class UserError(Exception):
     """An error that the user can correct: the message says what is wrong and what to do. The command line prints the
     message of these errors; any other exception is an error in the program.
     """
+
+
+class InputError(UserError):
+    """An input that cannot be used: what is wrong (`message`), the remedy, and what is allowed."""
+
+    def __init__(self, message: str, remedy: str = "", allowed: str = "") -> None:
+        super().__init__(f"{message}: {remedy}" if remedy else message)
+        self.message, self.remedy, self.allowed = message, remedy, allowed
 
 
 class ExperimentError(UserError):

@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.problems import InputError
+from vinetrack.core.records import CONTAINERS, IMAGES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,9 +39,6 @@ if TYPE_CHECKING:
 # The text of a path in a sheet stays inside the experiment folder, but a link in the folder may lead outside, for
 # example
 # to recordings on another disk. Its target must be a regular file or a folder, like every entry of the folder itself.
-
-DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})  # Error numbers of a full disk or an exhausted quota
-
 
 # Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`
 NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
@@ -88,8 +86,65 @@ def is_readable(path: Path) -> bool:
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error means that the disk is full."""
-    return isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS
+    """Whether an error means that the disk is full, or a quota exhausted."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+# ------------------------------------------------------------------------------
+# Recordings that lie in the folder.
+
+PROVENANCE = "provenance.json"  # Its presence marks a results folder
+MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
+MAX_FOLDER_DEPTH = 4  # Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
+
+
+def list_recordings(folder: Path) -> list[str]:
+    """Return the recordings below a folder, as relative paths in natural order."""
+    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, MAX_FOLDER_DEPTH)]
+    return sorted(names, key=natural_order)
+
+
+def _recordings(folder: Path, depth: int) -> Iterator[Path]:
+    for path in entries(folder):
+        if path.is_file() and (path.suffix.lower() in CONTAINERS or _is_stack(path)):
+            yield path
+        elif path.is_dir() and not (path / PROVENANCE).exists() and not is_calibration(path):
+            inside = [entry for entry in entries(path) if entry.suffix.lower() in IMAGES]
+            if len(inside) >= MIN_PICTURES:
+                yield path
+            elif depth > 0:
+                yield from _recordings(path, depth - 1)
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what a folder holds, without hidden files; nothing if it cannot be read."""
+    try:
+        return [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def is_calibration(folder: Path) -> bool:
+    """Whether a folder's name says that it holds pictures of a target."""
+    return folder.name.lower().startswith("calib")
+
+
+def _is_stack(path: Path) -> bool:
+    """Whether a TIFF holds as many pictures as a recording needs."""
+    from PIL import Image, UnidentifiedImageError
+
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return False
+    try:
+        with Image.open(path) as image:
+            return getattr(image, "n_frames", 1) >= MIN_PICTURES
+    except (OSError, UnidentifiedImageError):
+        return False
+
+
+def natural_order(text: str) -> list[tuple[int, int, str]]:
+    """Sort key that orders numbers in a name by value: 2 before 10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.findall(r"\d+|\D+", text)]
 
 
 MAX_TABLE_BYTES = 200_000_000  # Largest file read as a table (chosen)
@@ -102,7 +157,7 @@ _PLAIN_NUMBERS = re.compile(r"[0-9eE+.\n-]*")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
 
-class TableError(UserError):
+class TableError(InputError):
     """A file that cannot be read as a table, or a cell that is not a number: one sentence with a remedy."""
 
 
@@ -139,7 +194,8 @@ class Table:
             try:
                 values[i] = parse_number(cell, self.decimal)
             except TableError as error:
-                raise TableError(f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error}") from None
+                message = f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error.message}"
+                raise TableError(message, error.remedy) from None
         return values
 
 
@@ -147,14 +203,14 @@ def parse_number(text: str, decimal: str = ".") -> float:
     """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else."""
     text = text.strip()
     if text == "":
-        raise TableError("is blank: write a number")
+        raise TableError("is blank", "write a number")
     if not _NUMBER.fullmatch(text):
-        raise TableError("is not a number: write digits only, without unit or separators")
+        raise TableError("is not a number", "write digits only, without unit or separators")
     mark = "," if "," in text else "."
     if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
         joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
         corrected = f"{pointed}0 or {joined}"
-        raise TableError(f"may be thousands or decimals: write {corrected}, whichever is meant")
+        raise TableError("may be thousands or decimals", f"write {corrected}, whichever is meant")
     value = float(text.replace(",", "."))
     if not math.isfinite(value):
         raise TableError("is too large a number")
@@ -170,24 +226,24 @@ def decode_text(data: bytes) -> str:
     else:
         encodings = ["utf-8-sig", "cp1252"]
         if b"\x00" in data:
-            raise TableError("is not text: save the table as CSV (comma or semicolon separated)")
+            raise TableError("is not text", "save the table as CSV (comma or semicolon separated)")
     for encoding in encodings:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
-    raise TableError("is not readable as text: save it as CSV in UTF-8")
+    raise TableError("is not readable as text", "save it as CSV in UTF-8")
 
 
 def read_text(path: Path) -> str:
     """Read a text file of at most `MAX_TABLE_BYTES`."""
     try:
         if file_size(path) > MAX_TABLE_BYTES:
-            raise TableError("is too large to be a table: is it a recording?")
+            raise TableError("is too large to be a table", "is it a recording?")
         return decode_text(path.read_bytes())
     except FileNotFoundError:
-        raise TableError(": ".join(missing_file_message(path))) from None
+        raise TableError(*missing_file_message(path)) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it cannot be opened"
-        raise TableError(f"cannot be read: {reason}") from None
+        raise TableError("cannot be read", reason) from None
 
 
 def read_table(path: Path) -> Table:
@@ -205,11 +261,11 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
     records = _records("\n".join(lines), delimiter)
     header = next(((line, cells) for line, cells in records if any(cells)), None)
     if header is None:
-        raise TableError("is empty: its first line must name the columns")
+        raise TableError("is empty", "its first line must name the columns")
     columns = tuple(header[1])
     named = [column for column in columns if column]
     if repeated := sorted({column for column in named if named.count(column) > 1}):
-        raise TableError(f"names the column {repeated[0]!r} twice: keep one of them")
+        raise TableError(f"names the column {repeated[0]!r} twice", "keep one of them")
     body = [(line, cells) for line, cells in records if line > header[0] and any(cells)]
     width = len(columns)
     rows = tuple(
@@ -235,11 +291,11 @@ def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
         return _split_records(text, delimiter, strict=True)
     except csv.Error as error:
         if "end of data" in str(error):
-            raise TableError("has a quotation mark that is never closed: remove it") from None
+            raise TableError("has a quotation mark that is never closed", "remove it") from None
     try:
         return _split_records(text, delimiter, strict=False)
     except csv.Error as error:
-        raise TableError(f"is not a table ({error}): save it as CSV") from None
+        raise TableError(f"is not a table ({error})", "save it as CSV") from None
 
 
 def _split_records(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]:
@@ -274,26 +330,26 @@ def safe_join(folder: Path, relative: str) -> Path:
     text = relative.strip().replace("\\", "/")
     # Control characters, surrogates, line and paragraph separators; unusual spaces are allowed: macOS writes them.
     if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
-        raise TableError("contains characters that no path should have: type it again")
+        raise TableError("contains characters that no path should have", "type it again")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
-        raise TableError("is an absolute path: write it relative to the experiment folder")
+        raise TableError("is an absolute path", "write it relative to the experiment folder")
     parts: list[str] = []
     for part in text.split("/"):
         if part == ".." and not parts:
-            raise TableError("leads out of the experiment folder: move the file into it, or put a link there")
+            raise TableError("leads out of the experiment folder", "move the file into it, or put a link there")
         if part == "..":
             parts.pop()
         elif part not in ("", "."):
             parts.append(part)
     if not parts:
-        raise TableError("names no file: write a path relative to the experiment folder")
+        raise TableError("names no file", "write a path relative to the experiment folder")
     return folder.joinpath(*parts)
 
 
 def result_file(folder: Path, name: str, suffix: str) -> Path:
     """Return the path of a result named after a trial, vine or condition; refuse a name that could leave `folder`."""
     if not _SAFE_NAME.fullmatch(name):
-        raise TableError(f"{name[:40]!r} cannot name a file: use letters, digits, _ and -")
+        raise TableError(f"{name[:40]!r} cannot name a file", "use letters, digits, _ and -")
     return folder / f"{name}{suffix}"
 
 

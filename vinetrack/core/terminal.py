@@ -19,7 +19,6 @@ Item = TypeVar("Item")
 
 PROGRESS_DELAY_S = 0.5  # Delay before a progress bar appears (chosen)
 
-COLUMN_GAP = "  "
 STYLE_CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
 SEVERITY_COLOURS = {"error": "red", "warning": "yellow"}
 
@@ -83,7 +82,7 @@ def table(
         ">" if _is_numeric([line[k] for line in lines[len(above) :]]) else "<" for k in range(count)
     )
     widths = [max(width(line[k]) for line in lines) for k in range(count)]
-    return [(indent + COLUMN_GAP.join(map(_padded, line, widths, sides))).rstrip() for line in lines]
+    return [(indent + "  ".join(map(_padded, line, widths, sides))).rstrip() for line in lines]
 
 
 def _padded(cell: str, columns: int, side: str) -> str:

@@ -191,6 +191,17 @@ def split_unit(name: str) -> tuple[str, str]:
     return name, ""
 
 
+def other_units(name: str) -> dict[str, str]:
+    """Return the names of the same quantity in other units, each with its unit; none for a name without a unit.
+
+    >>> other_units("chamber_l")
+    {'chamber_ml': 'ml', 'chamber_cm3': 'cm3', 'chamber_m3': 'm3'}
+    """
+    quantity, own = split_unit(name)
+    same = {key for key in UNITS if own and UNITS[key].si == UNITS[own].si}
+    return {f"{quantity}_{key}": key for key in UNITS if key in same - {own}}
+
+
 def convert(value: float, unit: str, to: str) -> float:
     """Convert a value to another unit of the same quantity."""
     given, wanted = UNITS[unit], UNITS[to]

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem, format_problems
-from vinetrack.core.records import CORRECTION_ACTIONS, Correction, Floats, Trial
+from vinetrack.core.problems import CLOSE_NAME_RATIO, ExperimentError, Problem
+from vinetrack.core.records import CORRECTION_ACTIONS, IMAGES, Correction, Floats, Trial
 from vinetrack.core.tables import (
     Table,
     TableError,
     file_size,
+    list_recordings,
     missing_file_message,
     parse_number,
     read_table,
@@ -34,7 +35,6 @@ from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, wit
 from vinetrack.experiment.settings import (
     ExperimentSettings,
     in_sheet_units,
-    keys_in_other_units,
     read_experiment_settings,
 )
 from vinetrack.experiment.sheet import (
@@ -179,8 +179,7 @@ def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction 
         try:
             numbers[column] = parse_number(row[column], table.decimal)
         except TableError as error:
-            message, _, remedy = str(error).partition(": ")
-            problems.append(_problem(table, index, column, message, remedy))
+            problems.append(_problem(table, index, column, error.message, error.remedy))
             return None
     if numbers["frame"] < 0 or numbers["frame"] != int(numbers["frame"]):
         problems.append(_problem(table, index, "frame", "is not a frame number", "frames are counted 0, 1, 2, …"))
@@ -233,8 +232,6 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     return out.getvalue()
 
 
-__all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
-
 SETTINGS = "experiment.yaml"
 EXPECTED_FOLDER = (
     f"expected a folder with {SHEET} (one row per trial) and, for videos, {SETTINGS}; vinetrack setup FOLDER "
@@ -258,6 +255,7 @@ class Experiment:
     lines: dict[str, int] = field(default_factory=dict)
     angle_blank: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
+    recordings: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -327,51 +325,48 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
         if sheet_is_sound and row.in_use and not row.failed:
             _take_pressure_from_recording(row, folder)
             check_pressures(row)
-    problems += _merge_warnings(problem for row in rows for problem in row.problems)
+    problems += [problem for row in rows for problem in row.problems]
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
         raise ExperimentError(problems)
-    experiment = _assemble(folder, settings, rows, problems, table.columns if table else ())
-    return _with_corrections(experiment, corrections)
-
-
-def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Correction, ...]]) -> Experiment:
-    """Add the manual corrections to the trials that are recordings."""
-    trials = tuple(
-        replace(trial, corrections=corrections[trial.name]) if trial.video and trial.name in corrections else trial
-        for trial in experiment.trials
-    )
-    return replace(experiment, trials=trials)
+    return _assemble(folder, settings, rows, problems, table.columns if table else (), corrections)
 
 
 def _assemble(
-    folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem], columns: Iterable[str]
+    folder: Path,
+    settings: ExperimentSettings,
+    rows: list[Row],
+    problems: list[Problem],
+    columns: Iterable[str],
+    corrections: Mapping[str, tuple[Correction, ...]],
 ) -> Experiment:
     """Sort the rows into trials to analyse, failed trials, and excluded ones."""
     good = [row for row in rows if row.in_use and not row.failed]
+    trials = [make_trial(row, folder, settings) for row in good]
+    trials = [replace(trial, corrections=corrections.get(trial.name, ()) if trial.video else ()) for trial in trials]
     errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
     return Experiment(
         name=Path(os.path.normpath(folder.absolute())).name or "experiment",
         folder=folder,
         settings=settings,
-        trials=with_names([make_trial(row, folder, settings) for row in good]),
+        trials=with_names(trials),
         failed={name: "; ".join(reasons) for name, reasons in errors.items() if reasons},
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
         angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
         columns=tuple(columns),
+        recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
 
 
 def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings | None:
     """Read the settings and check their paths and values; None if they cannot be read."""
     try:
-        settings = read_experiment_settings(folder / SETTINGS)
+        settings = read_experiment_settings(folder / SETTINGS, problems)
     except ExperimentError as error:
         problems += error.problems
         return None
-    problems += keys_in_other_units(folder / SETTINGS)
     for key, relative in _settings_paths(settings):
         try:
             safe_join(folder, relative)
@@ -475,8 +470,9 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
-        message, _, remedy = str(error).partition(": ")
-        row.add(message, column, value=row.values[column], remedy=remedy)
+        row.problems.append(
+            Problem.from_error(error, SHEET, trial=row.name, line=row.line, column=column, value=row.values[column])
+        )
         return
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
@@ -490,18 +486,23 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     row.values["pressure_kPa"] = nominal_kPa
 
 
-def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
-    """Merge repetitions of a warning about the same value in several rows."""
-    merged: dict[object, list[Problem]] = {}
-    for problem in problems:
-        key = (problem.column, problem.value, problem.message) if problem.severity == "warning" else id(problem)
-        merged.setdefault(key, []).append(problem)
-    return [
-        group[0]
-        if len(group) == 1
-        else replace(group[0], message=f"{group[0].message} [and {len(group) - 1} more rows]")
-        for group in merged.values()
-    ]
+def _in_no_row(experiment: Experiment) -> list[Problem]:
+    """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
+    paths = [*experiment.recordings, *(path for _, path in _settings_paths(experiment.settings))]
+    named = {_normal(experiment.folder, path) for path in paths}
+    named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
+    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in (".cih", ".cihx")}
+    found = [name for name in list_recordings(experiment.folder) if _normal(experiment.folder, name) not in named]
+    if not found:
+        return []
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    message = f"names no trial for {', '.join(found[:5])}{more}"
+    remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
+    return [Problem(message=message, file=SHEET, column="video", severity="warning", remedy=remedy)]
+
+
+def _normal(folder: Path, name: str) -> Path:
+    return Path(os.path.normpath(folder / name.replace("\\", "/")))
 
 
 OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
@@ -518,7 +519,7 @@ def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = No
         if not safe_join(experiment.folder, relative).exists():
             message, remedy = missing_file_message(safe_join(experiment.folder, relative))
             problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
-    problems += order_problems(experiment.trials, SHEET)
+    problems += [*order_problems(experiment.trials, SHEET), *_in_no_row(experiment)]
     trial_problems: list[Problem] = []
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -158,8 +158,9 @@ def _planned_trials(
         )
         raise ExperimentError([*problems, *nothing])
     trials = with_names([_trial(row, settings) for row in rows])
-    kept = tuple(trials) if every_row else _one_a_condition(trials)
-    return PlannedTrials(kept, settings, folder, tuple(_without_repeats(problems)))
+    first = {trial.condition: trial for trial in reversed(trials)}
+    kept = trials if every_row else (first[condition] for condition in dict.fromkeys(t.condition for t in trials))
+    return PlannedTrials(tuple(kept), settings, folder, tuple(problems))
 
 
 def _check_row(row: Row, needed: Sequence[str]) -> None:
@@ -188,18 +189,3 @@ def _trial(row: Row, settings: ExperimentSettings) -> Trial:
     if "yield_pressure_kPa" not in row.values:
         return replace(trial, yield_pressure_Pa=math.nan, yield_pressure_sigma_Pa=math.nan)
     return trial
-
-
-def _one_a_condition(trials: Iterable[Trial]) -> tuple[Trial, ...]:
-    first: dict[str, Trial] = {}
-    for trial in trials:
-        first.setdefault(trial.condition, trial)
-    return tuple(first.values())
-
-
-def _without_repeats(problems: Iterable[Problem]) -> list[Problem]:
-    """Drop repetitions of a warning about the same value in several rows."""
-    first: dict[object, Problem] = {}
-    for problem in problems:
-        first.setdefault((problem.column, problem.value, problem.message), problem)
-    return list(first.values())

@@ -11,8 +11,6 @@ from typing import Any
 
 import vinetrack
 
-PROVENANCE = "provenance.json"  # Its presence marks a results folder
-
 LIBRARIES = (
     "numpy",
     "scipy",

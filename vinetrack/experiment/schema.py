@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
+from vinetrack.core.problems import InputError
 from vinetrack.core.records import Bend, PictureAxis, Trial
 from vinetrack.core.tables import TableError, parse_number
 from vinetrack.core.units import UNITS, Unit, convert, split_unit
@@ -403,19 +404,6 @@ SHARED = tuple(name for name, column in COLUMNS.items() if column.shared)
 LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) for kind in ("range", "choice")}
 
 
-def column_in_other_unit(name: str) -> tuple[Column, str] | None:
-    """Return the column of the same quantity as a name in another unit, and that unit; None if there is none. Returns
-    column, unit, >>> column, unit = column_in_other_unit("pressure_psi"), >>> column.name, unit, ('pressure_kPa',
-    'psi').
-    """
-    quantity, unit = split_unit(name)
-    for column in COLUMNS.values():
-        same = split_unit(column.name)[0] == quantity and column.scale is not None and unit in UNITS
-        if same and column.name != name and column.scale is not None and UNITS[unit].si == column.scale.si:
-            return column, unit
-    return None
-
-
 def option(column: str) -> str:
     """Return the command-line option for a column of the sheet."""
     return "--" + column.replace("_", "-")
@@ -435,19 +423,15 @@ SMALLEST_POINT_SPACING_PX = 2  # Smallest distance between neighbouring points o
 TRUTH_WORDS = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
 
-class CellError(ValueError):
-    """A value that its column does not allow: what is wrong (`message`), what is allowed, and the remedy."""
-
-    def __init__(self, message: str, allowed: str = "", remedy: str = "") -> None:
-        super().__init__(message)
-        self.message, self.allowed, self.remedy = message, allowed, remedy
+class CellError(InputError, ValueError):
+    """A value that its column does not allow; pydantic reports it as an error of its key."""
 
 
 def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
     """Return the value of a non-blank cell, in the unit of its column."""
     if column.kind == "yes_no":
         if text.lower() not in TRUTH_WORDS:
-            raise CellError("is neither yes nor no", "yes or no")
+            raise CellError("is neither yes nor no", allowed="yes or no")
         return TRUTH_WORDS[text.lower()]
     if column.kind == "window":
         return _read_window(text, decimal)
@@ -468,10 +452,10 @@ def read_range(column: Column, value: Any) -> tuple[float, float]:
     """
     parts = value.split(":") if isinstance(value, str) else value
     if not isinstance(parts, list | tuple) or len(parts) != 2:
-        raise ValueError("is not a range: write low:high, such as 7:40")
+        raise CellError("is not a range", "write low:high, such as 7:40")
     low, high = (read_limit(column, part) for part in parts)
     if low > high:
-        raise ValueError("ends below its start: write the lower value first")
+        raise CellError("ends below its start", "write the lower value first")
     return low, high
 
 
@@ -484,29 +468,25 @@ def interior_values(low: float, high: float) -> list[float]:
 def read_limit(column: Column, value: Any) -> float:
     """Read one number of `limits`, checked like a cell of the column."""
     if isinstance(value, bool | list | tuple | dict):
-        raise ValueError("holds something that is not a number: write numbers only")
+        raise CellError("holds something that is not a number", "write numbers only")
     return float(str(read_value(column, value)))
 
 
 def read_value(column: Column, value: Any) -> Any:
     """Read a value of the settings like a cell of the sheet's column of the same name."""
-    try:
-        return read_cell(column, str(value).strip())
-    except CellError as error:
-        remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
-        raise ValueError(f"{error.message}: {remedy}") from None
+    return read_cell(column, str(value).strip())
 
 
 def _check_number(column: Column, value: float) -> float:
     """Return the value unchanged if its column allows it; raise a CellError otherwise."""
     if column.kind == "choice":
         if value not in (column.low, column.high):
-            raise CellError("is not a travel ratio", "2 for eversion, 1 for a body that moves as a whole")
+            raise CellError("is not a travel ratio", allowed="2 for eversion, 1 for a body that moves as a whole")
     elif value > column.high:
-        raise CellError(f"is above {column.high:g} {column.unit}", column.allowed, _likely_unit(column, value))
+        raise CellError(f"is above {column.high:g} {column.unit}", _likely_unit(column, value), column.allowed)
     elif value < column.low or (column.above_low and value == column.low):
         relation = "is not above" if column.above_low else "is below"
-        raise CellError(f"{relation} {column.low:g} {column.unit}".strip(), column.allowed, _likely_unit(column, value))
+        raise CellError(f"{relation} {column.low:g} {column.unit}".strip(), _likely_unit(column, value), column.allowed)
     return value
 
 
@@ -532,8 +512,7 @@ def _number(text: str, decimal: str, allowed: str = "") -> float:
     try:
         return parse_number(text, decimal)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise CellError(message, allowed, remedy) from None
+        raise CellError(error.message, error.remedy, allowed) from None
 
 
 def _read_window(text: str, decimal: str) -> tuple[float, float]:
@@ -541,10 +520,10 @@ def _read_window(text: str, decimal: str) -> tuple[float, float]:
     allowed = "from_s:to_s, such as 0.05:0.20"
     parts = text.split(":")
     if len(parts) != 2:
-        raise CellError("is not a window", allowed)
+        raise CellError("is not a window", allowed=allowed)
     start, end = (_number(part, decimal, allowed) for part in parts)
     if start >= end:
-        raise CellError("ends before it starts", allowed)
+        raise CellError("ends before it starts", allowed=allowed)
     return start, end
 
 
@@ -557,17 +536,17 @@ def _read_axis(text: str) -> PictureAxis:
     parts, width = text.split(":"), math.nan
     written = parts if "," in parts[-1] else parts[:-1]
     if len(written) < 2 or any(point.count(",") != 1 for point in written):
-        raise CellError("is not an axis", allowed)
+        raise CellError("is not an axis", allowed=allowed)
     points = [(_number(x, ".", allowed), _number(y, ".", allowed)) for x, y in (point.split(",") for point in written)]
     if sum(math.dist(*pair) for pair in pairwise(points)) < SHORTEST_AXIS_PX:
-        raise CellError(f"is shorter than {SHORTEST_AXIS_PX} pixels", allowed, "give two points far apart")
+        raise CellError(f"is shorter than {SHORTEST_AXIS_PX} pixels", "give two points far apart", allowed)
     if len(points) > 2 and min(math.dist(*pair) for pair in pairwise(points)) < SMALLEST_POINT_SPACING_PX:
         message = f"has neighbouring points less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-        raise CellError(message, allowed, "leave out the second of the two")
+        raise CellError(message, "leave out the second of the two", allowed)
     if len(parts) > len(written):
         width = _number(parts[-1], ".", allowed) / 1000
         if width <= 0:
-            raise CellError("has a width that is not positive", allowed)
+            raise CellError("has a width that is not positive", allowed=allowed)
     return PictureAxis(points[0], points[-1], width, tuple(points[1:-1]))
 
 
@@ -576,10 +555,10 @@ def _read_frames(text: str) -> tuple[int, int]:
     allowed = "from:to, such as 12:80"
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
-        raise CellError("is not a range of frames", allowed)
+        raise CellError("is not a range of frames", allowed=allowed)
     first, last = int(parts[0]), int(parts[1])
     if first >= last:
-        raise CellError("ends before it starts", allowed)
+        raise CellError("ends before it starts", allowed=allowed)
     return first, last
 
 
@@ -590,10 +569,10 @@ def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
     for piece in filter(None, (piece.strip() for piece in text.split(";"))):
         parts = piece.split(":")
         if len(parts) != 3:
-            raise CellError(f"has a bend {piece!r} that is not three numbers", allowed)
+            raise CellError(f"has a bend {piece!r} that is not three numbers", allowed=allowed)
         start, arc, radius = (_number(part, decimal, allowed) / 1000 for part in parts)
         if start < 0 or arc <= 0 or radius <= 0:
-            raise CellError(f"has a bend {piece!r} with a length that is not positive", allowed)
+            raise CellError(f"has a bend {piece!r} with a length that is not positive", allowed=allowed)
         bends.append(Bend(start, arc, radius))
     return tuple(bends)
 

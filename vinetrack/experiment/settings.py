@@ -12,7 +12,7 @@ import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -28,15 +28,14 @@ from pydantic import (
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.records import Bend
 from vinetrack.core.tables import Table, TableError, parse_number
-from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, split_unit
+from vinetrack.core.units import BASE_EFFECTS, UNITS, convert, other_units, split_unit
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
 from vinetrack.experiment.schema import (
     COLUMNS,
     LIMITED,
     SHARED,
     SMALLEST_POINT_SPACING_PX,
-    Column,
-    column_in_other_unit,
+    CellError,
     interior_values,
     read_limit,
     read_range,
@@ -48,83 +47,86 @@ from vinetrack.experiment.schema import (
 
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Convert columns in other units to the columns of the sheet. Returns table, problems: The table with those columns
-    renamed and their numbers converted, and a warning for each.
+    """Rename columns in other units to those of the sheet and convert their numbers, with a warning for each. A column
+    of the sheet without any value gives way to the same quantity in another unit.
     """
     problems: list[Problem] = []
-    renamed: dict[str, tuple[Column, str]] = {}
+    known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
+    filled = {name for name in table.columns if any(row[name] for row in table.rows)}
+    renamed: dict[str, tuple[str, str]] = {}
     for name in table.columns:
-        if name in COLUMNS or (other := column_in_other_unit(name)) is None:
+        if name in COLUMNS or name not in known:
             continue
-        column, unit = other
+        column, unit = known[name]
         place: dict[str, Any] = {"file": file, "line": 1, "column": name, "severity": "warning"}
-        if column.name in table.columns or column.name in [target.name for target, _ in renamed.values()]:
-            problems.append(Problem(message=f"is ignored, because the sheet also has {column.name}", **place))
+        if column in filled or column in [target for target, _ in renamed.values()]:
+            problems.append(Problem(message=f"is ignored, because the sheet also has {column}", **place))
             continue
-        renamed[name] = other
+        renamed[name] = known[name]
         problems.append(Problem(message=_conversion(column, unit), **place))
     if not renamed:
         return table, problems
+    blank = {column for column, _ in renamed.values()}
+    names = {name: renamed[name][0] if name in renamed else name for name in table.columns if name not in blank}
     rows = tuple(
         {
-            (renamed[name][0].name if name in renamed else name): (
-                _converted(cell, renamed[name][1], renamed[name][0], table.decimal) if name in renamed else cell
-            )
-            for name, cell in row.items()
+            column: _converted(row[name], renamed[name][1], column, table.decimal) if name in renamed else row[name]
+            for name, column in names.items()
         }
         for row in table.rows
     )
-    columns = tuple(renamed[name][0].name if name in renamed else name for name in table.columns)
-    return replace(table, columns=columns, rows=rows), problems
+    return replace(table, columns=tuple(names.values()), rows=rows), problems
 
 
-def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
-    """Return a cell converted to the unit of its column, to 15 digits, with the decimal mark of the sheet."""
+def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
+    """Convert the numbers of a cell or key to the unit of its name, to 15 digits; what is no number stays."""
+    if isinstance(value, list):
+        return [_converted(element, unit, name) for element in value]
+    if isinstance(value, str) and ":" in value:
+        return ":".join(_converted(part, unit, name, decimal) for part in value.split(":"))
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return value
     try:
-        value = convert(parse_number(cell, decimal), unit, split_unit(column.name)[1])
+        given = parse_number(value, decimal) if isinstance(value, str) else float(value)
     except TableError:
-        return cell
-    return f"{value:.15g}".replace(".", decimal or ".")
+        return value
+    text = f"{convert(given, unit, split_unit(name)[1]):.15g}"
+    return text.replace(".", decimal or ".") if isinstance(value, str) else float(text)
 
 
-def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[Problem]]:
-    """Convert keys in other units, such as `pressure_psi`, to the keys of the settings. Returns document, problems: The
-    document with those keys renamed and their numbers converted, and a warning for each.
+def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
+    """Rename keys in other units, such as `pressure_psi`, to those of the settings and convert their numbers, with a
+    warning for each. Of two keys for one quantity a blank one gives way.
     """
-    problems: list[Problem] = []
-    if not isinstance(document.content, dict):
-        return document, problems
-    content, lines = {}, dict(document.lines)
-    for key, value in document.content.items():
-        other = column_in_other_unit(key) if isinstance(key, str) and key not in COLUMNS else None
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if other is None or not is_number or not other[0].shared or other[0].name in document.content:
-            content[key] = value
+    content, lines = dict(document.content), dict(document.lines)
+    for group, models in _GROUPS.items():
+        keys = content if not group else content.get(group)
+        if not isinstance(keys, dict):
             continue
-        column, unit = other
-        unit_of_column = split_unit(column.name)[1]
-        content[column.name] = float(f"{convert(float(value), unit, unit_of_column):.15g}")
-        line = lines.get((key,), 0)
-        lines[column.name,] = line
-        message = _conversion(column, unit)
-        problems.append(Problem(message=message, severity="warning", file=file, line=line, column=key))
-    return YamlDocument(content, lines), problems
+        path, keys = ((group,) if group else ()), dict(keys)
+        for name in [name for model in models for name in model.model_fields]:
+            for other, unit in other_units(name).items():
+                if other not in keys or None not in (keys.get(name), keys[other]):
+                    continue
+                value, line = keys.pop(other), lines.get((*path, other), 0)
+                if value is None:
+                    continue
+                keys[name], lines[*path, name] = _converted(value, unit, name), line
+                place: dict[str, Any] = {"file": file, "line": line, "column": ".".join((*path, other))}
+                problems.append(Problem(message=_conversion(name, unit), severity="warning", **place))
+        content = {**content, group: keys} if group else keys
+    return YamlDocument(content, lines)
 
 
-def keys_in_other_units(path: Path) -> list[Problem]:
-    """Return the warnings of `in_key_units` for a settings file."""
-    return in_key_units(read_yaml(path), path.name)[1] if path.exists() else []
-
-
-def _conversion(column: Column, unit: str) -> str:
-    size = convert(1.0, unit, split_unit(column.name)[1])
-    return f"is read as {column.name}: 1 {UNITS[unit].text} is {size:.6g} {column.unit}"
+def _conversion(name: str, unit: str) -> str:
+    own = split_unit(name)[1]
+    return f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
 
 
 def _no_yes_or_no(value: Any) -> Any:
     """Refuse yes and no, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
-        raise ValueError("is yes or no where a number belongs: write the number")
+        raise CellError("is yes or no where a number belongs", "write the number")
     return value
 
 
@@ -159,11 +161,10 @@ class AxisSettings(_Strict):
     def _has_a_direction(self) -> AxisSettings:
         through = (self.from_px, *(self.via_px or ()), self.to_px)
         if self.via_px and any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
-            raise ValueError(
-                f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart: leave out the second"
-            )
+            message = f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
+            raise CellError(message, "leave out the second")
         if not self.via_px and self.from_px == self.to_px:
-            raise ValueError("from_px and to_px are the same point: name two")
+            raise CellError("from_px and to_px are the same point", "name two")
         return self
 
 
@@ -185,7 +186,7 @@ class TwoPoints(_Strict):
     @model_validator(mode="after")
     def _has_a_length(self) -> TwoPoints:
         if self.from_px == self.to_px:
-            raise ValueError("from_px and to_px are the same point: name two")
+            raise CellError("from_px and to_px are the same point", "name two")
         return self
 
 
@@ -211,7 +212,7 @@ class Charuco(_Strict):
     @model_validator(mode="after")
     def _markers_fit(self) -> Charuco:
         if self.marker_mm >= self.square_mm:
-            raise ValueError("marker_mm is not smaller than square_mm: markers lie inside their squares")
+            raise CellError("marker_mm is not smaller than square_mm", "markers lie inside their squares")
         return self
 
 
@@ -252,7 +253,7 @@ class Limits(_LimitedColumns):
             return tuple(sorted({low, *(float(f"{step:.3g}") for step in interior_values(low, high)), high}))
         if isinstance(value, list | tuple):
             if not value:
-                raise ValueError("is empty: name at least one value, or remove the key")
+                raise CellError("is empty", "name at least one value, or remove the key")
             return tuple(sorted({read_limit(column, limit) for limit in value}))
         return value if value is None else (read_limit(column, value),)
 
@@ -316,14 +317,14 @@ class ExperimentSettings(_SharedColumns):
         if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
             return value
         if isinstance(value, bool | list | dict):
-            raise ValueError("is not a single value: write one, as in the sheet")
+            raise CellError("is not a single value", "write one, as in the sheet")
         return read_value(column, value)
 
     @field_validator("model", "candidates", "effects")
     @classmethod
     def _named_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if names and (twice := sorted({name for name in names if names.count(name) > 1})):
-            raise ValueError(f"names {twice[0]!r} twice: keep one")
+            raise CellError(f"names {twice[0]!r} twice", "keep one")
         return names
 
 
@@ -380,7 +381,7 @@ class FigureSettings(_Strict):
     @classmethod
     def _with_svg(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
-            raise ValueError("is empty: name at least one of png, svg, pdf")
+            raise CellError("is empty", "name at least one of png, svg, pdf")
         return tuple(dict.fromkeys([*formats, "svg"]))
 
 
@@ -422,12 +423,22 @@ class RunSettings(_Strict):
     """Clips of the recordings."""
 
 
-def read_experiment_settings(path: Path) -> ExperimentSettings:
-    """Read `experiment.yaml`; return the defaults if there is no such file."""
+# Groups of keys of `experiment.yaml`, and the models of which one validates them; "" for the keys of no group
+_GROUPS: dict[str, tuple[type[BaseModel], ...]] = {
+    "": (ExperimentSettings,),
+    "limits": (Limits,),
+    "axis": (AxisSettings,),
+    "calibration": (Charuco, Checkerboard, TwoPoints, MmPerPx),
+}
+
+
+def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) -> ExperimentSettings:
+    """Read `experiment.yaml`, and add to `warnings` what is converted; return the defaults if there is no such file."""
     # A broken link is an error, not a missing file: defaults would silently replace the intended settings.
     if not os.path.lexists(path):
         return ExperimentSettings()
-    return _validate(ExperimentSettings, in_key_units(read_yaml(path), path.name)[0], path.name)
+    document = _in_key_units(read_yaml(path), path.name, [] if warnings is None else warnings)
+    return _validate(ExperimentSettings, document, path.name)
 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
@@ -454,16 +465,21 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     value = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
     shown = None if value is None else str(value)
     if detail["type"] == "extra_forbidden":
-        remedy = did_you_mean(str(location[-1]), _valid_keys(model, document.content, location)) or "remove it"
+        names = _valid_keys(model, document.content, location)
+        if same := [name for name in names if location[-1] in other_units(name)]:
+            remedy = "keep one of the two"
+            return Problem(message=f"is {same[0]} again", file=file, line=line, column=key, remedy=remedy)
+        remedy = did_you_mean(str(location[-1]), names) or "remove it"
         return Problem(message="is not a setting", file=file, line=line, column=key, remedy=remedy)
     if detail["type"] == "missing":
         return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")
-    message, _, remedy = detail["msg"].removeprefix("Value error, ").partition(": ")
-    if not detail["msg"].startswith("Value error, "):
-        words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
-        words = re.sub(r"a valid dictionary.*", "a group of keys", words)
-        message, remedy = f"is not allowed: {words[:1].lower()}{words[1:]}", ""
-    return Problem(message=message, file=file, line=line, column=key, value=shown, remedy=remedy)
+    error = detail.get("ctx", {}).get("error")
+    if isinstance(error, CellError):
+        return Problem.from_error(error, file, line=line, column=key, value=shown)
+    words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
+    words = re.sub(r"a valid dictionary.*", "a group of keys", words)
+    message = f"is not allowed: {words[:1].lower()}{words[1:]}"
+    return Problem(message=message, file=file, line=line, column=key, value=shown)
 
 
 def _kind(content: Any) -> Any:
@@ -476,12 +492,7 @@ def _valid_keys(model: type[BaseModel], content: Any, location: tuple[Any, ...])
     if len(location) == 1:
         return list(model.model_fields)
     if location[0] == "calibration":
-        kinds: dict[Any, type[BaseModel]] = {
-            "charuco": Charuco,
-            "checkerboard": Checkerboard,
-            "two_points": TwoPoints,
-            "mm_per_px": MmPerPx,
-        }
-        return list(kinds[_kind(content)].model_fields)
+        models = {get_args(m.model_fields["kind"].annotation)[0]: m for m in _GROUPS["calibration"]}
+        return list(models[_kind(content)].model_fields)
     inner = type(model.model_fields[location[0]].default) if location[0] != "axis" else AxisSettings
     return list(getattr(inner, "model_fields", {}))

@@ -27,8 +27,6 @@ PRESSURE_REL_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2  # Default standard errors (chos
 
 SUFFIXES_WITH_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})  # Suffixes of files that may carry the capture rate
 
-RATE_REMEDY = "write the capture rate; the rate stored in the file is that of playback"
-
 
 @dataclass
 class Row:
@@ -140,7 +138,8 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     missing = [name for name in _required_columns(row, folder) if name not in row.values and name not in faulty]
     for name in missing:
         if name in columns:
-            remedy = RATE_REMEDY if name == "capture_fps" else "fill it in"
+            rate = "write the capture rate; the rate stored in the file is that of playback"
+            remedy = rate if name == "capture_fps" else "fill it in"
             row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
         else:
             absent.add(name)
@@ -164,8 +163,7 @@ def _check_paths(row: Row, folder: Path) -> None:
             try:
                 safe_join(folder, row.values[name])
             except TableError as error:
-                message, _, remedy = str(error).partition(": ")
-                row.add(message, name, value=row.values[name], remedy=remedy)
+                row.add(error.message, name, value=row.values[name], remedy=error.remedy)
     if "video" in row.values and "track" in row.values:
         row.add("has both a video and a track", "track", value=row.values["track"], remedy="keep one of the two")
     if "video" not in row.values and "track" not in row.values:

@@ -13,10 +13,9 @@ import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Kinematics, Track, Trial
-from vinetrack.core.tables import Table
+from vinetrack.core.tables import PROVENANCE, Table
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
-from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.schema import COLUMNS, with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.experiment.sheet import check_pressures, check_wall, make_trial, read_row

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from vinetrack.core.units import UNITS, convert, split_unit
-from vinetrack.experiment.provenance import PROVENANCE
+from vinetrack.core.records import CONTAINERS, IMAGES
+from vinetrack.core.tables import MIN_PICTURES, PROVENANCE, entries, is_calibration, natural_order
+from vinetrack.core.units import convert, other_units, split_unit
 from vinetrack.experiment.schema import COLUMNS
-
-MIN_PICTURES = 5  # Pictures from which a folder counts as a recording; chosen: a track needs as many frames
-
-MAX_FOLDER_DEPTH = 4  # Levels of folders that are searched; chosen: vine, day, pressure and a folder of pictures
 
 _NUMBER = r"(?P<number>\d+(?:[.p]\d+)?)"
 # Column of a number with a unit, by the unit in lower case
@@ -50,30 +47,22 @@ _COLUMN_BY_LETTER = {
 _WORD = re.compile(rf"(?P<letter>[a-z]*?){_NUMBER}(?P<unit>[a-zµ]*)", re.IGNORECASE)
 
 
-def list_recordings(folder: Path) -> list[str]:
-    """Return the recordings below a folder, as relative paths in natural order."""
-    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, MAX_FOLDER_DEPTH)]
-    return sorted(names, key=_natural_order)
-
-
 def list_pictures(folder: Path) -> list[str]:
     """Return single pictures and films that may show a ruler or a board, as paths relative to the folder."""
-    kinds = _suffixes("IMAGES")
-    films = _suffixes("CONTAINERS")
-    pictures = [path for path in _entries(folder) if path.is_file() and path.suffix.lower() in kinds]
+    pictures = [path for path in entries(folder) if path.is_file() and path.suffix.lower() in IMAGES]
     pictures = pictures if len(pictures) < MIN_PICTURES else []
-    for sub in _entries(folder):
-        if sub.is_dir() and _is_calibration(sub):
-            pictures += [path for path in _entries(sub) if path.suffix.lower() in kinds | films]
-    return sorted((path.relative_to(folder).as_posix() for path in pictures), key=_natural_order)
+    for sub in entries(folder):
+        if sub.is_dir() and is_calibration(sub):
+            pictures += [path for path in entries(sub) if path.suffix.lower() in IMAGES | CONTAINERS]
+    return sorted((path.relative_to(folder).as_posix() for path in pictures), key=natural_order)
 
 
 def list_tables(folder: Path) -> list[str]:
     """Return tables that may be pressure traces, as paths relative to the folder."""
-    folders = [folder, *(path for path in _entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
-    tables = [path for place in folders for path in _entries(place) if path.suffix.lower() == ".csv"]
+    folders = [folder, *(path for path in entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
+    tables = [path for place in folders for path in entries(place) if path.suffix.lower() == ".csv"]
     names = (path.relative_to(folder).as_posix() for path in tables)
-    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=_natural_order)
+    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=natural_order)
 
 
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
@@ -174,68 +163,14 @@ def _converted(cell: str, name: str, column: str) -> str:
 
 def units_of(column: str) -> list[str]:
     """Return the units in which a column may be written, its own first; none if it has no unit."""
-    unit_of_column = split_unit(column)[1]
-    if unit_of_column not in UNITS or COLUMNS[column].kind != "number":
-        return []
-    return [
-        unit_of_column,
-        *(key for key, unit in UNITS.items() if unit.si == UNITS[unit_of_column].si and key != unit_of_column),
-    ]
-
-
-def _recordings(folder: Path, depth: int) -> Iterator[Path]:
-    films, kinds = _suffixes("CONTAINERS"), _suffixes("IMAGES")
-    for path in _entries(folder):
-        if path.is_file() and (path.suffix.lower() in films or _is_stack(path)):
-            yield path
-        elif path.is_dir() and not (path / PROVENANCE).exists() and not _is_calibration(path):
-            inside = [entry for entry in _entries(path) if entry.suffix.lower() in kinds]
-            if len(inside) >= MIN_PICTURES:
-                yield path
-            elif depth > 0:
-                yield from _recordings(path, depth - 1)
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return [path for path in folder.iterdir() if not path.name.startswith(".")]
-    except OSError:
-        return []
-
-
-def _is_calibration(folder: Path) -> bool:
-    return folder.name.lower().startswith("calib")
-
-
-def _is_stack(path: Path) -> bool:
-    """Whether a TIFF holds as many pictures as a recording needs."""
-    from PIL import Image, UnidentifiedImageError
-
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return False
-    try:
-        with Image.open(path) as image:
-            return getattr(image, "n_frames", 1) >= MIN_PICTURES
-    except (OSError, UnidentifiedImageError):
-        return False
-
-
-def _suffixes(which: str) -> frozenset[str]:
-    # The decoder is slow to import: it is loaded only when recordings are searched.
-    from vinetrack.video import frames
-
-    return frozenset(getattr(frames, which))
+    others = other_units(column)
+    return [split_unit(column)[1], *others.values()] if others else []
 
 
 def _stem(recording: str) -> str:
     path = PurePosixPath(recording)
-    return path.stem if path.suffix.lower() in _suffixes("CONTAINERS") | _suffixes("IMAGES") else path.name
+    return path.stem if path.suffix.lower() in CONTAINERS | IMAGES else path.name
 
 
 def _clean(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "trial"
-
-
-def _natural_order(text: str) -> list[tuple[int, int, str]]:
-    """Sort key that orders numbers in a name by value: 2 before 10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.findall(r"\d+|\D+", text)]

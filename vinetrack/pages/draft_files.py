@@ -16,13 +16,13 @@ from typing import Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Correction
-from vinetrack.core.tables import TableError, read_table, read_text, write_text
+from vinetrack.core.tables import TableError, list_recordings, read_table, read_text, write_text
 from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import CORRECTIONS_FILE, SETTINGS, corrections_text, read_corrections
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import SHEET
-from vinetrack.pages.clip_names import columns_from_names, list_recordings, trial_names
+from vinetrack.pages.clip_names import columns_from_names, trial_names
 
 # ------------------------------------------------------------------------------
 # Editing of the trial sheet: cells as text, with those of an existing sheet preserved.

@@ -25,12 +25,13 @@ from vinetrack.core.local_page import (
 )
 from vinetrack.core.problems import ExperimentError, Problem, UserError
 from vinetrack.core.records import Correction
+from vinetrack.core.tables import list_recordings
 from vinetrack.core.units import UNITS, split_unit
 from vinetrack.core.yaml_document import parse_yaml, with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment, corrections_text
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import REQUIRED_COLUMNS, SHEET
-from vinetrack.pages.clip_names import list_pictures, list_recordings, list_tables, units_of
+from vinetrack.pages.clip_names import list_pictures, list_tables, units_of
 from vinetrack.pages.clip_views import ClipStore, jpeg, track_row, warm_up
 from vinetrack.pages.draft_files import (
     Draft,

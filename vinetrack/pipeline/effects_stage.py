@@ -49,7 +49,7 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     ends of the file are kept; other encodings are converted to UTF-8.
     """
     from vinetrack.core.tables import read_text, write_bytes
-    from vinetrack.core.yaml_document import with_list
+    from vinetrack.core.yaml_document import with_value
     from vinetrack.experiment.settings import read_experiment_settings
 
     path = folder / SETTINGS
@@ -58,8 +58,8 @@ def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) ->
     listed = list(read_experiment_settings(path).effects) if before and files else []
     new = [name for name in files if name not in listed]
     if new:
-        text = with_list(text, "effects", [*listed, *new], path.name)
-    text = with_list(text, "model", names, path.name)
+        text = with_value(text, "effects", [*listed, *new], path.name)
+    text = with_value(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")
     write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))
@@ -130,8 +130,7 @@ def model_problems(experiment: Path) -> list[Problem]:
         column = "model"
         check_needs(make_model(settings.model, user_effects), *read.trials)
     except EffectError as error:
-        message, _, remedy = str(error).rstrip(".").partition(": ")
-        return [Problem(message=message, file="experiment.yaml", column=column, remedy=remedy)]
+        return [Problem(message=str(error).rstrip("."), file="experiment.yaml", column=column)]
     return []
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import PROVENANCE
 from vinetrack.core.threads import in_one_blas_thread
 from vinetrack.diagnosis.campaign_power import (
     CampaignDesign,
@@ -20,7 +21,6 @@ from vinetrack.diagnosis.campaign_power import (
 )
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.effects import BASE_EFFECTS
-from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.settings import ExperimentSettings, Limits
 from vinetrack.experiment.sheet import expected_systematic_m
 from vinetrack.pipeline.tracks_stage import map_unordered

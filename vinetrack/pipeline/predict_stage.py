@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.tables import STANDARD_OUTPUT, write_bytes, write_csv, write_json
 from vinetrack.core.units import PREDICTION_UNITS, display_unit, number
 from vinetrack.diagnosis.result import ADEQUATE
@@ -210,7 +210,7 @@ def name_missing_option(error: Exception) -> Exception:
 
 def warnings_of(basis: PredictionBasis) -> list[str]:
     """Return warnings about values of the sheet or the options that are allowed but implausible."""
-    return [str(problem) for problem in basis.planned.problems]
+    return format_problems(basis.planned.problems)
 
 
 def format_volume(volume_m3: float) -> str:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import CONTAINERS, IMAGES, Floats
 from vinetrack.core.tables import file_size
 from vinetrack.video.decoding import (
     HALF_TICK,
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     import av
 
 
-CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
-IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 # Formats under which FFmpeg renders any text as a picture of its letters
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
 
