@@ -129,12 +129,14 @@ def spread_px(found: np.ndarray) -> float:
     return float(found[sure, 0].std())
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_the_report_shows_where_edges_fall_within_a_pixel(filmed: Filmed) -> None:
     assert (filmed.results / "figures" / "pixel_places.svg").exists()
     assert "Positions of edges within a pixel" in (filmed.results / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 @pytest.mark.parametrize("name", GOOD)
 def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
@@ -144,6 +146,7 @@ def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, n
     assert (np.abs(found[:, 0]) < 6 * found[:, 1]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 @pytest.mark.parametrize("name", GOOD)
 def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filmed, name: str) -> None:
@@ -156,6 +159,7 @@ def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filme
     assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("name", "words"),
@@ -172,6 +176,7 @@ def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed,
     assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Filmed) -> None:
     row = filmed.rows["part"]
@@ -182,6 +187,7 @@ def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Fil
     assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> None:
     page = (filmed.results / "report.html").read_text(encoding="utf-8")
@@ -195,6 +201,7 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(filmed: Filmed) -> None:
     tracked = {name: row["condition"] for name, row in filmed.rows.items() if row["status"] in ("ok", "warning")}
@@ -205,6 +212,7 @@ def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(f
     assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_provenance_has_the_hashes_of_recordings_and_calibration_picture(filmed: Filmed) -> None:
     inputs = json.loads((filmed.results / "provenance.json").read_text())["inputs"]
@@ -212,6 +220,7 @@ def test_provenance_has_the_hashes_of_recordings_and_calibration_picture(filmed:
     assert inputs["videos/gone.mp4"] == "missing"
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
     done = CliRunner().invoke(app, ["check", str(filmed.results.parents[1] / "vines")], catch_exceptions=False)
@@ -238,6 +247,7 @@ def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
     return read_rows(results / "trials.csv")[trial]
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("settings", "rel_sigma"),

@@ -87,6 +87,7 @@ def test_provenance_says_what_could_not_be_read(vines: Path, monkeypatch: pytest
     assert inputs == {"shut": "unreadable", "pipe": "missing"}
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_a_pipe_among_the_tracks_does_not_end_the_run(vines: Path, tmp_path: Path) -> None:
     assert (vines / "pipe").is_fifo()

@@ -144,6 +144,7 @@ def write_campaign(folder: Path) -> None:
     (folder / "experiment.yaml").write_text("candidates: [tail_friction]\n")
 
 
+@pytest.mark.slow
 @pytest.mark.pipeline
 def test_the_whole_chain_runs_from_anywhere_and_ends_with_the_verdict(tmp_path: Path) -> None:
     write_campaign(tmp_path / "my vines")

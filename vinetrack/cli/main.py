@@ -30,10 +30,8 @@ from vinetrack.cli.command_frame import (
 )
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
-from vinetrack.cli.explore_commands import register as register_explore
 from vinetrack.cli.power_commands import register as register_power
-from vinetrack.cli.run_commands import register as register_run
-from vinetrack.cli.setup_commands import register as register_setup
+from vinetrack.cli.start_commands import register as register_start
 from vinetrack.core.local_page import THREAD_PREFIX
 
 if TYPE_CHECKING:
@@ -94,9 +92,7 @@ def _options(
     """See the commands below."""
 
 
-register_setup(app)
-register_run(app)
-register_explore(app)
+register_start(app)
 
 
 @app.command("settings", rich_help_panel=MORE)
