@@ -52,7 +52,3 @@ def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
     assert [bar.get_ylabel() for bar in bars] == ["missing force (N)", "its standard error (N)"]
     # The one condition's motion, over either map.
     assert [len(ax.lines) for ax in (force, error)] == [1, 1]
-
-
-def test_an_empty_table_is_stated() -> None:
-    assert draw_learned_force(pd.DataFrame()).texts

@@ -84,10 +84,10 @@ def test_a_trial_without_a_window_is_drawn_with_the_reason() -> None:
     assert "never steady" in words(figure(window("gated", False, "never steady", np.nan)))
 
 
-def test_a_trial_without_positions_says_so() -> None:
+def test_a_trial_without_positions_has_no_figure() -> None:
     track, kinematics = tables()
-    drawn = draw_trial_motion("a", track.iloc[:0], kinematics.iloc[:0], pd.DataFrame([window("gated", False)]))
-    assert "no positions to draw" in words(drawn)
+    rules = pd.DataFrame([window("gated", False)])
+    assert draw_trial_motion("a", track.iloc[:0], kinematics.iloc[:0], rules) is None
 
 
 def test_a_long_track_is_thinned() -> None:

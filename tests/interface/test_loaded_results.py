@@ -48,7 +48,7 @@ def test_models_carry_fitted_values_and_what_was_added(loaded: LoadedResults) ->
     assert loaded.final_model.parameters_for("24mm-200um-200mm")[2] == n
 
 
-@pytest.mark.parametrize("name", ["", "damping_law", "model_comparison", "before_after", "candidates"])
+@pytest.mark.parametrize("name", ["", "overview", "model_comparison", "before_after", "candidates"])
 def test_a_figure_of_the_report_is_a_figure(loaded: LoadedResults, name: str) -> None:
     assert isinstance(loaded.plot(name), Figure)
 

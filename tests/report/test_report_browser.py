@@ -42,7 +42,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page with all optional parts."""
     folder = tmp_path_factory.mktemp("page")
     steps = ladder("", "reservoir_depletion")
-    pictures = {"ladder": svg_of(draw_ladder(steps)), "before_after": svg_of(draw_before_after("24 kPa", motion()))}
+    pictures = {"ladder": svg_of(draw_ladder(steps)), "before_after": svg_of(draw_before_after("24 kPa", motion(), ""))}
     write_clip(folder / "a.mp4", [np.full((64, 96, 3), 20 * i, np.uint8) for i in range(12)], 12)
     names = [f"trial_with_a_rather_long_name_{i}" for i in range(24)]
     html = page(
