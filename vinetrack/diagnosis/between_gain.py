@@ -206,12 +206,10 @@ def _column_map(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
 # ------------------------------------------------------------------------------
 # Gain of a hypothesis if the film mass of each vine is a nuisance parameter.
 #
-# Which of two effects has the higher likelihood may depend on the mass of the film: where the truth was a drag on film
-# that is 1.5 % lighter than stated, a wrong scale was ahead of it by Δχ² 27. A hypothesis is therefore not excluded if
-# it
-# fits as well as the best once the film mass of every vine is free within its usual error. The tests of whether
-# anything
-# is missing use the stated mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
+# Which of two effects has the higher likelihood may depend on the mass of the film: where the truth was a drag on
+# film that is 1.5 % lighter than stated, a wrong scale was ahead of it by Δχ² 27. A hypothesis is therefore not
+# excluded if it fits as well as the best once the film mass of every vine is free within its usual error. The tests
+# of whether anything is missing use the stated mass: there a wrong film mass is a hypothesis of its own, `film_mass`.
 
 
 def film_gain(fit: Fit) -> float:

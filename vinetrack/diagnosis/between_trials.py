@@ -51,13 +51,11 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm, group
 from vinetrack.inference.position_errors import with_smooth_errors
 
 # ------------------------------------------------------------------------------
-# Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is
-# confounded.
+# Hypotheses that trials differ: which parameter differs, by which column of the sheet, and whether it is confounded.
 #
 # Each hypothesis has several forms, of which the best counts: a drift of B, a drift of the pressure, or a step of the
 # pressure from some trial on; specimens and days differ in B, in pressure, or in both. `between_trials` states the
-# model
-# and compares the hypotheses.
+# model and compares the hypotheses.
 
 SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0  # Standard deviation of ln B and of P_y among tubes of one kind
 

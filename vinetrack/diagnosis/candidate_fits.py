@@ -57,10 +57,9 @@ from vinetrack.inference.solving import SLOW_NOISE, as_recorded
 # ------------------------------------------------------------------------------
 # Fits of hypotheses from several starts: a short fit to a subset of the trials, then a full fit to all of them.
 #
-# A subset fit takes one trial of every condition. Its between-trial standard deviations are fixed at those of a typical
-# batch of vines, and the correlation of its noise at that of the tracks: if free, they would absorb the misfit and
-# stall
-# the optimiser.
+# A subset fit takes one trial of every condition. Its between-trial standard deviations are fixed at those of a
+# typical batch of vines, and the correlation of its noise at that of the tracks: if free, they would absorb the
+# misfit and stall the optimiser.
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]  # Effects to add, and parameter values to start from
 
@@ -346,8 +345,7 @@ def sheet_slip_starts(effect: Effect) -> list[Start]:
 #
 # The curves of a fit to a thousand trials of 550 frames take some sixty megabytes, its misfit tests 700, and a search
 # makes dozens of fits. Numbers, likelihood and state of a fit always stay; its curves are computed again from them
-# where
-# a later step needs them.
+# where a later step needs them.
 
 MANY_POINTS = 150_000  # Points of all trials from which curves are dropped (chosen)
 

@@ -194,9 +194,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
 # Sensitivities of a fit's trajectories to effects that are not in its model.
 #
 # Each column is the change of a trial's positions per unit of an effect's size, with the effect added to the fitted
-# model
-# and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross products,
-# from which score tests, cosines and expected gains follow by linear algebra.
+# model and all other parameters held. Together with the fit's own sensitivities the columns give one set of cross
+# products, from which score tests, cosines and expected gains follow by linear algebra.
 
 # A finite-difference step should move a trajectory by the first of these parts of its travel (derived)
 TARGET_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4

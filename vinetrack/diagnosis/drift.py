@@ -285,9 +285,9 @@ class ConstancyTest:
 # ------------------------------------------------------------------------------
 # Tests of whether B changes along the growth, and whether the fitted yield pressure agrees with the sheet.
 #
-# B is estimated for the first and second half of the growth of each trial. The scatter of pressure and B between trials
-# is the same in both halves and cancels in their difference. An effect that builds up along the growth shows here even
-# where n and the yield pressure absorb it in every comparison between trials.
+# B is estimated for the first and second half of the growth of each trial. The scatter of pressure and B between
+# trials is the same in both halves and cancels in their difference. An effect that builds up along the growth shows
+# here even where n and the yield pressure absorb it in every comparison between trials.
 
 STEP = 1e-3  # Relative step of a finite difference (derived)
 

@@ -280,13 +280,12 @@ def has_credible_sizes(hypothesis: LikelihoodRatio) -> bool:
 # How much of a fitted size may belong to another, undetected effect: "this K includes up to … of drag".
 #
 # Once an effect is in the model, the other candidates are too weak to be detected, but not zero: air is never absent.
-# If
-# another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
+# If another effect were present with size s, the size θ of the added one would fall by L s, with L = I_θθ⁻¹ I_θs the
 # coefficient of omitted-variable bias of the linear fit (`score_test.levers_of`). The estimate of s from the
 # trajectories, N(ŝ, σ_s²), is combined with a normal prior centred on zero, scaled so that 95 % of it lies within the
-# farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis). Effects
-# are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the one with
-# the other effect left free: at least 95 %.
+# farther end of the plausible range, and truncated where physics allows one sign only (Bayesian bias analysis).
+# Effects are considered one at a time and to first order. The interval stated is the hull of the fit's own and of the
+# one with the other effect left free: at least 95 %.
 
 MIN_SHIFT_SIGMAS = 1.0  # Shift, in standard errors of the size, from which a confounder is reported (chosen)
 

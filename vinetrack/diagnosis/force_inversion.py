@@ -130,8 +130,7 @@ def integrate_responses(
 #     δẍ = (∂a/∂x) δx + (∂a/∂ẋ) δẋ + f/m,   a = F/m
 #
 # It is linear in f, so that the responses to many forces of any shape are integrated together, with no model compiled
-# for
-# them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`). For a force
+# for them. The derivatives are finite differences of the model's own terms (`vinetrack.dynamics.audit`). For a force
 # that is not small the motion is corrected and linearised again (Newton's method in function space, Kantorovich; also
 # known as quasilinearisation).
 
@@ -592,13 +591,12 @@ def scaled_pseudo_inverse(matrix: Floats, cutoff: float, estimable: NDArray[np.b
 # ------------------------------------------------------------------------------
 # Motions that lie on the tracks, whatever the model says: the starting point for a force that is not small.
 #
-# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to positions
-# with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4). The acceleration itself is not used as
-# data: the equation of motion is linearised about this motion, and the defect there (what the model's forces lack)
-# enters
-# as one more known acceleration, so that noise in the smoothed motion cancels to first order (quasilinearisation,
-# Bellman
-# & Kalaba 1965). About the motion of a model that lacks a large force the linearisation would be poor.
+# The acceleration of every trial is a sum of splines, integrated twice from rest at its release and fitted to
+# positions with the smoothing chosen by generalised cross-validation (Wahba 1990, ch. 4). The acceleration itself is
+# not used as data: the equation of motion is linearised about this motion, and the defect there (what the model's
+# forces lack) enters as one more known acceleration, so that noise in the smoothed motion cancels to first order
+# (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model that lacks a large force the linearisation
+# would be poor.
 
 # Splines of an acceleration, even in the square root of time and so denser where a vine accelerates (chosen)
 N_SPLINES = 20

@@ -287,13 +287,11 @@ def _visited_range(motions: Sequence[FittedMotion]) -> _Range:
 # Nonlinear least squares for a missing force, with model parameters and trial effects free.
 #
 # The linear inversion (`vinetrack.diagnosis.force_inversion`) tells laws apart; but a force that slows a vine down
-# keeps
-# it longer where the force acts, so that the linear estimate of a force of a tenth of the drive comes out a fifth too
-# large. Here the motions respond to the force in full (`vinetrack.diagnosis.force_inversion.with_force`), and
-# Gauss-Newton steps, damped as by Levenberg and Marquardt where needed, find the amplitudes, the shape parameters of
-# the
-# law, the model parameters and the trial effects. The search starts from the fitted motions, which lie near the tracks:
-# simulated from the parameters of the model without the force, they would run ahead of the tracks.
+# keeps it longer where the force acts, so that the linear estimate of a force of a tenth of the drive comes out a
+# fifth too large. Here the motions respond to the force in full (`vinetrack.diagnosis.force_inversion.with_force`),
+# and Gauss-Newton steps, damped as by Levenberg and Marquardt where needed, find the amplitudes, the shape parameters
+# of the law, the model parameters and the trial effects. The search starts from the fitted motions, which lie near
+# the tracks: simulated from the parameters of the model without the force, they would run ahead of the tracks.
 
 MAX_STEPS, MOTION_CORRECTIONS = 12, 2  # Most Gauss-Newton steps, and corrections of the motions at each (chosen)
 

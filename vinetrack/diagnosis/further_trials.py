@@ -40,10 +40,9 @@ from vinetrack.planning.simulated_campaigns import FEWEST_GROWTH_FRAMES
 #
 #     M = M_prior + M_so_far + Σ_c n_c M_c,   I = M_aa − M_aν M_νν⁻¹ M_νa
 #
-# is the information about the sizes a with all other unknowns ν free: its diagonal is about each effect alone, and I_ee
-# −
-# I_ef² / I_ff about effect e with effect f free as well. One trial of every condition is therefore simulated once, and
-# designs are evaluated by linear algebra.
+# is the information about the sizes a with all other unknowns ν free: its diagonal is about each effect alone, and
+# I_ee − I_ef² / I_ff about effect e with effect f free as well. One trial of every condition is therefore simulated
+# once, and designs are evaluated by linear algebra.
 
 REPLICATES = 2  # Trials of a condition that are added at a time (chosen)
 
@@ -360,18 +359,15 @@ def _evaluated(design: CampaignDesign, search: _Search, plan: FurtherTrials, cho
 
 
 # ------------------------------------------------------------------------------
-# Further trials for a campaign that goes on: those that reveal most where nothing is found, or confirm
-# what is named.
+# Further trials for a campaign that goes on: those that reveal most where nothing is found, or confirm what is named.
 #
-# A size a of an effect is detected with probability Φ(a √I − c), with I the information about it (`design_information`)
-# and c the threshold of its score. Averaged over sizes spread evenly in their logarithm over the decade below the
-# largest
-# plausible one, and summed over all candidates, that is the expected number of effects that a design would detect if
-# each
-# were missing in turn. With I_ee − I_ef² / I_ff in place of I, for the most similar other candidate f, it is the
-# expected
-# number that it would tell from every other. The design with the largest sum of both is found by adding pairs of trials
-# one by one and exchanging them (Fedorov 1972, Theory of Optimal Experiments).
+# A size a of an effect is detected with probability Φ(a √I − c), with I the information about it
+# (`design_information`) and c the threshold of its score. Averaged over sizes spread evenly in their logarithm over
+# the decade below the largest plausible one, and summed over all candidates, that is the expected number of effects
+# that a design would detect if each were missing in turn. With I_ee − I_ef² / I_ff in place of I, for the most
+# similar other candidate f, it is the expected number that it would tell from every other. The design with the
+# largest sum of both is found by adding pairs of trials one by one and exchanging them (Fedorov 1972, Theory of
+# Optimal Experiments).
 
 # Sizes of an effect that are averaged over, relative to its largest plausible one (chosen)
 SIZES = np.geomspace(0.1, 1.0, 9)

@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 #
 # A model that is far off has several minima close together. Started, compiled or iterated differently, two fits of it
 # would end at parameters that differ in the third digit, and every page would show both. The model is therefore
-# compiled
-# together with all candidates of the diagnosis (`candidates_of`) in either case.
+# compiled together with all candidates of the diagnosis (`candidates_of`) in either case.
 
 
 def candidates_of(
@@ -80,14 +79,13 @@ def initial_fit(
 # ------------------------------------------------------------------------------
 # Errors of a fitted model by condition, compared with the scatter of replicates.
 #
-# The prediction of a trial has its own release and origin, but no deviation of pressure and B, as for a trial that was
-# left out of the fit. The origin is the position at standstill; the release, and the origin where no standstill was
-# filmed, minimise the root mean square error. Replicates are aligned with their mean in the same way, without any
-# model,
-# so that a model which lacks nothing has an error equal to the replicate floor, a ratio of 1.
+# The prediction of a trial has its own release and origin, but no deviation of pressure and B, as for a trial that
+# was left out of the fit. The origin is the position at standstill; the release, and the origin where no standstill
+# was filmed, minimise the root mean square error. Replicates are aligned with their mean in the same way, without any
+# model, so that a model which lacks nothing has an error equal to the replicate floor, a ratio of 1.
 #
-# The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of the
-# final speed of the leading edge.
+# The two errors are those of the paper's Table II (Alvarez et al., 2025): of position over the whole growth, and of
+# the final speed of the leading edge.
 
 COMPARISON_COLUMNS = (
     "model",

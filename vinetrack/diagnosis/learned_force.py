@@ -52,8 +52,8 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Marginal likelihood and posterior of a smooth force over given variables, averaged over its hyperparameters.
 #
-# A force that is zero where growth begins, one that is constant there and one that is free there are compared by their
-# marginal likelihoods; `force_surface` explains why the first is drawn unless the tracks contradict it.
+# A force that is zero where growth begins, one that is constant there and one that is free there are compared by
+# their marginal likelihoods; `force_surface` explains why the first is drawn unless the tracks contradict it.
 
 # Information, where each unknown alone has 1, below which a combination of unknowns is not estimable (derived)
 LEAST_INFORMATION = 1e-8
@@ -268,10 +268,9 @@ def variable_weights(choices: Sequence[VariableChoice], error: float) -> dict[st
 # ------------------------------------------------------------------------------
 # Which variables a learned force may depend on when the trials cannot tell, and the sentences about it.
 #
-# Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can be
-# written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the prior.
-# A
-# choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
+# Where speeds are steady, growth, speed and time are hardly three separate variables: a surface over two of them can
+# be written over another two. Posterior weights then compare only how smooth the surfaces are, which depends on the
+# prior. A choice of variables is therefore excluded by the misfit that it leaves, not by its weight alone.
 
 LEAST_WEIGHT_NAMED = 0.05  # Weight from which a choice of variables is reported with the best (chosen)
 

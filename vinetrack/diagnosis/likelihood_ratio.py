@@ -29,15 +29,14 @@ from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covari
 # ------------------------------------------------------------------------------
 # Priors from plausible ranges, and the marginal likelihoods and posterior probabilities of hypotheses with them.
 #
-# A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4:
-# the range holds 95 % of it. With a likelihood that is normal about its maximum θ̂ with covariance Σ, the marginal
-# likelihood of a hypothesis is
+# A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b −
+# a)/4: the range holds 95 % of it. With a likelihood that is normal about its maximum θ̂ with covariance Σ, the
+# marginal likelihood of a hypothesis is
 #
 #     ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
 #
 # which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). Each
-# parameter
-# of a hypothesis costs ln(σ/τ), and sizes outside the range cost more. What all hypotheses share cancels.
+# parameter of a hypothesis costs ln(σ/τ), and sizes outside the range cost more. What all hypotheses share cancels.
 
 # Squared distance from the middle of a plausible range, in units of the prior variance, up to which a size is not
 # penalised (derived)

@@ -48,12 +48,11 @@ from vinetrack.inference.whitening import at_correlation
 # ------------------------------------------------------------------------------
 # Expected scores of effects of finite size: the model without the effect, fitted to noise-free data with it.
 #
-# In linear theory (`vinetrack.diagnosis.linear_power`) the free parameters move in proportion to the size of an effect.
-# An effect that they nearly imitate moves them by many standard errors before it becomes detectable, and by then the
-# sensitivities have changed. So each effect is put into noise-free trajectories at the size in question, the model
-# without it is fitted to them with noise and between-trial standard deviations held, and the score is computed there:
-# the
-# Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
+# In linear theory (`vinetrack.diagnosis.linear_power`) the free parameters move in proportion to the size of an
+# effect. An effect that they nearly imitate moves them by many standard errors before it becomes detectable, and by
+# then the sensitivities have changed. So each effect is put into noise-free trajectories at the size in question, the
+# model without it is fitted to them with noise and between-trial standard deviations held, and the score is computed
+# there: the Asimov data set of Cowan, Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011.
 
 # Most Gauss–Newton steps of the fit without the effect, beyond which it is not used (chosen)
 MAX_ITERATIONS, CONVERGENCE_DECREASE = 20, 0.2

@@ -129,9 +129,9 @@ def structure_from_scores(scores: Scores) -> Structure:
 # Two tests of whether trial effects and noise have absorbed what a model lacks.
 #
 # The deviations of pressure and B of each trial can absorb part of a misfit. Deviations by chance differ between
-# replicates of a condition; those that compensate for the model are the same in all of them. What the deviations cannot
-# absorb is estimated as noise: positions are then noisier in motion than at rest, summed over stretches as long as slow
-# errors last.
+# replicates of a condition; those that compensate for the model are the same in all of them. What the deviations
+# cannot absorb is estimated as noise: positions are then noisier in motion than at rest, summed over stretches as
+# long as slow errors last.
 
 STRETCH_FRAMES = 8  # Frames over which residuals are summed (chosen)
 

@@ -199,11 +199,10 @@ def _variance(aligned: AlignedTrials, projected: list[Floats], scale: Floats) ->
 # Between-trial scatter from replicates alone, and the standard error of a condition's mean residual that follows.
 #
 # Residuals of one trial are correlated from frame to frame: a trial with 3 % more B is late everywhere. Frames are
-# therefore not counted as independent. Every trial is cut into a few stretches, and the covariance of the stretch means
-# between replicates has three parameters for all conditions: the scatter of pressure and of B, propagated by the
-# sensitivities of the trajectories, and a residual scatter that is independent between stretches. They are estimated
-# from
-# differences between replicates alone, so that a model that fails does not inflate them.
+# therefore not counted as independent. Every trial is cut into a few stretches, and the covariance of the stretch
+# means between replicates has three parameters for all conditions: the scatter of pressure and of B, propagated by
+# the sensitivities of the trajectories, and a residual scatter that is independent between stretches. They are
+# estimated from differences between replicates alone, so that a model that fails does not inflate them.
 
 START_VALUES = (0.01, 0.03, 0.2)  # Starting values of the search: pressure, ln B, residual scatter (chosen)
 

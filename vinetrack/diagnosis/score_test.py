@@ -45,7 +45,8 @@ from vinetrack.inference.whitening import all_products, at_correlation
 # ------------------------------------------------------------------------------
 # Columns of a fit, of candidates and of systematic errors, and their cross products by trial.
 #
-# In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic errors.
+# In this order: trial effects, parameters of the fit (keys), residual, shapes of candidates, shared systematic
+# errors.
 
 TRIALS_AT_ONCE = 64  # Trials whose cross products are held at once, each of half a megabyte (chosen)
 
@@ -436,18 +437,15 @@ def _residual_sum(fit: Fit, projection: Projection, p: int, state: FitState) -> 
 # ------------------------------------------------------------------------------
 # Family-wise thresholds of all candidates that give each of them an equal share of the false alarms.
 #
-# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one threshold
-# for all scores the first would take most of the false alarms and raise the threshold of the second. The largest score
-# of
-# each candidate is therefore converted to a p-value of its own, and the family is tested by the smallest (min-p;
-# Westfall
-# & Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold that it alone exceeds with
-# probability q, and q is such that any candidate exceeds its own with probability `level`.
+# A candidate with many shapes has many chances of a large score, a candidate with one shape has one. With one
+# threshold for all scores the first would take most of the false alarms and raise the threshold of the second. The
+# largest score of each candidate is therefore converted to a p-value of its own, and the family is tested by the
+# smallest (min-p; Westfall & Young, *Resampling-Based Multiple Testing*, 1993): every candidate has the threshold
+# that it alone exceeds with probability q, and q is such that any candidate exceeds its own with probability `level`.
 #
 # The probability that any of many correlated normal scores exceeds its threshold is found by importance sampling
-# (Adler,
-# Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail probability
-# and drawn beyond its threshold, and the others are drawn conditionally on it.
+# (Adler, Blanchet & Liu, Annals of Applied Probability 22, 1167, 2012): a score is chosen in proportion to its tail
+# probability and drawn beyond its threshold, and the others are drawn conditionally on it.
 
 DRAWS, SEED = 2000, 20  # Draws of the scores, and the seed (measured)
 

@@ -130,9 +130,8 @@ def _still_drifts(fit: Fit) -> Iterator[Remark]:
 # The rule that a tail cannot push, as a hypothesis: the same model with `tail_slack: free`.
 #
 # Eq. (2) holds while the tail's tension T₁ = ½(P − P_y)A − ½Bẋⁿ − … is positive. It becomes negative where a payload
-# falls faster than the tip everts: the real tail goes slack there, but the model predicts that it pushes. The rule has
-# no
-# parameter, so that any rise of the likelihood is due to it alone.
+# falls faster than the tip everts: the real tail goes slack there, but the model predicts that it pushes. The rule
+# has no parameter, so that any rise of the likelihood is due to it alone.
 
 # Stands for the rule in answer sets
 TAIL_SLACK = Effect(

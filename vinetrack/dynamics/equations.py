@@ -175,12 +175,12 @@ def angle_passed(y, trial):
 # One step of Radau IIA, order 5, for the speed and position of a tail and the pressure of its chamber.
 #
 # Position follows from the speeds by the same quadrature, so that the Newton system is that of the three stage speeds
-# alone; the chamber pressure has a Newton system of its own. `vinetrack.dynamics.integrator` states why this method is
-# used.
+# alone; the chamber pressure has a Newton system of its own. `vinetrack.dynamics.integrator` states why this method
+# is used.
 #
 # Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections IV.5 (the
-# method,
-# table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error estimate).
+# method, table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error
+# estimate).
 
 SQRT6 = 6.0**0.5  # Derived: √6, which appears in the nodes
 
@@ -394,8 +394,8 @@ def quintic(s, h, start, end):
 # Interpolation of the motion between the requested times.
 #
 # It is the Hermite polynomial of degree 5 through position, speed and acceleration on either side; next to the end of
-# growth, where the acceleration jumps, that of degree 4 without the acceleration at the jump. The jump at the start of
-# motion is not treated separately: over a frame that is an error of micrometres.
+# growth, where the acceleration jumps, that of degree 4 without the acceleration at the jump. The jump at the start
+# of motion is not treated separately: over a frame that is an error of micrometres.
 
 
 @inlined
@@ -446,9 +446,8 @@ def _without_far_acceleration(near, far, read):
 # ------------------------------------------------------------------------------
 # Rolling shutter: the rows of a picture are read one after the other, and show the edge at different times.
 #
-# A frame stamped t shows the edge at t + s·y, with y its position at that time and s the delay per metre. At the start
-# of
-# growth s·y is negligible, and rows are read at their stamps.
+# A frame stamped t shows the edge at t + s·y, with y its position at that time and s the delay per metre. At the
+# start of growth s·y is negligible, and rows are read at their stamps.
 
 STEEPEST = 0.1  # Least 1 − s·ẏ by which Newton's method divides (chosen)
 

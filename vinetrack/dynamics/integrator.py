@@ -409,13 +409,13 @@ def _resolvable_start(equations, trial, time, until, x, chamber, delay):
 # Motion with a slack tail, which cannot push, for trials with `tail_slack: free`.
 #
 # The payload then falls freely, under the forces on the tail alone; the tip, whose mass is negligible, grows at the
-# speed
-# at which its own forces balance, Σ tip forces = 0 at the tail speed r·ẏ of the film that passes it. The tail is taut
-# again when the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests there: its
-# push on the tip is neglected, so that growth is too slow from then on.
+# speed at which its own forces balance, Σ tip forces = 0 at the tail speed r·ẏ of the film that passes it. The tail
+# is taut again when the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests
+# there: its push on the tip is neglected, so that growth is too slow from then on.
 #
-# The method is that of Dormand & Prince with its continuous extension: E. Hairer, S. P. Nørsett and G. Wanner, Solving
-# Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation (6.12).
+# The method is that of Dormand & Prince with its continuous extension: E. Hairer, S. P. Nørsett and G. Wanner,
+# Solving Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation
+# (6.12).
 
 # Indices in the inputs of a trial: derived from the order of the fields
 FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")

@@ -340,10 +340,8 @@ def check_needs(model: Model, *trials: Trial) -> None:
 #
 # A model takes seconds to compile, an effect of no size next to nothing to simulate. What compares models therefore
 # simulates each by the compiled form of one larger model, the host. Wherever no effect of a user's own is involved it
-# is
-# the same model, so that fits, designs, diagnoses and the explorer share what is compiled. An effect that is switched
-# off
-# is skipped, so that the trajectories are those of the smaller model to the last bit.
+# is the same model, so that fits, designs, diagnoses and the explorer share what is compiled. An effect that is
+# switched off is skipped, so that the trajectories are those of the smaller model to the last bit.
 
 PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 

@@ -52,8 +52,8 @@ from vinetrack.tracks.importers import TrackError, load_track, read_pressure_tra
 # ------------------------------------------------------------------------------
 # The order in which trials were run, and whether it is confounded with pressure.
 #
-# A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure rises
-# with the order, the data cannot distinguish such a drift from an effect of pressure.
+# A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
+# rises with the order, the data cannot distinguish such a drift from an effect of pressure.
 
 CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
 
@@ -128,8 +128,7 @@ def _confounded_with_condition(trials: Sequence[Trial], column: str) -> bool:
 # Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
 #
 # One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`;
-# the
-# position that it had found itself is kept in the results.
+# the position that it had found itself is kept in the results.
 
 CORRECTIONS_FILE = "corrections.csv"
 CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")

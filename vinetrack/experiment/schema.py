@@ -412,8 +412,8 @@ def option(column: str) -> str:
 # ------------------------------------------------------------------------------
 # Reading and checking of single values of the trial sheet.
 #
-# A cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay in
-# the unit of their column until `vinetrack.experiment.sheet.make_trial` converts them to SI.
+# A cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay
+# in the unit of their column until `vinetrack.experiment.sheet.make_trial` converts them to SI.
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 

@@ -313,12 +313,10 @@ def _spread_line(name: str, spread: BetweenTrialSpread) -> str:
 
 
 # ------------------------------------------------------------------------------
-# Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole
-# trajectories.
+# Check of the damping fits by the dynamic model: B and n from steady windows against B and n from whole trajectories.
 #
 # Both use the same recordings, but not the same part of them: steady windows show the final speed of a vine,
-# trajectories
-# also the approach to it. If they differ by more than their errors, the model lacks an effect.
+# trajectories also the approach to it. If they differ by more than their errors, the model lacks an effect.
 
 CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory", "z")
 

@@ -28,10 +28,9 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Sensitivity of fitted numbers to the mass of the film.
 #
-# The mass of the film is computed from its thickness and density, which no sheet states to better than a few per cent.
-# It
-# is not part of the stated errors, because it can be weighed and is then negligible. In a campaign of two dozen precise
-# trials it may exceed all stated errors, and the fit then says so.
+# The mass of the film is computed from its thickness and density, which no sheet states to better than a few per
+# cent. It is not part of the stated errors, because it can be weighed and is then negligible. In a campaign of two
+# dozen precise trials it may exceed all stated errors, and the fit then says so.
 
 FILM = "film_mass"  # The effect that makes the mass of the film a free parameter
 

@@ -38,12 +38,10 @@ from vinetrack.inference.gauge_readings import (
 # ------------------------------------------------------------------------------
 # Clock offset between pressure gauge and camera, estimated from the growth that empties the chamber.
 #
-# A pressure that falls as the tube fills has its corner where growth begins. So the growth is shifted in time to where
-# it
-# explains the readings of each trace best. All trials share gauge and camera, so that the same offset is likely: the
-# distribution of offsets in the other trials is the prior of each (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp.
-# 1,
-# 157, 1956), since a short trace determines its own offset to a few samples at best.
+# A pressure that falls as the tube fills has its corner where growth begins. So the growth is shifted in time to
+# where it explains the readings of each trace best. All trials share gauge and camera, so that the same offset is
+# likely: the distribution of offsets in the other trials is the prior of each (empirical Bayes: Robbins, Proc. 3rd
+# Berkeley Symp. 1, 157, 1956), since a short trace determines its own offset to a few samples at best.
 
 LARGEST_OFFSET_FRAMES = 60  # Largest clock offset, samples (chosen)
 

@@ -24,8 +24,7 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, N_TRIAL_EFFECTS, 
 from vinetrack.inference.whitening import at_correlation
 
 # ------------------------------------------------------------------------------
-# Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some
-# thousand times.
+# Compiled loops over trials for the likelihood of the variance components, which a fit evaluates some thousand times.
 #
 # Each trial has only a handful of columns, so that with array operations most of the time would go into calling them.
 

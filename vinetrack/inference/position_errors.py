@@ -58,9 +58,9 @@ if TYPE_CHECKING:
 # Uncertainty of the parameters of a fit: covariance, degrees of freedom, intervals, profile likelihood.
 #
 # The covariance is the inverse information of the linearised mixed model. As between-trial standard deviations are
-# estimated from a few trials, 95 % intervals use Student's t with Satterthwaite degrees of freedom (Giesbrecht & Burns,
-# Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the profile
-# likelihood: the values that a constrained fit does not reject.
+# estimated from a few trials, 95 % intervals use Student's t with Satterthwaite degrees of freedom (Giesbrecht &
+# Burns, Biometrics 41, 477, 1985). Near a bound, where a linear interval is invalid, the interval is that of the
+# profile likelihood: the values that a constrained fit does not reject.
 
 # Smallest eigenvalue of an information matrix of unit diagonal at which a direction still counts as determined
 SINGULAR_EIGENVALUE = 1e-10
@@ -465,12 +465,11 @@ def with_smooth_errors(fit: Fit) -> Solution:
 #
 # A fit gives every trial a noise of its own, and some trials a deviation of B and pressure. Where trials differ in a
 # parameter that they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the
-# smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights further.
-# So:
+# smaller noise determines it, and the misfit of the others passes for their noise, which reduces their weights
+# further. So:
 #
 # 1. The noise of a trial is that of its residuals after its own B, n, C_D ... have been fitted too. 2. The parameters
-# θ_i
-# of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
+# θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M).
 
 # Maximum number of steps, and the length of a step in standard errors at which they have converged (chosen)
 POOLING_MOST_STEPS, CONVERGED_STEP_SIGMAS = 12, 0.05

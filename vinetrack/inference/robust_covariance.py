@@ -27,10 +27,9 @@ from vinetrack.inference.whitening import products
 # ------------------------------------------------------------------------------
 # Systematic errors of a campaign: payloads, set pressures, film mass, position errors of the camera, gauge noise.
 #
-# Most of them are shared by several trials and do not average out, so that the scatter of trials does not reveal them.
-# If
-# neglected, they look like a small effect as soon as pressures and B vary little between trials. The error that gauge
-# noise leaves in a recorded pressure belongs to a single trial and bends its whole motion.
+# Most of them are shared by several trials and do not average out, so that the scatter of trials does not reveal
+# them. If neglected, they look like a small effect as soon as pressures and B vary little between trials. The error
+# that gauge noise leaves in a recorded pressure belongs to a single trial and bends its whole motion.
 
 PAYLOAD_ERROR = 0.005  # Standard deviation of a payload's mass in addition to that of the sheet, relative
 

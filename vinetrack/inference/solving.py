@@ -326,12 +326,12 @@ def start_at_fixed_noise(
 # Errors that gauge noise leaves in a recorded pressure, estimated as random effects along with a fit.
 #
 # The remaining errors of a curve through noisy readings are known, one standard deviation each
-# (`gauge_noise.DenoisedTrace.errors_Pa`). A light vine follows its pressure immediately, so that an error of the curve
-# moves it by several times the noise of its positions and would look like a difference between trials. So the sizes of
-# these errors, a ~ N(0, 1) in each trial, are random effects besides those of `vinetrack.inference.mixed_effects`. The
-# linearised model estimates them with the parameters and trial effects all free at once; they are added to the trace,
-# and
-# the model is fitted again, until they converge. −2 ln L is evaluated at the most likely a, with Σ a² for their prior.
+# (`gauge_noise.DenoisedTrace.errors_Pa`). A light vine follows its pressure immediately, so that an error of the
+# curve moves it by several times the noise of its positions and would look like a difference between trials. So the
+# sizes of these errors, a ~ N(0, 1) in each trial, are random effects besides those of
+# `vinetrack.inference.mixed_effects`. The linearised model estimates them with the parameters and trial effects all
+# free at once; they are added to the trace, and the model is fitted again, until they converge. −2 ln L is evaluated
+# at the most likely a, with Σ a² for their prior.
 
 # Maximum number of rounds (measured)
 MOST_ROUNDS, CONVERGED_SIGMAS = 4, 0.1

@@ -32,12 +32,10 @@ from vinetrack.inference.sensitivity import (
 from vinetrack.inference.whitening import at_correlation, whiten
 
 # ------------------------------------------------------------------------------
-# Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take
-# cross products.
+# Compiled loop over the candidate releases of a trial: shift the trajectory, whiten its columns, take cross products.
 #
 # A search for releases evaluates some forty candidates per trial, a few times per fit; as array operations that was
-# three
-# quarters of the time of a fit that continues from another.
+# three quarters of the time of a fit that continues from another.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -368,17 +368,13 @@ def _r_squared(log_force: Floats, residual: Floats) -> float:
 # Dependence of damping coefficient, steady speed and efficiency on the size of the vine.
 #
 # B against diameter is described by a power law (a straight line on log axes) and by a straight line; both are
-# reported,
-# because neither is known to be right. For the published vines (R = 1…4) the power is 1.80, and the straight line has
-# R²
-# = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
+# reported, because neither is known to be right. For the published vines (R = 1…4) the power is 1.80, and the
+# straight line has R² = 0.983 and an intercept of −1.7 N·(s/m)ⁿ.
 #
 # Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. Each
-# size
-# counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number. Slopes are
-# those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as large if
-# there
-# is none.
+# size counts once: replicates share a vine, so the means of vines scatter about a trend, and N is their number.
+# Slopes are those on log axes with 95 % intervals by Student's t; a p-value is the probability of a slope at least as
+# large if there is none.
 
 ISOMETRIC_WITHIN = 0.05  # Vines whose t/D agree within this fraction count as scaled copies of each other (chosen)
 

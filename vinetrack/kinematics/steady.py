@@ -591,10 +591,10 @@ def _near_quiet_blocks(velocity: Floats, block: int, cv_limit: float) -> NDArray
 # ------------------------------------------------------------------------------
 # Quasi-steady windows, in which a vine follows a changing pressure with negligible inertia.
 #
-# As the chamber empties no speed is steady, yet the forces balance at every instant as long as inertia is a small part
-# of
-# them. If the pressure during growth is known, measured or from the model in use, such a window gives a point of the
-# damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not applied.
+# As the chamber empties no speed is steady, yet the forces balance at every instant as long as inertia is a small
+# part of them. If the pressure during growth is known, measured or from the model in use, such a window gives a point
+# of the damping law as good as a steady one. If it is not known, the point would be wrong, and the rule is not
+# applied.
 
 INERTIA_LIMIT = 0.1  # Largest inertia as a fraction of the force, at the end of its 95 % interval (chosen)
 

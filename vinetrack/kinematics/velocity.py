@@ -20,8 +20,8 @@ from vinetrack.tracks.position_noise import track_noise
 # ------------------------------------------------------------------------------
 # Local polynomials fitted to all windows of one width along a track at once.
 #
-# For even spacing the fit is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows with a gap or uneven
-# spacing are fitted individually by least squares of the same order.
+# For even spacing the fit is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows with a gap or
+# uneven spacing are fitted individually by least squares of the same order.
 
 EVEN_TOLERANCE = 0.01  # Spacings within this fraction of their median count as even (chosen)
 

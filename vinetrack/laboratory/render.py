@@ -24,11 +24,10 @@ from vinetrack.laboratory.scene import PATTERN_PX, Ball, Camera, Door, Scene, Ta
 Image = NDArray[np.float32]
 
 # ------------------------------------------------------------------------------
-# Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film,
-# tail, ball.
+# Textures of the virtual laboratory, painted once per recording: backdrop with ruler and launcher, film, tail, ball.
 #
-# All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that changing
-# one surface does not change the others.
+# All are float32 radiances or fractions on a grid of plane pixels. Each has its own random generator, so that
+# changing one surface does not change the others.
 
 OVERSAMPLING = 4  # Sub-pixels per pixel for drawing lines (derived)
 

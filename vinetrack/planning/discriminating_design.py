@@ -46,9 +46,9 @@ from vinetrack.tracks.position_noise import ar1_noise
 # Candidate trials for the next experiment: pressures, payloads, vines and rigs within the user's limits.
 #
 # Where a limit is not given it follows from the experiment: pressures from the lowest used to a quarter above the
-# highest
-# and never above the strength of the film; no payload or the heaviest used; half and twice the chamber; connectors of
-# half and twice the area; and vines of other diameters and film thicknesses. Only one part of a rig changes at a time.
+# highest and never above the strength of the film; no payload or the heaviest used; half and twice the chamber;
+# connectors of half and twice the area; and vines of other diameters and film thicknesses. Only one part of a rig
+# changes at a time.
 
 SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2  # Effort of a trial: nothing new (defined)
 
@@ -282,8 +282,8 @@ def _most_different(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Tri
 # ------------------------------------------------------------------------------
 # Extension of a fitted hypothesis to trials that have not been made.
 #
-# The free parameters of the fit stay as they are. Every new vine adds its own: B from the scaling prior, multiplied by
-# the mean ratio of the measured vines to their prior, and the yield pressure with the error to which it will be
+# The free parameters of the fit stay as they are. Every new vine adds its own: B from the scaling prior, multiplied
+# by the mean ratio of the measured vines to their prior, and the yield pressure with the error to which it will be
 # measured.
 
 NEW_VINE_SD = 1.0  # Prior standard deviation of the parameters of a new vine, scaled as in the fit (chosen)

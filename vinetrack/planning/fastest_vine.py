@@ -204,9 +204,8 @@ def _odds(vine_inputs: Sequence[PredictiveInputs], samples: int, seed: int, at_f
 #     V₀ = S q/(1 − q) with q = (((1 − ε) P + P_atm)/(P + P_atm))^(1/γ)
 #
 # with S = A·y the volume filled and ε the allowed loss as a fraction of the gauge pressure. The gas law needs
-# *absolute*
-# pressure. γ = 1 is isothermal: growth so slow that the gas stays at room temperature. γ = 1.4 is adiabatic: growth too
-# fast for heat exchange.
+# *absolute* pressure. γ = 1 is isothermal: growth so slow that the gas stays at room temperature. γ = 1.4 is
+# adiabatic: growth too fast for heat exchange.
 
 GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}  # Gas laws between which every growth lies
 

@@ -35,10 +35,9 @@ if TYPE_CHECKING:
 #
 #     B ≈ 6.44 (t/200 µm) (D/24 mm)^0.75 N·(s/m)ⁿ
 #
-# describes the four printed values and the printed linear rise with wall thickness. All four have nearly the same t/D,
-# so
-# they do not determine the exponents of t and D separately: `SPLIT_SIGMA` allows for that. None of these values is a
-# measurement, and every output that uses them says so.
+# describes the four printed values and the printed linear rise with wall thickness. All four have nearly the same
+# t/D, so they do not determine the exponents of t and D separately: `SPLIT_SIGMA` allows for that. None of these
+# values is a measurement, and every output that uses them says so.
 
 DIAMETER_EXPONENT = 0.75  # Exponent of D in the prior of B (derived)
 
@@ -810,9 +809,8 @@ def _between_trial(sources: _Sources, stated_values: StatedValues) -> tuple[floa
 # Check of stated pressures against measured speeds, for errors of unit.
 #
 # The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the
-# scaling
-# prior (`planning.predictive_inputs`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by even
-# more.
+# scaling prior (`planning.predictive_inputs`). A pressure in psi stated as kPa is 6.9 times too low, and P − P_y by
+# even more.
 
 FAR_OFF = 4.0  # Factor between implied and prior damping from which another unit is tried (chosen)
 

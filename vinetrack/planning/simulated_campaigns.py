@@ -103,15 +103,13 @@ def make(
 # Separation by further trials, found by simulating them and refitting the hypotheses to old and new trials.
 #
 # Each hypothesis in turn is taken as the truth. The new trials are simulated with deviations of pressure and B,
-# releases,
-# origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials; between-trial
-# standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain part of its
-# misfit
-# as scatter. The squared separation is the increase in the difference of −2 ln L.
+# releases, origins and noise, and sampled as the experiment films. Every hypothesis is then fitted to all trials;
+# between-trial standard deviations and noise are estimated anew as in a diagnosis, so a wrong hypothesis can explain
+# part of its misfit as scatter. The squared separation is the increase in the difference of −2 ln L.
 #
-# There are two levels of detail. `expected_rises` sets the truth to the best values and treats the old trials as linear
-# in the parameters, which is fast enough to compare designs. `simulated_rises` draws the truth from its distribution
-# given the old trials and simulates every trajectory anew, as a check.
+# There are two levels of detail. `expected_rises` sets the truth to the best values and treats the old trials as
+# linear in the parameters, which is fast enough to compare designs. `simulated_rises` draws the truth from its
+# distribution given the old trials and simulates every trajectory anew, as a check.
 
 MOST_ITERATIONS = 20  # Iterations of a refit, at most (chosen)
 

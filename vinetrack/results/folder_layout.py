@@ -316,7 +316,6 @@ def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
 
 # ------------------------------------------------------------------------------
 # Reading the fit of a results folder as a typed object; the only reader of `fit.json`.
-#
 
 
 def read_fit(results: Results) -> FitSummary:

@@ -92,10 +92,9 @@ def new_track(
 # ------------------------------------------------------------------------------
 # Restore times of frames that a file holds with too few digits.
 #
-# Frames 0.935 ms apart, written to the millisecond, deviate from the motion by up to half a millisecond, 2 mm at 4 m/s,
-# and two of them may share the same time. Where all times of a file lie within half their last digit of an evenly
-# spaced
-# series, that series is used.
+# Frames 0.935 ms apart, written to the millisecond, deviate from the motion by up to half a millisecond, 2 mm at 4
+# m/s, and two of them may share the same time. Where all times of a file lie within half their last digit of an
+# evenly spaced series, that series is used.
 
 FEWEST_TIMES = 8  # Fewest times from which an even series is recognised (measured)
 
@@ -209,9 +208,8 @@ def _with_unit(name: str, properties: Mapping[str, Any]) -> str:
 #
 # A project stores the marks of a point mass in image pixels, frame by frame, and the axes: origin (px, image y
 # downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The transform to world coordinates
-# is
-# that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale change, a
-# project holds them for key frames; each is valid until the next.
+# is that of Tracker's source, `org.opensourcephysics.media.core.ImageCoordSystem`. Where origin, angle or scale
+# change, a project holds them for key frames; each is valid until the next.
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "µm": 1e-6, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 SECONDS = {"s": 1.0, "ms": 0.001, "min": 60.0}

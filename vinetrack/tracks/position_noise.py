@@ -284,10 +284,8 @@ def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generat
 #
 # Every point is compared with a cubic through its neighbours, itself left out. The cubic is fitted by iteratively
 # reweighted least squares, first for least absolute residuals, then with Tukey's biweight (Beaton & Tukey,
-# Technometrics
-# 16, 147, 1974), so that a second outlier nearby does not bend it. No model of the motion enters: what a model misses
-# is
-# no reason to drop a point.
+# Technometrics 16, 147, 1974), so that a second outlier nearby does not bend it. No model of the motion enters: what
+# a model misses is no reason to drop a point.
 #
 # An outlier is isolated: the motion goes on through its neighbours as if it were not there. After a dropped frame all
 # later points are displaced together, and at a corner of the motion one side leaves the cubic; both leave too few
@@ -515,14 +513,12 @@ def _normal_solution(sums: Floats, right: Floats) -> Floats:
 # How the noise of positions varies from point to point: with the speed of the edge, or as a file states it.
 #
 # A picture is exposed for a while, so a moving edge is blurred over speed × exposure, and its measured place scatters
-# by
-# a part of that: sd² = s² + (τ v)², with s of each trial and τ of the experiment. Or the file has a column of standard
-# deviations, which need not have the right size but show which points are better: sd = s σ.
+# by a part of that: sd² = s² + (τ v)², with s of each trial and τ of the experiment. Or the file has a column of
+# standard deviations, which need not have the right size but show which points are better: sd = s σ.
 #
 # Both are compared with equal noise by the likelihood of the fourth differences of the positions: the distance of a
-# point
-# from the cubic through the four around it, a stretch so short that fast motion leaves nothing in it. No model of the
-# motion enters, so what a model misses cannot pass for noise.
+# point from the cubic through the four around it, a stretch so short that fast motion leaves nothing in it. No model
+# of the motion enters, so what a model misses cannot pass for noise.
 
 FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth difference
 

@@ -30,15 +30,13 @@ from vinetrack.video.target_corners import CornersError, charuco_corners, checke
 # Map from pixels to the plane of growth: lens distortion and tilt, with their uncertainty.
 #
 # A point of the plane, seen through a pinhole, is mapped by a homography (for any pose and focal length), and radial
-# distortion then moves it outwards or inwards from the centre of the picture (Brown 1966; the form OpenCV uses): q_d =
-# q
-# (1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target determines these ten
-# parameters. Focal length and distance remain unknown, but are not needed to measure in the plane.
+# distortion then moves it outwards or inwards from the centre of the picture (Brown 1966; the form OpenCV uses): q_d
+# = q (1 + κ₁ q² + κ₂ q⁴), lengths in half-diagonals of the picture. A single view of a flat target determines these
+# ten parameters. Focal length and distance remain unknown, but are not needed to measure in the plane.
 #
 # Gaussian priors (PRIOR_SIGMA), from typical lenses and set-ups, constrain parameters that the corners do not
-# determine,
-# so that a small target neither fails nor claims too much: the covariance of the fit includes the remaining
-# uncertainty.
+# determine, so that a small target neither fails nor claims too much: the covariance of the fit includes the
+# remaining uncertainty.
 
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)  # Prior standard deviations of the two perspective terms (chosen)
 MIN_NOISE_PX = 0.01  # Chosen: no corner is located better

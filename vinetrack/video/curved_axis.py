@@ -283,9 +283,8 @@ def _moved_back(luma: NDArray[Any], shift_px: Floats) -> NDArray[np.float32]:
 # Cut the strip along an axis, straight or curved; along a curve the picture is straightened by the curve's normals.
 #
 # A straightened picture is a picture like any other: its middle is a level axis, its columns are one pixel of arc
-# length
-# apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of the tube
-# that grew.
+# length apart, and everything that works on straight strips works on it. The curve is then moved onto the middle of
+# the tube that grew.
 
 KNOT_PX = 40.0  # Distance of the knots of a curve that is moved onto the middle of a tube (chosen)
 STRETCH_PX = 30.0  # Length of the stretches in which the tube's middle is found along a curve (chosen)
@@ -434,10 +433,9 @@ def _rows_on_side(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int,
 # ------------------------------------------------------------------------------
 # Find the curve along which a vine grew, from the region of pixels that changed.
 #
-# A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end that
-# changed first to the end that changed last, is the path. The curve is used only where its front share is far larger
-# than
-# that of the best straight line.
+# A pixel that the vine covers changes once. The region of such pixels is a band; its smoothed middle, from the end
+# that changed first to the end that changed last, is the path. The curve is used only where its front share is far
+# larger than that of the best straight line.
 
 # Ratio of the front share of a curve to that of the straight line from which the curve is used (measured)
 CURVE_GAIN = 1.35

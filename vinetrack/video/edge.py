@@ -59,14 +59,12 @@ from vinetrack.video.strip import Strip
 # ------------------------------------------------------------------------------
 # Initial path of the front through a strip, before film, background or the tip are known.
 #
-# Two methods of `kymograph` complement each other. The path by change does not know what caused a change: a bright door
-# that comes to rest beside the tube outweighs the front. The path by appearance lets every pixel vote on whether it
-# looks
-# as in the first or as in the last frames; votes are equal and a door has few rows. But a payload that has flown past
-# by
-# the end, or an object that stood in front at the start, has no vote, and the path starts up to three frames late and
-# ends up to three frames early, because several frames are averaged at either end. The path that leaves the smaller
-# residual sum is used.
+# Two methods of `kymograph` complement each other. The path by change does not know what caused a change: a bright
+# door that comes to rest beside the tube outweighs the front. The path by appearance lets every pixel vote on whether
+# it looks as in the first or as in the last frames; votes are equal and a door has few rows. But a payload that has
+# flown past by the end, or an object that stood in front at the start, has no vote, and the path starts up to three
+# frames late and ends up to three frames early, because several frames are averaged at either end. The path that
+# leaves the smaller residual sum is used.
 
 # Change of a column, as returned by `kymograph.path_by_change`, from which it counts as changed (chosen)
 MIN_LOG_CHANGE = 5.0

@@ -18,9 +18,9 @@ from vinetrack.core.threads import in_parts
 # ------------------------------------------------------------------------------
 # Fraction of each pixel that the film covers, for an edge blurred by optics (Gaussian) and by its own motion (box).
 #
-# The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that a
-# row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run over
-# neighbours in memory, without a branch.
+# The fraction, called coverage, is tabulated at subpixel steps. Neighbouring columns lie a whole pixel apart, so that
+# a row of pixels reads every 1/TABLE_STEP_PX-th entry; the table is stored in that order, so that inner loops run
+# over neighbours in memory, without a branch.
 
 TABLE_STEP_PX = 0.05  # Spacing of the coverage table, px (derived)
 Z_STEP, Z_LAST = 0.02, 8.0  # Spacing and end of the table of the normal distribution (derived)

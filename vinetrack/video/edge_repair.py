@@ -29,10 +29,10 @@ from vinetrack.video.strip import Strip
 # ------------------------------------------------------------------------------
 # Slow errors of an edge: errors that neighbouring frames share, which neither roughness nor averaging reveals.
 #
-# Where film or background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced by
-# about G/C pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge differently for
-# some frames, and their mean with them. Near the start a door or a mouth may hide the tip as well, and where a shaken
-# camera was stabilised the slow part of the shake stays.
+# Where film or background differ by G grey levels from their estimated pictures, an edge of contrast C is misplaced
+# by about G/C pixels for as long as it passes that place. Wrinkles and light displace the bands of an edge
+# differently for some frames, and their mean with them. Near the start a door or a mouth may hide the tip as well,
+# and where a shaken camera was stabilised the slow part of the shake stays.
 
 SLOW_PX = 0.03  # Slow error of any edge, which nothing in a track shows (measured)
 SLOW_GREY = 1.0  # Error of the pictures of film and background, in grey levels of 255 (measured)
@@ -290,9 +290,8 @@ def _band_offsets(lead_px: Floats, edge: Floats, core: NDArray[np.int_]) -> Floa
 #
 # A door leaves. While it hides the tip, the picture resembles neither film nor background, and the misfit shows it. A
 # mouth stays: its border with the background looks like a tip at rest while the tip moves behind it. What the tip
-# leaves
-# behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a tip that
-# came out of a mouth, the mouth's straight border stays where the edge rested.
+# leaves behind tells the two apart: behind a tip that was seen at rest the film continues without a border; behind a
+# tip that came out of a mouth, the mouth's straight border stays where the edge rested.
 
 # Misfit, in units of the noise and as a ratio to the median, above which an object stands in front of the tip and the
 # edge is a guess (chosen)

@@ -71,8 +71,8 @@ def capture_exposure(trial: Trial, recording: Recording) -> float:
 # ------------------------------------------------------------------------------
 # Read the headers of high-speed camera files: Phantom `.cine`, Photron `.mraw` with its `.cih` or `.cihx`.
 #
-# They state rate and exposure of capture, which no ordinary film does. What cannot be read with certainty is refused by
-# name: compressed frames, unknown depths and versions, interleaved colours.
+# They state rate and exposure of capture, which no ordinary film does. What cannot be read with certainty is refused
+# by name: compressed frames, unknown depths and versions, interleaved colours.
 
 # Offsets in the settings of a cine, bytes from their beginning
 MARK_AT, RATE_AT, SHUTTER_US_AT, COLOUR_FILTER_AT, REAL_BITS_AT, SHUTTER_NS_AT = 140, 768, 772, 808, 896, 1568

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change
-# in order.
+# Compiled medians (by histogram instead of sorting), largest changes, and paths through pixels that change in order.
 #
 # Medians are exact; the range of the values must be known.
 

@@ -224,8 +224,8 @@ def _flying_on(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
 # ------------------------------------------------------------------------------
 # Where growth ends though something flies on, and why a motion ended, in words.
 #
-# A payload in free flight leaves background behind it; film stays. A motion ends when the whole vine has grown, when an
-# obstacle stops it, or when the recording ends.
+# A payload in free flight leaves background behind it; film stays. A motion ends when the whole vine has grown, when
+# an obstacle stops it, or when the recording ends.
 
 GROWN_TOLERANCE = 0.03  # Relative difference of travel and length within which the whole vine has grown (chosen)
 FEWEST_STILL_FRAMES = 4  # Fewest frames of standstill at the end that are reported (chosen)

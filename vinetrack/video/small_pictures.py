@@ -224,11 +224,10 @@ def _timing_information(time: Floats, weight: Floats, n_times: int) -> Floats:
 # Selection of the frames that show the event, so that the rest of a long recording is neither decoded nor held.
 #
 # A recording stopped by hand may hold thousands of frames of which tens or hundreds show the growth. A recording too
-# large for memory is sampled first: the key frames of a film, which can be decoded on their own, or every n-th frame of
-# other files. The event lasts from the first sample that differs from the initial pictures to the last that differs
-# from
-# the final ones. In a film with few key frames the packet sizes are used instead, if frames at rest take hardly any
-# bytes.
+# large for memory is sampled first: the key frames of a film, which can be decoded on their own, or every n-th frame
+# of other files. The event lasts from the first sample that differs from the initial pictures to the last that
+# differs from the final ones. In a film with few key frames the packet sizes are used instead, if frames at rest take
+# hardly any bytes.
 
 MAX_BYTES_WHOLE = 400_000_000  # Size of the pictures up to which a recording is read whole (chosen)
 MAX_SAMPLES = 400  # Maximum number of samples (chosen)

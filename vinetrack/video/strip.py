@@ -24,8 +24,8 @@ from vinetrack.video.kymograph import BINS_PER_LEVEL, median
 # Cutting the same strip out of many pictures, by slicing or by bicubic interpolation on a straight grid, compiled.
 #
 # Along an axis close to the rows of a picture, neighbours in the strip are neighbours in the picture for hundreds of
-# pixels. A pixel then takes sixteen weights and sixteen loads from neighbouring addresses, and many pixels are computed
-# at a time.
+# pixels. A pixel then takes sixteen weights and sixteen loads from neighbouring addresses, and many pixels are
+# computed at a time.
 
 CUBIC_COEFFICIENT = np.float32(-0.75)  # Coefficient a of the bicubic kernel (Keys 1981) (defined)
 MIN_MEAN_RUN_PX = 16  # Mean length of runs of neighbours from which the compiled loops are used (measured)
@@ -216,8 +216,7 @@ def _take(luma: NDArray[Any], index: NDArray[np.int_], dim: int) -> NDArray[Any]
 # Registration of camera shake and flicker: each frame against the median picture of the static background.
 #
 # Robust least squares on the median picture and its derivatives (Lucas-Kanade). Moving objects, such as a door or a
-# hand,
-# appear as outliers and are left out.
+# hand, appear as outliers and are left out.
 
 REFERENCE_FRAMES = 15  # Frames whose median is the reference (derived)
 

@@ -145,8 +145,7 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
 # Facts of a recording, and whether they agree with the sheet.
 #
 # A ruler wrong by a factor of ten, a diameter in the column of the length or a playback rate would otherwise come out
-# as
-# physics.
+# as physics.
 
 WIDTH_TOLERANCE = 0.08  # Relative difference of width and diameter that is allowed beyond the stated error (measured)
 GROWTH_TOLERANCE = 0.06  # Relative excess of growth over length that is allowed (measured)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 # ------------------------------------------------------------------------------
 # Refine where two edges of a printed pattern cross, to under a hundredth of a pixel in a sharp picture.
 #
-# Around a corner of a checkerboard the picture is modelled as m + A·erf(a/s)·erf(b/s) on a linear ramp of light, with a
-# and b the distances from the two edges and s the blur (√2 times its standard deviation). Levenberg-Marquardt least
+# Around a corner of a checkerboard the picture is modelled as m + A·erf(a/s)·erf(b/s) on a linear ramp of light, with
+# a and b the distances from the two edges and s the blur (√2 times its standard deviation). Levenberg-Marquardt least
 # squares for the crossing, both slants, blur, contrast and ramp uses every pixel beside the edges. Symmetry alone
 # (OpenCV's `cornerSubPix`) leaves 0.03 px in the same pictures.
 

@@ -209,10 +209,9 @@ def _unsure(fit: EdgeFit) -> Bools:
 # ------------------------------------------------------------------------------
 # Select the frames of a damaged recording that are tracked: the longest undamaged stretch.
 #
-# What a decoder makes of a damaged frame looks like a picture and may be tracked, with small stated errors, to a wrong
-# place; so may the frames after a hole in the motion. Neither is used until a person has placed the edge of such a
-# frame
-# (`corrections.csv`).
+# What a decoder makes of a damaged frame looks like a picture and may be tracked, with small stated errors, to a
+# wrong place; so may the frames after a hole in the motion. Neither is used until a person has placed the edge of
+# such a frame (`corrections.csv`).
 
 LONGEST_HOLE = 1  # Most frames missing in a row that the tracker bridges (measured)
 MOST_DROPPED = 3  # Most frames missing in a row that a recorder may have dropped from an undamaged recording (chosen)
