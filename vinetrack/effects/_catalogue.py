@@ -159,7 +159,27 @@ def effect_sources(path: Path) -> list[Path]:
 
 
 def load_effect(path: Path | str) -> Effect:
-    """Read one effect from its file; its name is the file's."""
+    """Read one effect from its file; its name is the file's.
+
+    Parameters
+    ----------
+    path : a Python file like those of the catalogue.
+
+    Returns
+    -------
+    the effect.
+
+    Raises
+    ------
+    EffectError
+        If the file does not follow the contract of `Effect`; the message names what is missing.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
+    'air_drag'
+    """
     path = Path(path)
     try:
         file_size(path)
@@ -251,14 +271,43 @@ def _is_range(pair: Any) -> bool:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Return every effect of vinetrack by name: base effects first, then alphabetical."""
+    """Return every effect of vinetrack by name: base effects first, then alphabetical.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.catalogue()["air_drag"].kind
+    'physical'
+    """
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
 
 
 def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
-    """Return the effect of this name, from the user's own effects or else from the catalogue."""
+    """Return the effect of this name, from the user's own effects or else from the catalogue.
+
+    Parameters
+    ----------
+    name : of an effect.
+    user_effects : effects by name, from `own_effects`.
+
+    Returns
+    -------
+    the effect.
+
+    Raises
+    ------
+    EffectError
+        If there is none; the message suggests the nearest name.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.find_effect("air_drg")
+    Traceback (most recent call last):
+    vinetrack.effects._catalogue.EffectError: ...
+    """
     known = {**catalogue(), **(user_effects or {})}
     if name in known:
         return known[name]

@@ -45,7 +45,27 @@ UNCHANGED = {
 
 
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
-    """Read and check a user's effects."""
+    """Read and check a user's effects.
+
+    Parameters
+    ----------
+    paths : files, one for each effect.
+
+    Returns
+    -------
+    effects by name.
+
+    Raises
+    ------
+    EffectError
+        If a file is not an effect, two have the same name, or one fails its checks; one sentence.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> dict(vt.effects.own_effects([]))
+    {}
+    """
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):
         effect = load_effect(path)

@@ -58,7 +58,15 @@ QUANTISED_REST_STEPS = 1.5
 
 
 class FitError(UserError, ValueError):
-    """The fit cannot be made; the message is one sentence with a remedy."""
+    """The fit cannot be made; the message is one sentence with a remedy.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.fit(vt.base_model(), [])
+    Traceback (most recent call last):
+    vinetrack.inference.fit_data.FitError: No trial can be fitted: there is none.
+    """
 
 
 @dataclass(frozen=True)
