@@ -48,7 +48,7 @@ BUDGETS = {
     "core": (1679, 11, 92),
     "diagnosis": (13235, 31, 348),
     "dynamics": (2899, 8, 90),
-    "effects": (2860, 44, 223),
+    "effects": (2870, 44, 223),
     "experiment": (2524, 8, 33),
     "figures": (3277, 9, 114),
     "inference": (7510, 19, 171),
