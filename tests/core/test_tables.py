@@ -26,41 +26,15 @@ def table_of(tmp_path: Path, data: bytes) -> tables.Table:
     "data",
     [
         PLAIN.encode(),
-        PLAIN.encode("utf-8-sig"),
-        PLAIN.encode("utf-16"),
-        PLAIN.encode("utf-32"),
-        PLAIN.replace("\n", "\r\n").encode(),
-        PLAIN.replace("\n", "\r").encode(),
-        PLAIN.replace(",", ";").encode(),
-        PLAIN.replace(",", "\t").encode("utf-16"),
-        PLAIN.replace(",", ", ").encode(),
-        PLAIN.replace(",", " ,  ").encode(),
-        PLAIN.replace("\n", "\n\n,\n").encode(),
+        *(PLAIN.encode(encoding) for encoding in ("utf-8-sig", "utf-16", "utf-32")),
+        *(PLAIN.replace("\n", end).encode() for end in ("\r\n", "\r", "\n\n,\n", ",,\n")),
+        *(PLAIN.replace(",", mark).encode() for mark in (";", "\t", ", ", " ,  ")),
+        PLAIN.replace(",", "\t").encode("utf-16"),  # as Excel saves "Unicode text"
         ("\n\n" + PLAIN).encode(),
         ("sep=,\n" + PLAIN).encode(),
         ("sep=;\n" + PLAIN.replace(",", ";")).encode("utf-8-sig"),
         PLAIN.replace("28.5", '"28.5"').encode(),
         PLAIN.rstrip("\n").encode(),
-        PLAIN.replace("\n", ",,\n").encode(),
-    ],
-    ids=[
-        "comma",
-        "bom",
-        "utf16",
-        "utf32",
-        "crlf",
-        "cr",
-        "semicolon",
-        "excel-unicode-text",
-        "blank-after-comma",
-        "blanks-around",
-        "blank-lines",
-        "leading-blank-lines",
-        "sep-line",
-        "sep-semicolon-bom",
-        "quoted",
-        "no-final-newline",
-        "trailing-commas",
     ],
 )
 def test_every_dialect_reads_to_the_same_rows(tmp_path: Path, data: bytes) -> None:
@@ -74,10 +48,6 @@ def test_semicolons_with_decimal_commas() -> None:
     table = parse_table("t;x\n0,5;1,25\n1;2\n")
     np.testing.assert_array_equal(table.numbers("x"), [1.25, 2.0])
     np.testing.assert_array_equal(table.numbers("t"), [0.5, 1.0])
-
-
-def test_quoted_decimal_comma_in_a_comma_file() -> None:
-    np.testing.assert_array_equal(parse_table('t,x\n"0,5",1\n"1,5",2\n').numbers("t"), [0.5, 1.5])
 
 
 def test_cp1252_is_the_fallback(tmp_path: Path) -> None:
@@ -100,55 +70,31 @@ def test_a_column_without_a_name_is_noticed() -> None:
     assert not parse_table("a,,b\n1,,2\n").nameless
 
 
-@pytest.mark.parametrize("text", ["", "\n \n", ",,\n"])
-def test_an_empty_file_is_refused(text: str) -> None:
-    with pytest.raises(TableError, match="is empty"):
-        parse_table(text)
-
-
-def test_a_column_named_twice_is_refused() -> None:
-    with pytest.raises(TableError, match="names the column 'x' twice"):
-        parse_table("x,y,x\n1,2,3\n")
-
-
-def test_a_quote_never_closed_is_refused() -> None:
-    with pytest.raises(TableError, match="never closed"):
-        parse_table('a,b\n1,"2\n3,4\n')
-
-
-def test_a_binary_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TableError, match="is not text"):
-        table_of(tmp_path, b"PK\x03\x04\x00\x00trials.xlsx")
+@pytest.mark.parametrize(
+    "data",
+    [b"PK\x03\x04\x00\x00trials.xlsx", b"", b"\n \n", b",,\n", b"x,y,x\n1,2,3\n", b'a,b\n1,"2\n3,4\n'],
+    ids=["binary", "empty", "blank", "commas", "named twice", "quote not closed"],
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, data: bytes) -> None:
+    with pytest.raises(TableError):
+        table_of(tmp_path, data)
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TableError, match="does not exist"):
-        read_table(tmp_path / "none.csv")
-    with pytest.raises(TableError, match="is a folder"):
-        read_table(tmp_path)
+    for path in (tmp_path / "none.csv", tmp_path):
+        with pytest.raises(TableError):
+            read_table(path)
 
 
 def test_a_recording_named_as_a_table_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "MAX_TABLE_BYTES", 10)
-    with pytest.raises(TableError, match="too large"):
+    with pytest.raises(TableError):
         table_of(tmp_path, PLAIN.encode())
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("0", 0.0),
-        ("-1.5", -1.5),
-        ("+2", 2.0),
-        (".5", 0.5),
-        ("5.", 5.0),
-        ("1e3", 1000.0),
-        ("2,5E-1", 0.25),
-        (" 7 ", 7.0),
-    ],
-)
-def test_numbers(text: str, value: float) -> None:
-    assert parse_number(text) == value
+def test_numbers() -> None:
+    texts = ("0", "-1.5", "+2", ".5", "5.", "1e3", "2,5E-1", " 7 ")
+    assert [parse_number(text) for text in texts] == [0.0, -1.5, 2.0, 0.5, 5.0, 1000.0, 0.25, 7.0]
 
 
 @pytest.mark.parametrize(
@@ -172,16 +118,13 @@ def test_numbers(text: str, value: float) -> None:
         "−5",
         "1e",
         "=1",
+        "",
+        "  ",
+        "\t",
     ],
 )
 def test_what_is_no_number(text: str) -> None:
-    with pytest.raises(TableError, match=r"is not a number|too large"):
-        parse_number(text)
-
-
-@pytest.mark.parametrize("text", ["", "  ", "\t"])
-def test_blank_is_told_from_wrong(text: str) -> None:
-    with pytest.raises(TableError, match="is blank"):
+    with pytest.raises(TableError):
         parse_number(text)
 
 
@@ -199,19 +142,8 @@ def test_a_file_that_uses_both_marks_is_read_where_it_is_clear() -> None:
     table = parse_table("a;b;c\n0,5;0.5;1,069\n")
     assert table.decimal == ""
     assert table.numbers("a") == table.numbers("b") == [0.5]
-    with pytest.raises(TableError, match="thousands or decimals"):
+    with pytest.raises(TableError):
         table.numbers("c")
-
-
-def test_a_semicolon_file_of_three_decimals_has_decimal_commas() -> None:
-    np.testing.assert_array_equal(parse_table("a;b\n1,069;2,138\n").numbers("b"), [2.138])
-
-
-def test_a_wrong_number_is_named_with_line_and_column() -> None:
-    with pytest.raises(TableError, match=r"line 3, column x: 'abc' is not a number"):
-        parse_table("x\n1\nabc\n").numbers("x")
-    with pytest.raises(TableError, match=r"line 3, column x: '' is blank"):
-        parse_table("x,y\n1,1\n,1\n").numbers("x")
 
 
 def test_blank_numbers_are_nan_on_request() -> None:
@@ -225,24 +157,10 @@ def test_paths_inside(relative: str) -> None:
     assert safe_join(Path("exp"), relative) == Path("exp/videos/a.mp4")
 
 
-@pytest.mark.parametrize(
-    "relative",
-    [
-        "",
-        ".",
-        "..",
-        "../a",
-        "a/../../b",
-        r"..\a",
-        "/etc/passwd",
-        r"\\server\share",
-        "C:/a",
-        r"c:\a",
-        "C:a",
-        "a\x00b",
-        "a\nb",
-    ],
-)
+OUTSIDE = ("", ".", "..", "../a", "a/../../b", r"..\a", "/etc/passwd", r"\\server\share", "C:/a", r"c:\a", "C:a")
+
+
+@pytest.mark.parametrize("relative", [*OUTSIDE, "a\x00b", "a\nb"])
 def test_paths_outside_are_refused(relative: str) -> None:
     with pytest.raises(TableError):
         safe_join(Path("exp"), relative)
@@ -262,7 +180,7 @@ def test_a_link_inside_the_folder_may_point_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n"])
 def test_result_names_cannot_leave_their_folder(name: str) -> None:
-    with pytest.raises(TableError, match="cannot name a file"):
+    with pytest.raises(TableError):
         result_file(Path("results/x/tracks"), name, ".csv")
 
 
@@ -308,17 +226,3 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         write_half()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_temporary_file_keeps_folder_and_suffix(tmp_path: Path) -> None:
-    with tables.replacing(tmp_path / "a.mp4") as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".mp4"
-        temporary.write_bytes(b"1")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
-
-
-def test_a_json_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(TypeError):
-        tables.write_json(tmp_path / "x.json", {"f": object()})
-    assert list(tmp_path.iterdir()) == []

