@@ -30,7 +30,7 @@ def make(folder: Path, *arguments: str, path: str | None = None) -> subprocess.C
 def test_help_is_the_default_and_lists_every_target(arguments: tuple[str, ...]) -> None:
     done = make(ROOT, *arguments)
     assert done.returncode == 0
-    targets = {"help", "venv", "demo", "guide", "test", "lint", "docs"}
+    targets = {"help", "venv", "demo", "guide", "test", "test-all", "lint", "docs"}
     assert {line.split()[1] for line in done.stdout.splitlines()} == targets
 
 

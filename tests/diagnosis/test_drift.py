@@ -114,7 +114,7 @@ def test_every_trial_finds_the_b_it_was_grown_with() -> None:
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
     values = per_trial_estimates(found, B, align_trials(found))
-    true = np.array([one.damping for one in virtual])
+    true = np.array([one.model.values[B] for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
     away = np.log(values.value / true)
     vines = np.array([trial.vine for trial in values.trials])

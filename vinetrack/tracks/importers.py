@@ -387,8 +387,8 @@ def is_export_header(line: str) -> bool:
 def _physics_tracker_column(cell: str) -> tuple[str, str]:
     """Name (t, x, y or blank) and unit of a column of an export.
 
-    >>> _column("x (cm)"), _column("#t"), _column("v_{x}")
-    (('x', 'cm'), ('t', ''), ('', ''))
+    >>> _physics_tracker_column("x (cm)"), _physics_tracker_column("#t")
+    (('x', 'cm'), ('t', ''))
     """
     match = _HEADER_CELL.fullmatch(cell.strip().strip('"').strip())
     if match is None:
