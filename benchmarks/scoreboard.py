@@ -4,10 +4,11 @@
 
 Each row of the table has its number, a 95 % interval (Wilson for shares, bootstrap over units for medians), the number
 of answers behind it and the processor seconds that they took. What is asked is in `scoreboard_units.py`. With `--rows`
-every unit is kept as it comes, a line of JSON each; begun again, what is there is not asked again. `--against` compares
-unit by unit with stored rows: which answers differ by more than 1e-6, and which scores moved beyond chance (McNemar's
-exact test for shares, Wilcoxon's signed ranks for the rest, p < 0.01). Seconds are compared in parts of a fixed piece
-of work that is timed beside each unit. `--repeat` asks every unit with further seeds.
+every unit is kept as it comes, a line of JSON each; begun again, what is there is not asked again unless it broke, so a
+file belongs to one state of the code. `--against` compares unit by unit with stored rows: which answers differ by more
+than 1e-6, and which scores moved beyond chance (McNemar's exact test for shares, Wilcoxon's signed ranks for the rest,
+p < 0.01). Seconds are compared in parts of a fixed piece of work that is timed beside each unit. `--repeat` asks every
+unit with further seeds.
 
 Seeds from 40000 are for working; from 41000 on for the final word, and nothing may be tuned on those. Recordings made
 by others are read from the folder that VINETRACK_REAL_DATA names; without it their rows are skipped.
@@ -191,7 +192,7 @@ def asked(task: Task, known: tuple[float, float] | None) -> Row:
         warnings.simplefilter("ignore")
         try:
             unit["answers"] = GROUPS[group].ask(name, seed, Path(folder), known)
-        except BaseException as error:
+        except (Exception, SystemExit) as error:
             unit |= {"answers": [], "failed": f"{type(error).__name__}: {error}"[:300]}
     unit["yardstick_s"] = (unit["yardstick_s"] + yardstick_s()) / 2
     return rounded(unit | {"processor_s": processor_s() - begun})

@@ -190,9 +190,7 @@ def real(name: str, seed: int, folder: Path, known: object) -> list[Row]:  # noq
         tracking = real_recordings.track_recording(trial)
         x = tracking.axis.points(tracking.track.edge_px)[:, 0]
         free = np.flatnonzero(tracking.track.usable & (x > 55) & (x < 200))
-        line, square = np.polyfit(free, x[free], 1, cov=True)
-        half = 1.96 * float(np.sqrt(square[0, 0]))
-        return [{"value": line[0], "low": line[0] - half, "high": line[0] + half, "points": len(free)}]
+        return [{"value": np.polyfit(free, x[free], 1)[0], "points": len(free)}]
     from tube.folder import write_folder
     from tube.models import fit_tubes, models
     from tube.recordings import read_recordings
