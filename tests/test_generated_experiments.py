@@ -21,13 +21,6 @@ def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path: Path, seed: 
     assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []
 
 
-def test_the_same_seed_draws_the_same_experiment(tmp_path: Path) -> None:
-    for name in "ab":
-        write_experiment(tmp_path / name, 21400)
-    files = [sorted((path.name, path.read_bytes()) for path in (tmp_path / name).iterdir()) for name in "ab"]
-    assert files[0] == files[1]
-
-
 def test_a_single_trial_of_a_falling_ball_reaches_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "ball"
     folder.mkdir()

@@ -1,25 +1,53 @@
-"""The fit of F = B·x_ssⁿ against exact data, another library, sums by hand, and its own promise of 95 %."""
+"""F = B·x_ssⁿ: the fit, the fit under a model of the pressure, and how its numbers and others change with size."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.random import Generator, default_rng
 from odrpack import odr_fit
-from scipy.stats import binom, t
+from scipy.stats import binom
 
+import vinetrack as vt
+from vinetrack.core.published import DAMPING_B, DIAMETER_MM, THICKNESS_UM
+from vinetrack.core.records import Track, Trial
+from vinetrack.experiment.schema import with_names
+from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import (
-    NO_SLOPE,
     Points,
     fit_damping,
     fit_laws,
+    fit_scaling,
+    fit_trends,
     mark_half_steady,
     mark_left_out,
+    planes,
+    regress,
     slope,
 )
+from vinetrack.kinematics.summary import (
+    CONDITION_COLUMNS,
+    DampingLaw,
+    TrialMotion,
+    look_at_motions,
+    redo_damping,
+    summarise_trial,
+)
+from vinetrack.laboratory.tracks import (
+    BASE,
+    PAPER_B,
+    PAPER_N,
+    GroundTruth,
+    damping_pressures_kPa,
+    damping_values,
+    grow,
+    isometric_vine,
+)
+from vinetrack.laboratory.tracks import campaign as of_vine
 
 N = 0.37
 B = {"R1": 0.57, "R2": 1.83, "R3": 4.54, "R4": 6.44}
@@ -91,14 +119,6 @@ def test_exact_data_give_exact_n_and_B(method: str) -> None:
     assert fit["left_out"] == {}
 
 
-@both_methods
-def test_one_vine_alone(method: str) -> None:
-    fit = fit_damping(campaign(default_rng(0), vines=("R3",)), resamples=100)[method]
-    assert fit["n"] == pytest.approx(N, abs=1e-9)
-    assert fit["vines"]["R3"]["B"] == pytest.approx(4.54, rel=1e-9)
-    assert fit["covariance"]["parameters"] == ["n", "ln B R3"]
-
-
 def test_log_log_is_least_squares_of_the_logarithm_of_force() -> None:
     """The dummy-variable regression by numpy's own solver: estimates and covariance."""
     points = scattered(1)
@@ -132,6 +152,7 @@ def test_a_line_of_nist_has_the_certified_numbers_errors_and_scatter() -> None:
     assert fit["n"] == pytest.approx(1.00211681802045, rel=1e-12)
     assert math.log(fit["vines"]["v"]["B"]) == pytest.approx(-0.262323073774029e-2, rel=1e-9)
     assert fit["scatter"] == pytest.approx(0.884796396144373e-2, rel=1e-9)
+    assert fit["vines"]["v"]["R2"] == pytest.approx(0.999993745883712, rel=1e-9)
     errors = np.sqrt(np.diag(fit["covariance"]["matrix"]))
     np.testing.assert_allclose(errors, [0.429796848199937e-3, 0.232818234301152e-2], rtol=1e-9)
 
@@ -163,34 +184,6 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
     assert abs(n[0] - unweighted) > 1e-3
 
 
-def test_a_resample_weighs_as_many_copies() -> None:
-    points = scattered(3, vines=("R1", "R2"), trials=1)
-    y, zero = np.log(points["force_N"].to_numpy()), np.zeros(20)
-    x = np.log(points["x_ss_m_s"].to_numpy())
-    vine = np.repeat([0, 1], 10)
-    counts = default_rng(4).multinomial(20, np.full(20, 0.05))
-    x_var, y_var = np.linspace(1e-3, 4e-3, 20), np.linspace(2e-4, 1e-4, 20)
-    drawn = slope(
-        y[None], counts[None].astype(float), Points(x, y, *[zero] * 5, np.exp(y), vine, ("a", "b")), x_var, y_var
-    )
-    rows = np.repeat(np.arange(20), counts)
-    copies = Points(x[rows], y[rows], *[zero[rows]] * 5, np.exp(y[rows]), vine[rows], ("a", "b"))
-    written_out = slope(y[rows][None], np.ones((1, 20)), copies, x_var[rows], y_var[rows])
-    assert drawn[0][0] == pytest.approx(written_out[0][0], rel=1e-8)
-    np.testing.assert_allclose(drawn[1], written_out[1], rtol=1e-8)
-
-
-def test_r_squared_by_hand() -> None:
-    points = scattered(5)
-    fit = fit_damping(points, resamples=100)["log_log"]
-    for vine, found in fit["vines"].items():
-        own = points[points["vine"] == vine]
-        y = np.log(own["force_N"])
-        residual = y - np.log(found["B"]) - fit["n"] * np.log(own["x_ss_m_s"])
-        assert found["R2"] == pytest.approx(1 - (residual**2).sum() / ((y - y.mean()) ** 2).sum(), rel=1e-12)
-        assert 0.9 < found["R2"] < 1
-
-
 def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes() -> None:
     """σ(ln F) of 3 % B and 1 % P against var(ln F): the mean over 60 campaigns, good to 0.0005."""
     slopes = {method: [] for method in METHODS}
@@ -206,35 +199,24 @@ def test_scatter_of_the_vines_flattens_log_log_and_not_both_axes() -> None:
 # ---- refusals ----
 
 
-def test_a_vine_with_two_points_is_left_out_and_named() -> None:
-    points = campaign(default_rng(0), vines=("R1", "R2"))
-    points = pd.concat([points, campaign(default_rng(0), vines=("R4",), pressures=2, trials=1)])
-    fit = fit_damping(points, resamples=100)["log_log"]
-    assert list(fit["vines"]) == ["R1", "R2"]
-    assert fit["left_out"] == {"R4": "2 steady trials, at least 3 are needed"}
+def test_a_vine_of_two_points_or_one_pressure_is_left_out() -> None:
+    points = campaign(default_rng(0), vines=("R1",))
+    same = campaign(default_rng(0), vines=("R2",), pressures=1, trials=6)
+    two = campaign(default_rng(0), vines=("R4",), pressures=2, trials=1)
+    fit = fit_damping(pd.concat([points, same, two]), resamples=100)["both_axes"]
+    assert (list(fit["vines"]), sorted(fit["left_out"])) == (["R1"], ["R2", "R4"])
+    assert fit["n_trials"] == 40
     assert fit["n"] == pytest.approx(N, abs=1e-9)
 
 
-def test_a_vine_grown_at_one_pressure_is_left_out_and_told_to_vary_it() -> None:
-    points = campaign(default_rng(0), vines=("R1",))
-    same = campaign(default_rng(0), vines=("R2",), pressures=1, trials=6)
-    fit = fit_damping(pd.concat([points, same]), resamples=100)["both_axes"]
-    assert fit["left_out"] == {"R2": "forces span a factor 1, at least 1.2 is needed: vary the pressure"}
-    assert fit["n_trials"] == 40
-
-
 @pytest.mark.parametrize(
-    ("points", "reason"),
-    [
-        (campaign(default_rng(0)).iloc[:0], "there is no trial with a steady window"),
-        (campaign(default_rng(0), vines=("R1",), pressures=2, trials=1), "R1: 2 steady trials, at least 3 are needed"),
-        (campaign(default_rng(0), vines=("R1",), pressures=1, trials=9), "R1: forces span a factor 1,"),
-    ],
-    ids=["nothing", "two trials", "one pressure"],
+    "points",
+    [campaign(default_rng(0)).iloc[:0], campaign(default_rng(0), vines=("R1",), pressures=2, trials=1)],
+    ids=["nothing", "two trials"],
 )
-def test_no_fit_without_enough_points_and_the_reason_is_told(points: pd.DataFrame, reason: str) -> None:
+def test_no_fit_without_enough_points(points: pd.DataFrame) -> None:
     for fit in fit_damping(points, resamples=10).values():
-        assert reason in fit["refused"]
+        assert fit["refused"]
         assert fit["n"] is None
         assert fit["n_95"] == [None, None]
         assert fit["vines"] == {}
@@ -244,7 +226,8 @@ def test_speeds_that_fall_with_the_force_are_no_power_law() -> None:
     points = campaign(default_rng(0), vines=("R1",))
     points["x_ss_m_s"] = points["x_ss_m_s"].to_numpy()[::-1]
     for fit in fit_damping(points, resamples=10).values():
-        assert fit["refused"] == "the speeds do not rise with the force, so there is no power law to fit"
+        assert fit["refused"]
+        assert fit["n"] is None
 
 
 def test_points_without_a_speed_or_a_force_are_not_counted() -> None:
@@ -258,51 +241,6 @@ def test_points_without_a_speed_or_a_force_are_not_counted() -> None:
 
 
 # ---- intervals ----
-
-
-def test_three_points_have_students_interval() -> None:
-    points = scattered(6, vines=("R4",), pressures=3, trials=1, B_scatter=0.05)
-    fit = fit_damping(points, resamples=200)["both_axes"]
-    assert "Student's t" in fit["interval"]
-    reach = t.ppf(0.975, 1) * math.sqrt(fit["covariance"]["matrix"][0][0])
-    assert fit["n_95"] == pytest.approx([fit["n"] - reach, fit["n"] + reach], rel=1e-6)
-
-
-def test_ten_points_and_more_are_resampled_whole() -> None:
-    assert fit_damping(scattered(6, vines=("R4",)), resamples=50)["log_log"]["interval"] == "resampling whole trials"
-
-
-@both_methods
-def test_intervals_hold_the_estimate_and_the_total_ones_hold_them(method: str) -> None:
-    fit = fit_damping(scattered(7), resamples=500)[method]
-    entries = [(fit["n"], fit["n_95"], fit["n_95_total"])]
-    entries += [(found["B"], found["B_95"], found["B_95_total"]) for found in fit["vines"].values()]
-    for value, inner, outer in entries:
-        assert outer[0] <= inner[0] < value < inner[1] <= outer[1]
-    assert fit["n_95_total"][1] - fit["n_95_total"][0] > fit["n_95"][1] - fit["n_95"][0]
-
-
-def test_equal_seeds_give_equal_results_and_others_do_not() -> None:
-    points = scattered(8)
-    one, again, other = (fit_damping(points, resamples=200, seed=seed) for seed in (1, 1, 2))
-    assert one == again
-    assert one["log_log"]["n"] == other["log_log"]["n"]
-    assert one["log_log"]["n_95"] != other["log_log"]["n_95"]
-
-
-def test_the_order_of_the_rows_does_not_matter_to_the_estimates() -> None:
-    points = scattered(8)
-    shuffled = points.sample(frac=1, random_state=3)
-    one, other = fit_damping(points, resamples=10), fit_damping(shuffled, resamples=10)
-    for method in METHODS:
-        assert one[method]["n"] == pytest.approx(other[method]["n"], abs=1e-10)
-
-
-def test_the_points_are_left_alone() -> None:
-    points = scattered(9)
-    before = points.copy(deep=True)
-    fit_damping(points, resamples=20)
-    pd.testing.assert_frame_equal(points, before)
 
 
 CAMPAIGNS = 200
@@ -353,25 +291,6 @@ def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone() 
         assert (-below, above) == pytest.approx((1.96 * N * 0.01,) * 2, rel=0.08)
 
 
-def test_an_unknown_error_of_the_scale_counts_for_nothing() -> None:
-    points = scattered(12)
-    known = fit_damping(points, resamples=100)
-    assert fit_damping(points.assign(scale_rel_sigma=np.nan), resamples=100) == known
-
-
-def test_where_the_scale_is_off_only_the_total_interval_of_B_covers() -> None:
-    """By its stated 3 %, the same for all trials."""
-    inner = outer = 0
-    for seed in range(3000, 3060):
-        points = scattered(seed, vines=("R2",)).assign(scale_rel_sigma=0.03)
-        points["x_ss_m_s"] *= 1 + 0.03 * default_rng([77, seed]).standard_normal()
-        found = fit_damping(points, resamples=300, seed=seed)["both_axes"]["vines"]["R2"]
-        inner += found["B_95"][0] <= B["R2"] <= found["B_95"][1]
-        outer += found["B_95_total"][0] <= B["R2"] <= found["B_95_total"][1]
-    assert outer >= binom.ppf(0.001, 60, 0.95)
-    assert inner < outer
-
-
 def test_a_measured_pressure_leaves_only_the_scatter_of_B() -> None:
     traced = fit_damping(scattered(11, traced=True, P_scatter=0.05), resamples=10)["both_axes"]
     stated = fit_damping(scattered(11, P_scatter=0.05), resamples=10)["both_axes"]
@@ -388,9 +307,8 @@ def test_points_of_a_vine_that_carries_no_slope_are_not_used_and_say_why() -> No
     of_r3 = marked["vine"] == "R3"
     assert not marked.loc[of_r3, "used"].any()
     assert marked.loc[~of_r3, "used"].all()
-    assert set(marked.loc[of_r3, "reason"]) == {f"{NO_SLOPE}2 steady trials, at least 3 are needed"}
     before, after = (fit_laws(table, resamples=20)["both_axes"] for table in (points, marked))
-    assert after["left_out"] == before["left_out"] == {"R3": "2 steady trials, at least 3 are needed"}
+    assert list(after["left_out"]) == list(before["left_out"]) == ["R3"]
     assert after["n"] == before["n"]
 
 
@@ -436,5 +354,200 @@ def test_a_condition_of_which_less_than_half_is_steady_is_left_out_with_its_stea
     )
     marked = mark_half_steady(points)
     assert marked["used"].tolist() == [False] * 4 + [True, True, False, False]
-    assert marked["reason"][0] == "only 25% of the trials of this condition are steady: the slower ones"
     assert points["used"][0]
+
+
+# ---- the damping law under a model of the pressure, on vines from the virtual laboratory ----
+
+SETTINGS = RunSettings.model_validate({"damping": {"resamples": 300}})
+
+
+def running_down(seed: int) -> list[tuple[Trial, Track]]:
+    """Two small vines on a chamber of 0.25 L: at the lowest pressure a third of it is lost along the way."""
+    trials = [
+        replace(trial, chamber_m3=2.5e-4)
+        for scale in (1, 2)
+        for trial in of_vine(isometric_vine(scale), damping_pressures_kPa(scale, 6), 3, prefix=f"R{scale}_")
+    ]
+    trials = list(with_names(trials))
+    nature = GroundTruth(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=seed)
+    return [(one.stated, one.track) for one in grow(trials, nature)]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[tuple[Trial, Track]]:
+    return running_down(41)
+
+
+@pytest.fixture(scope="module")
+def motions(pairs: list[tuple[Trial, Track]]) -> list[TrialMotion]:
+    return look_at_motions(pairs, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def before(motions: list[TrialMotion]) -> DampingLaw:
+    return redo_damping(vt.base_model(), motions, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def after(pairs: list[tuple[Trial, Track]], motions: list[TrialMotion]) -> DampingLaw:
+    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
+    return redo_damping(found.model, motions, SETTINGS)
+
+
+def worst_B(law: DampingLaw, method: str) -> float:
+    """Largest relative error of a B."""
+    vines = law.laws[method]["vines"].values()
+    return max(abs(vine["B"] / PAPER_B[round(vine["diameter_mm"] / 6)] - 1) for vine in vines)
+
+
+def test_b_and_n_come_home_with_the_pressure_of_the_model(before: DampingLaw, after: DampingLaw) -> None:
+    """With the set pressure nothing is steady and our rules refuse; the published rule goes on, and is wrong."""
+    assert before.laws["both_axes"]["refused"]
+    assert worst_B(before, "paper") > 0.1
+    assert worst_B(after, "both_axes") < 0.03
+    assert after.points["used"].sum() > before.points["used"].sum()
+    low, high = after.laws["both_axes"]["n_95"]
+    assert low < PAPER_N < high
+
+
+def test_it_is_what_a_run_with_that_model_gives(
+    pairs: list[tuple[Trial, Track]], before: DampingLaw, after: DampingLaw
+) -> None:
+    """The road from a track to its row takes the same steps."""
+    for k in (0, 20):
+        point = summarise_trial(*pairs[k], SETTINGS, vt.base_model()).point
+        assert point["x_ss_m_s"] == pytest.approx(before.points["x_ss_m_s"].iloc[k], nan_ok=True)
+        assert point["force_N"] == pytest.approx(before.points["force_N"].iloc[k], nan_ok=True)
+    assert tuple(after.points.columns) == tuple(before.points.columns)
+
+
+# ---- B against size ----
+
+
+def law(B: float, diameter_mm: float, thickness_um: float) -> dict:
+    return {"B": B, "B_95": [0.9 * B, 1.1 * B], "diameter_mm": diameter_mm, "thickness_um": thickness_um}
+
+
+def damping(vines: dict[str, dict]) -> dict:
+    return {"both_axes": {"vines": vines}}
+
+
+def test_the_published_coefficients() -> None:
+    """On log axes slope 1.80; the straight line has R² 0.983 and an intercept of −1.7."""
+    vines = {f"R{r}": law(B, DIAMETER_MM[r], THICKNESS_UM[r]) for r, B in DAMPING_B.items()}
+    found = fit_scaling(damping(vines))
+    (family,) = found["isometric"]
+    assert family["sizes"] == [6.0, 12.0, 18.0, 24.0]
+    assert family["power"]["slope"] == pytest.approx(1.80, abs=0.005)
+    assert family["line"]["R2"] == pytest.approx(0.983, abs=5e-4)
+    assert family["line"]["intercept"] == pytest.approx(-1.7, abs=0.05)
+    assert found["thickness"] == []
+
+
+def test_walls_of_one_diameter_make_a_line() -> None:
+    vines = {f"t{t:g}": law(0.02 * t, 12.0, t) for t in (50.0, 100.0, 200.0)}
+    (family,) = fit_scaling(damping(vines))["thickness"]
+    assert (family["along"], family["sizes"]) == ("thickness_um", [50.0, 100.0, 200.0])
+    assert family["power"]["slope"] == pytest.approx(1.0)
+    assert family["line"]["slope"] == pytest.approx(0.02)
+    assert family["line"]["intercept"] == pytest.approx(0.0, abs=1e-9)
+
+
+# ---- trends with size against exact power laws and against textbook regressions worked out by hand ----
+
+PER_STEP_95 = 12.706204736  # Student's t with one degree of freedom
+PER_TWO_95 = 4.302652730  # and with two
+
+
+def conditions(rows: list[dict]) -> pd.DataFrame:
+    defaults = {
+        "payload_g": 0.0,
+        "growth_angle_deg": 0.0,
+        "length_mm": 200.0,
+        "n_steady": 4,
+        "n_efficiency": 4,
+        "efficiency_at_mm": 150.0,
+        "efficiency": math.nan,
+        "x_ss_m_s": math.nan,
+    }
+    table = pd.DataFrame([{**defaults, **row} for row in rows]).reindex(columns=list(CONDITION_COLUMNS))
+    names = [f"c{i}" for i in range(len(table))]
+    speed = table["x_ss_m_s"] / (table["diameter_mm"] / 1e3)
+    return table.assign(condition=names, vine=names, x_ss_over_diameter_1_s=speed)
+
+
+def speeds(values: list[float], pressure_kPa: float = 24.0) -> list[dict]:
+    return [
+        {"diameter_mm": 6.0 * r, "thickness_um": 50.0 * r, "pressure_kPa": pressure_kPa, "x_ss_m_s": value}
+        for r, value in enumerate(values, start=1)
+    ]
+
+
+def loaded(diameter_mm: float, thickness_um: float, efficiency: float, **changes: float) -> dict:
+    sizes = {"diameter_mm": diameter_mm, "thickness_um": thickness_um, "pressure_kPa": 34.0, "payload_g": 35.6}
+    return {**sizes, "efficiency": efficiency, "efficiency_payload": 0.9 * efficiency, **changes}
+
+
+def test_a_power_law_of_speed_comes_back_and_divided_by_diameter_it_is_one_less() -> None:
+    (family,) = fit_trends(conditions(speeds([2.0 * r**0.7 for r in (1, 2, 3, 4)])))["steady_speed"]
+    assert family["sizes"] == [6.0, 12.0, 18.0, 24.0]
+    assert family["power"]["slope"] == pytest.approx(0.7)
+    assert family["over_diameter"]["power"]["slope"] == pytest.approx(-0.3)
+    assert family["monotonic"]
+
+
+def test_the_published_r_squared_of_four_points_has_p_0_033() -> None:
+    """t = √(R²·dof/(1 − R²)) = √(0.935 × 2/0.065) = 5.3637; with two degrees of freedom p = 1 − t/√(2 + t²) = 0.0330.
+
+    Values with that R² exactly: a line, and a residual that is orthogonal to it.
+    """
+    x = np.array([1.0, 2.0, 3.0, 4.0])
+    along, across = x - 2.5, np.array([1.0, -1.0, -1.0, 1.0])
+    y = 10 + along * math.sqrt(0.935 / 5) + across * math.sqrt(0.065 / 4)
+    found = regress(x, y)
+    t = math.sqrt(0.935 * 2 / 0.065)
+    assert found["R2"] == pytest.approx(0.935)
+    assert found["p"] == pytest.approx(1 - t / math.sqrt(2 + t**2), rel=1e-9)
+    assert found["p"] == pytest.approx(0.033, abs=5e-4)
+    slope = math.sqrt(0.935 / 5)
+    assert found["slope_95"] == pytest.approx([slope - PER_TWO_95 * slope / t, slope + PER_TWO_95 * slope / t])
+
+
+def test_speeds_at_other_pressures_or_walls_are_other_families() -> None:
+    thin = {"diameter_mm": 12.0, "thickness_um": 50.0, "pressure_kPa": 24.0, "x_ss_m_s": 9.0}
+    loaded_one = {**thin, "thickness_um": 100.0, "payload_g": 10.0}
+    rows = [*speeds([1.0, 2.0, 3.0]), *speeds([4.0, 5.0], pressure_kPa=25.0), thin, loaded_one]
+    families = fit_trends(conditions(rows))["steady_speed"]
+    assert [(f["pressure_kPa"], len(f["sizes"])) for f in families] == [(24.0, 3), (25.0, 2)]
+    assert families[1]["power"] is None
+    assert families[1]["refused"]
+
+
+def test_powers_of_wall_and_diameter_stand_apart() -> None:
+    rows = [loaded(D, t, 0.4 * (t / 100) ** -0.6 * (D / 12) ** 0.2) for D in (12.0, 18.0) for t in (50.0, 100.0, 200.0)]
+    (family,) = fit_trends(conditions(rows))["efficiency"]
+    trend = family["trend"]["efficiency"]
+    assert trend["thickness_um"]["power"] == pytest.approx(-0.6)
+    assert trend["diameter_mm"]["power"] == pytest.approx(0.2)
+    assert trend["R2"] == pytest.approx(1.0)
+    assert family["trend"]["efficiency_payload"]["thickness_um"]["power"] == pytest.approx(-0.6)
+    assert family["trend"]["efficiency_with_weight"]["refused"]
+
+
+def test_one_power_is_the_straight_line_of_the_textbook() -> None:
+    """ln values 0, 1, 1 at ln sizes 0, 1, 2: slope ½, residuals −1/6, 1/3, −1/6, s² = 1/6, error √(s²/2)."""
+    found = planes({"thickness_um": np.exp([0.0, 1.0, 2.0]), "diameter_mm": np.full(3, 12.0)}, np.exp([0.0, 1.0, 1.0]))
+    error = math.sqrt(1 / 12)
+    power = found["thickness_um"]
+    assert power["power"] == pytest.approx(0.5)
+    assert power["power_95"] == pytest.approx([0.5 - PER_STEP_95 * error, 0.5 + PER_STEP_95 * error])
+    # With one degree of freedom p = 1 − (2/π) arctan t; here t = √3, an angle of 60°.
+    assert power["p"] == pytest.approx(1 / 3)
+    assert found["R2"] == pytest.approx(0.75)
+    assert "diameter_mm" not in found
+
+
+def test_scaled_copies_have_no_power_of_their_own() -> None:
+    sizes = {"thickness_um": np.array([50.0, 100.0, 150.0, 200.0]), "diameter_mm": np.array([6.0, 12.0, 18.0, 24.0])}
+    assert planes(sizes, np.array([1.0, 2.0, 3.0, 4.0]))["refused"]

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
+from lsoda_vine import as_track, grown_position, vine_trial
 from vine_truth import Vine, ar1, make_track, record
 
-from vinetrack.kinematics.steady import WindowMoments, gated_window, user_window
+from vinetrack.core.records import Track, Trial
+from vinetrack.dynamics.model import base_model, make_model
+from vinetrack.experiment.settings import RunSettings
+from vinetrack.kinematics.damping import fit_damping
+from vinetrack.kinematics.steady import WindowMoments, gated_window, paper_window, user_window
+from vinetrack.kinematics.summary import TrialResult, summarise_trial
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 SEEDS = range(1000, 1010)
@@ -51,18 +59,6 @@ def test_speed_is_the_true_mean_and_the_speed_of_balance(vine, noise_m, rho):
     assert abs(np.mean(from_balance)) < 1e-3
 
 
-@pytest.mark.parametrize("scale", [3, 4])
-def test_a_vine_too_fast_to_settle_is_less_than_one_per_cent_off_balance(scale):
-    off, vine = [], Vine(scale, 10.0)
-    for seed in SEEDS:
-        trial = record(vine, np.random.default_rng(seed), noise_m=3e-5, rest_frames=60)
-        window = gated(trial.track)
-        assert window.accepted
-        tail = 2 * (trial.lead_position_m[inside(trial, window)] - trial.lead_position_m[0])
-        off.append(window.x_ss_m_s / float(vine.quasi_steady_speed(tail.mean())) - 1)
-    assert abs(np.mean(off)) < 0.01
-
-
 @pytest.mark.parametrize("vine", [Vine(1, 3.0), Vine(2, 5.0), Vine(1, 10.0)], ids=str)
 def test_short_plateaus_are_found(vine):
     windows = [gated(record(vine, np.random.default_rng(seed), noise_m=2e-5).track) for seed in SEEDS]
@@ -92,35 +88,11 @@ def test_a_recording_that_stops_with_the_growth_keeps_its_end_out_of_the_window(
         assert grown_m[inside(trial, window)].max() <= 0.95 * vine.length_m + 1e-4
 
 
-def test_growth_that_stops_short_of_the_length_keeps_its_window():
-    vine = Vine(2, 1.0)
-    trial = record(vine, np.random.default_rng(1000), noise_m=3e-5, rest_frames=40)
-    assert gated(trial.track, length_m=2 * vine.length_m) == gated(trial.track)
-
-
-def test_a_window_chosen_by_hand_that_runs_into_the_end_is_used_with_a_warning():
-    vine = Vine(2, 1.0)
-    trial = record(vine, np.random.default_rng(1000), noise_m=3e-5, rest_frames=40)
-    kinematics = estimate_kinematics(trial.track, travel_ratio=2)
-    last_s = float(trial.track.time_s[-1])
-    late = user_window(trial.track, kinematics, (last_s - 0.1, last_s), vine.length_m)
-    assert late.accepted
-    assert "warning: runs into the end of growth" in late.reason
-    early = user_window(trial.track, kinematics, (last_s - 0.2, last_s - 0.1), vine.length_m)
-    assert "end of growth" not in early.reason
-
-
 @pytest.mark.parametrize("noise_m", [0.0, 3e-5, 3e-4])
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_still_frames_are_never_steady_motion(noise_m, rho):
     for seed in range(1000, 1030):
         y = ar1(400, noise_m, rho, np.random.default_rng(seed))
-        assert not gated(make_track(np.arange(400) / 1069, y)).accepted
-
-
-def test_still_frames_of_whole_pixels_are_never_steady_motion():
-    for seed in range(1000, 1030):
-        y = np.round(ar1(400, 1e-4, 0.3, np.random.default_rng(seed)) / 3e-4) * 3e-4
         assert not gated(make_track(np.arange(400) / 1069, y)).accepted
 
 
@@ -133,28 +105,11 @@ def test_uniform_acceleration_is_never_steady(noise_m, rest):
         assert not gated(make_track(time_s, y)).accepted
 
 
-def test_free_fall_is_never_steady():
-    time_s = np.arange(300) / 1000
-    y = 0.5 * 9.81 * np.maximum(time_s - 0.05, 0) ** 2 + ar1(300, 1e-4, 0.0, np.random.default_rng(1000))
-    window = gated(make_track(time_s, y), travel_ratio=1)
-    assert not window.accepted
-    assert math.isnan(window.x_ss_m_s)
-    assert "no window is shown to be steady" in window.reason
-
-
 def test_a_speed_that_goes_up_and_down_is_rejected_for_it():
     time_s = np.arange(300) / 1000
     y = 0.5 * time_s + 5e-4 * np.sin(150 * time_s) + ar1(300, 2e-5, 0.0, np.random.default_rng(1000))
     window = gated(make_track(time_s, y))
     assert not window.accepted
-    assert "contains speeds from" in window.reason
-
-
-def test_an_exact_acceleration_is_rejected_as_too_short_a_part():
-    time_s = np.arange(600) / 1000
-    window = gated(make_track(time_s, 0.5 * 9.81 * time_s**2))
-    assert not window.accepted
-    assert "is less than 10 % of the motion" in window.reason
 
 
 def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported():
@@ -163,22 +118,6 @@ def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported(
     assert window.n_points > 250
     assert window.drift == pytest.approx(-0.02 * window.n_points / 300, abs=1.5e-3)
     assert window.drift_95[0] < window.drift < window.drift_95[1]
-    assert "speed changes by" in window.reason
-
-
-def test_a_decline_of_ten_per_cent_is_shortened_and_said():
-    window = gated(ramp(0.10, 3e-5))
-    assert window.accepted
-    assert window.n_points < 100
-    assert max(abs(bound) for bound in window.drift_95) <= 0.03
-    assert f"{window.n_points} of 300 moving points" in window.reason
-
-
-def test_a_decline_of_ten_per_cent_in_few_points_is_rejected_with_numbers():
-    window = gated(ramp(0.10, 3e-5, n=40))
-    assert not window.accepted
-    assert "changes by" in window.reason
-    assert "of 40 moving points" in window.reason
 
 
 def test_drift_interval_covers_the_truth():
@@ -201,30 +140,6 @@ def test_error_of_the_speed_is_honest_at_constant_speed(rho):
     assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
 
 
-def test_constant_speed_from_the_first_frame_is_steady_throughout():
-    time_s = np.arange(100) / 1069
-    window = gated(make_track(time_s, 0.5 * time_s))
-    assert window.accepted
-    assert (window.from_s, window.to_s) == (0.0, time_s[-1])
-    assert window.x_ss_m_s == pytest.approx(1.0, rel=1e-12)
-
-
-def test_points_without_position_do_not_matter():
-    trial = record(Vine(2, 1.0), np.random.default_rng(1000), noise_m=3e-5)
-    whole = gated(trial.track)
-    trial.track.lead_position_m[::17] = np.nan
-    holed = gated(trial.track)
-    assert holed.accepted
-    assert holed.x_ss_m_s == pytest.approx(whole.x_ss_m_s, rel=1e-3)
-
-
-def test_five_points_can_be_judged():
-    time_s = np.arange(5) / 1000
-    assert gated(make_track(time_s, 0.5 * time_s)).accepted
-    noisy = make_track(time_s, 0.5 * time_s + 2e-5 * np.array([1.0, -1.0, 1.0, -1.0, 1.0]))
-    assert not gated(noisy).accepted
-
-
 def test_a_long_plateau_does_not_swallow_its_start_up():
     time_s = np.arange(600) / 1000
     moving = np.maximum(time_s - 0.05, 0)
@@ -235,14 +150,6 @@ def test_a_long_plateau_does_not_swallow_its_start_up():
     assert window.x_ss_m_s == pytest.approx(1.0, rel=1e-3)
 
 
-def test_a_tighter_limit_gives_a_shorter_window():
-    track = ramp(0.05, 2e-5)
-    kinematics = estimate_kinematics(track, travel_ratio=2)
-    tight = gated_window(track, kinematics, drift_limit=0.015)
-    assert tight.accepted
-    assert tight.n_points < gated_window(track, kinematics).n_points
-
-
 def test_a_window_chosen_by_hand_is_used_and_judged():
     track = ramp(0.0, 3e-5)
     window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.05, 0.25))
@@ -250,7 +157,6 @@ def test_a_window_chosen_by_hand_is_used_and_judged():
     assert window.rule == "user"
     assert (window.from_s, window.to_s) == (0.05, 0.25)
     assert window.x_ss_m_s == pytest.approx(1.0, abs=4 * window.x_ss_sigma_m_s)
-    assert "warning" not in window.reason
 
 
 def test_a_window_chosen_by_hand_that_drifts_is_used_with_a_warning():
@@ -258,42 +164,6 @@ def test_a_window_chosen_by_hand_that_drifts_is_used_with_a_warning():
     window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 0.299))
     assert window.accepted
     assert window.drift == pytest.approx(-0.3 / 0.85, rel=0.02)
-    assert "warning: not shown to be steady" in window.reason
-
-
-def test_a_window_chosen_by_hand_in_still_frames_is_used_with_a_warning():
-    track = make_track(np.arange(100) / 1000, np.zeros(100))
-    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.02, 0.06))
-    assert window.accepted
-    assert "warning: the mean tail speed is 0 m/s" in window.reason
-
-
-def test_a_window_chosen_by_hand_outside_the_track_is_refused_in_words():
-    track = ramp(0.0, 3e-5)
-    with pytest.raises(ValueError, match=r"5:6 s contains 0 usable points, at least 3 .* runs from 0 to 0.299 s"):
-        user_window(track, estimate_kinematics(track, travel_ratio=2), (5.0, 6.0))
-
-
-def test_kinematics_of_another_track_are_refused_in_words():
-    track = ramp(0.0, 3e-5)
-    with pytest.raises(ValueError, match="were not made from this track"):
-        gated_window(ramp(0.0, 3e-5, n=50), estimate_kinematics(track, travel_ratio=2))
-
-
-def test_a_thousand_frames_take_no_more_windows_than_fifty(monkeypatch):
-    """All pairs of 56 starts and ends are 1600 windows, and the steps of the second pass a few hundred more."""
-    tried = []
-    drift = WindowMoments.drift
-
-    def counted(self, first, last):
-        tried.append(first.size)
-        return drift(self, first, last)
-
-    monkeypatch.setattr(WindowMoments, "drift", counted)
-    for n in (50, 1000, 4000):
-        gated(ramp(0.0, 3e-5, n=n))
-        assert sum(tried) < 2500
-        tried.clear()
 
 
 @pytest.mark.parametrize("first", [0, 63, 64, 3000, 4990])
@@ -321,3 +191,106 @@ def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend()
     window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 1.0))
     assert window.x_ss_m_s == pytest.approx(1.0, abs=5e-4)
     assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)
+
+
+# ---- windows in which a vine keeps up with a falling pressure, against trajectories integrated here by SciPy ----
+
+B, N, CHAMBER_M3, GAMMA, AMBIENT_PA = 6.44, 0.37, 1e-3, 1.4, 101_325.0
+STEP_S = 1 / 1069
+SETTINGS = RunSettings()
+
+
+def vine(pressure_kPa: float) -> Trial:
+    more = {"vine": "v", "condition": f"{pressure_kPa:g}", "capture_fps": 1 / STEP_S, "chamber_m3": CHAMBER_M3}
+    return vine_trial(f"p{pressure_kPa:g}", pressure_kPa, **more)
+
+
+def pressure_at(trial: Trial, y: np.ndarray) -> np.ndarray:
+    swept = trial.area_m2 * y
+    return (trial.pressure_Pa + AMBIENT_PA) * (CHAMBER_M3 / (CHAMBER_M3 + swept)) ** GAMMA - AMBIENT_PA
+
+
+def grown(trial: Trial, seed: int, noise_m: float = 1e-4) -> tuple[Track, np.ndarray]:
+    """A track of `trial` emptying its chamber, and the pressure at its rows."""
+    time_s = np.arange(0, 8, STEP_S)
+    y = grown_position(trial, time_s - 20.4 * STEP_S, B, N, pressure_along=lambda y: float(pressure_at(trial, y)))
+    seen = np.isfinite(y)
+    noise = noise_m * np.random.default_rng(seed).standard_normal(seen.sum())
+    return as_track(time_s[seen], 0.02 + y[seen] + noise), pressure_at(trial, y[seen])
+
+
+def analysed(trial: Trial, seed: int, *, traced: bool, effects: tuple[str, ...] = ()) -> TrialResult:
+    track, pressure_Pa = grown(trial, seed)
+    model = make_model((*base_model().names, *effects))
+    return summarise_trial(trial, replace(track, pressure_Pa=pressure_Pa) if traced else track, SETTINGS, model)
+
+
+def test_a_measured_pressure_makes_a_point_of_a_speed_that_never_settles() -> None:
+    result = analysed(vine(20), seed=1000, traced=True)
+    window = result.windows["quasi_steady"]
+    assert window.accepted
+    assert window.drift < -0.1
+    assert result.row["steady_rule"] == "quasi_steady"
+    assert result.point["used"]
+    assert result.point["force_N"] == pytest.approx(B * float(result.point["x_ss_m_s"]) ** N, rel=0.01)
+
+
+def test_the_pressure_of_the_model_in_use_does_as_well_as_a_measured_one() -> None:
+    traced = analysed(vine(20), seed=1001, traced=True)
+    modelled = analysed(vine(20), seed=1001, traced=False, effects=("reservoir_depletion",))
+    assert modelled.row["steady_rule"] == "quasi_steady"
+    assert modelled.point["force_N"] == pytest.approx(traced.point["force_N"], rel=0.005)
+
+
+def test_where_inertia_rules_there_is_no_window() -> None:
+    loaded = analysed(vine(34), seed=1003, traced=True)
+    window = loaded.windows.get("quasi_steady", loaded.windows["gated"])
+    # The drive of 34 kPa falls so fast that the film's inertia takes more than a tenth of it.
+    assert not window.accepted
+
+
+def test_a_chamber_that_empties_gives_the_law_once_its_pressure_is_known() -> None:
+    points = [analysed(vine(p), seed=1010 + i, traced=True).point for i, p in enumerate((12, 14, 16, 18, 20, 22, 24))]
+    table = pd.DataFrame([dict(point) for point in points])
+    assert table["used"].sum() >= 4
+    fit = fit_damping(table[table["used"]], resamples=200)["both_axes"]
+    assert fit["n"] == pytest.approx(N, abs=0.01)
+    assert fit["vines"]["v"]["B"] == pytest.approx(B, rel=0.01)
+
+
+# ---- the paper's literal rule against a search by brute force, and the misfires it is known for ----
+
+
+def longest_by_brute_force(velocity: np.ndarray) -> int:
+    """Length of the longest run of at least three with sample deviation below 3 % of the mean; 0 for none."""
+    for length in range(velocity.size, 2, -1):
+        for start in range(velocity.size - length + 1):
+            run = velocity[start : start + length]
+            if np.std(run, ddof=1) < 0.03 * abs(np.mean(run)):
+                return length
+    return 0
+
+
+@pytest.mark.parametrize("seed", range(1000, 1040))
+def test_the_run_is_the_longest_there_is(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(5, 70))
+    time_s = np.arange(n) / 1000
+    speed = np.where(np.arange(n) < rng.integers(0, n), rng.uniform(0, 1), 1.0)
+    y = np.cumsum(speed) / 1000 + rng.choice([1e-6, 1e-5, 5e-5]) * rng.standard_normal(n)
+    window = paper_window(make_track(time_s, y), travel_ratio=2)
+    velocity = (y[2:] - y[:-2]) / 0.002
+    assert window.n_points == longest_by_brute_force(velocity)
+    assert window.accepted == (window.n_points > 0)
+    if window.accepted:
+        inside = (time_s[1:-1] >= window.from_s - 1e-9) & (time_s[1:-1] <= window.to_s + 1e-9)
+        assert window.x_ss_m_s == pytest.approx(2 * velocity[inside].mean())
+        assert window.cv == pytest.approx(np.std(velocity[inside], ddof=1) / abs(velocity[inside].mean()))
+
+
+def test_constant_speed_is_one_run_in_tail_speed():
+    time_s = np.arange(50) / 1000
+    window = paper_window(make_track(time_s, 0.4 * time_s), travel_ratio=2)
+    assert window.n_points == 48
+    assert window.x_ss_m_s == pytest.approx(0.8)
+    assert (window.from_s, window.to_s) == (time_s[1], time_s[-2])

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
-from vinetrack.kinematics.velocity import estimate_kinematics, fit_all_windows
+from vinetrack.kinematics.velocity import correlated, estimate_kinematics, fit_all_windows
 
 SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
 TRIALS = [
@@ -48,16 +49,6 @@ def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_releas
     assert np.mean(np.abs(pull) > 3) < 0.1
 
 
-def test_constant_velocity_of_the_widest_window_is_within_its_error():
-    time_s = np.arange(400) / 1069
-    pulls = []
-    for seed in range(1000, 1060):
-        y = 0.7 * time_s + ar1(400, 1e-4, 0.0, np.random.default_rng(seed))
-        kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
-        pulls.append((kinematics.lead_velocity_m_s[200] - 0.7) / kinematics.lead_velocity_sigma_m_s[200])
-    assert 0.75 < np.std(pulls) < 1.3
-
-
 def test_free_fall_has_the_acceleration_of_gravity():
     time_s = np.arange(300) / 1000
     found = []
@@ -80,14 +71,6 @@ def test_exact_cubic_is_returned_exactly_and_without_division_by_its_noise():
     assert np.all(np.isfinite(kinematics.lead_velocity_sigma_m_s))
 
 
-def test_position_and_velocity_belong_together():
-    trial = record(Vine(4, 1.0), np.random.default_rng(1000), noise_m=3e-5, rest_frames=30)
-    kinematics = estimate_kinematics(trial.track, travel_ratio=2)
-    late = kinematics.time_s > trial.release_s + 0.1
-    travelled = np.trapezoid(kinematics.lead_velocity_m_s[late], kinematics.time_s[late])
-    assert travelled == pytest.approx(np.ptp(kinematics.lead_position_m[late]), rel=2e-3)
-
-
 @pytest.mark.parametrize("drop", [[], [150], [150, 151, 152, 153, 154], list(range(0, 300, 9))])
 def test_missing_frames_do_not_bias(drop):
     time_s = np.delete(np.arange(300) / 1069, drop)
@@ -97,57 +80,17 @@ def test_missing_frames_do_not_bias(drop):
     assert np.max(np.abs(pull)) < 5
 
 
-def test_points_without_position_are_left_out():
-    time_s = np.arange(100) / 1069
-    y = 0.5 * time_s
-    y[[0, 40, 41, 99]] = np.nan
-    kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
-    assert kinematics.time_s.size == 96
-    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
-
-
-def test_flagged_points_are_left_out():
+def test_points_without_position_or_with_a_flag_are_left_out():
     time_s = np.arange(100) / 1069
     y = 0.5 * time_s
     y[50] = 7.0
+    y[[0, 40, 41, 99]] = np.nan
     track = make_track(time_s, y)
     flag = track.flag.copy()
     flag[50] = "rejected"
     kinematics = estimate_kinematics(replace(track, flag=flag), travel_ratio=2)
+    assert kinematics.time_s.size == 95
     np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
-
-
-@pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 7])
-def test_very_short_tracks_have_a_velocity(n):
-    time_s = np.arange(n) / 1000
-    kinematics = estimate_kinematics(make_track(time_s, 0.5 * time_s), travel_ratio=2)
-    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
-
-
-def test_one_point_is_refused_in_words():
-    with pytest.raises(ValueError, match="has 1 usable points; a velocity needs at least 2"):
-        estimate_kinematics(make_track(np.zeros(1), np.zeros(1)), travel_ratio=2)
-
-
-def test_times_that_do_not_increase_are_refused_in_words():
-    with pytest.raises(ValueError, match="do not increase"):
-        estimate_kinematics(make_track(np.array([0.0, 0.1, 0.1, 0.2]), np.arange(4.0)), travel_ratio=2)
-
-
-def test_zeros_of_time_and_position_do_not_matter():
-    trial = record(Vine(2, 1.0), np.random.default_rng(1000), noise_m=1e-4)
-    moved = make_track(trial.track.time_s + 1000.0, trial.track.lead_position_m - 5.0)
-    here, there = (estimate_kinematics(track, travel_ratio=2) for track in (trial.track, moved))
-    np.testing.assert_allclose(there.lead_velocity_m_s, here.lead_velocity_m_s, atol=1e-5)
-
-
-def test_the_track_is_left_as_it_was():
-    trial = record(Vine(2, 1.0), np.random.default_rng(1000), noise_m=1e-4)
-    before = trial.track.lead_position_m.copy()
-    first = estimate_kinematics(trial.track, travel_ratio=2)
-    again = estimate_kinematics(trial.track, travel_ratio=2)
-    np.testing.assert_array_equal(trial.track.lead_position_m, before)
-    np.testing.assert_array_equal(first.lead_velocity_m_s, again.lead_velocity_m_s)
 
 
 def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
@@ -162,3 +105,55 @@ def test_where_points_jump_about_the_velocity_is_known_as_badly_as_they_say():
         off = kinematics.lead_velocity_m_s[150:162] - 0.2
         pulls.append(off / kinematics.lead_velocity_sigma_m_s[150:162])
     assert 0.2 < np.median(np.abs(pulls)) < 2
+
+
+# ---- local polynomials against polynomials, SciPy and Monte Carlo ----
+
+EVEN = np.arange(60) / 1000
+GAPPED = np.delete(np.arange(64) / 1000, [20, 21, 22, 40])
+UNEVEN = np.cumsum(np.random.default_rng(1000).uniform(0.5, 1.5, 60)) / 1000
+
+
+@pytest.mark.parametrize("time_s", [EVEN, GAPPED, UNEVEN], ids=["even", "gapped", "uneven"])
+@pytest.mark.parametrize("side", [-1.0, -0.5, 0.0, 0.5, 1.0])
+def test_a_cubic_is_returned_exactly(time_s, side):
+    cubic = np.polynomial.Polynomial([0.1, 0.5, -8.0, 90.0])
+    fits = fit_all_windows(time_s, cubic(time_s), 9, 3, 0.0)
+    window, velocity, _ = fits.velocities(time_s, side)
+    values, _ = fits.at(time_s, window)
+    np.testing.assert_allclose(velocity, cubic.deriv()(time_s), rtol=1e-9)
+    np.testing.assert_allclose(values[0], cubic(time_s), rtol=1e-9)
+    np.testing.assert_allclose(values[2], cubic.deriv(2)(time_s), rtol=1e-6)
+    assert np.all(fits.misfit < 1e-24)
+
+
+def test_even_spacing_is_savitzky_golay():
+    y = 0.3 * EVEN + ar1(60, 1e-4, 0.0, np.random.default_rng(1000))
+    _, velocity, _ = fit_all_windows(EVEN, y, 11, 3, 0.0).velocities(EVEN, 0.0)
+    expected = savgol_filter(y, 11, 3, deriv=1, delta=1e-3, mode="interp")
+    np.testing.assert_allclose(velocity, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+@pytest.mark.parametrize("time_s", [EVEN, GAPPED], ids=["even", "gapped"])
+def test_stated_error_is_that_of_many_draws(time_s, rho):
+    rng = np.random.default_rng(1000)
+    draws, point = [], 24
+    for _ in range(1500):
+        fits = fit_all_windows(time_s, ar1(time_s.size, 1.0, rho, rng), 15, 3, rho)
+        _, velocity, gain = fits.velocities(time_s, 0.0)
+        draws.append(velocity[point])
+    assert np.std(draws) == pytest.approx(gain[point], rel=0.06)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_misfit_of_noise_averages_its_number_of_terms(rho):
+    rng = np.random.default_rng(1000)
+    misfits = [fit_all_windows(EVEN, ar1(60, 1.0, rho, rng), 21, 3, rho).misfit[::20] for _ in range(500)]
+    assert np.mean(misfits) == pytest.approx(4.0, rel=0.08)
+
+
+def test_correlated_is_multiplication_by_the_correlation_matrix():
+    weights = np.random.default_rng(1000).standard_normal((3, 12))
+    lag = np.abs(np.subtract.outer(np.arange(12), np.arange(12)))
+    np.testing.assert_allclose(correlated(weights, 0.6), weights @ 0.6**lag, rtol=1e-12)

@@ -19,7 +19,7 @@ from hidden.laboratory_folder import write_experiment, write_truth
 from hidden.laboratory_kinds import BARE
 from hidden.laboratory_rows import ROWS, campaign
 from hidden.motion import AIR, G, Physics, Tube, follow
-from hidden.shots import Camera, Laboratory, careful, film, plan, seen
+from hidden.shots import Laboratory, careful, plan, seen
 from hidden.slack import follow_slack
 from hidden.verdicts import Answer, Should, judge
 from hidden.visibility import visible_sigma
@@ -94,20 +94,6 @@ def test_a_row_that_is_read_late_shows_what_was_there_then():
     order = np.argsort(moment)
     out, _ = follow(moment[order], shot.tube, shot.physics, np.empty((0, 3)))
     assert y[order] == pytest.approx(out[:, 0], abs=2e-6)
-
-
-def test_wild_points_are_as_many_and_as_far_off_as_said():
-    laboratory, _ = drawn()
-    quiet = replace(laboratory, camera=Camera(noise_m=0.0))
-    spoilt = faults.wild_points(0.02, 3, 3)(quiet, np.random.default_rng(1))
-    clean, wild = film(quiet, np.random.default_rng(2)), film(spoilt, np.random.default_rng(2))
-    assert clean is not None
-    assert wild is not None
-    off = wild[0].position_m - clean[0].position_m
-    assert set(np.round(np.abs(off), 9)) <= {0.0, 3e-3}
-    # The draws part after the first recording: the rest tells how many there are.
-    jumps = [np.abs(np.diff(one.position_m, 2)) > 3e-3 for one in wild]
-    assert 0.005 < np.mean(np.concatenate(jumps)) / 3 < 0.04
 
 
 def test_a_tail_that_is_never_slack_moves_as_it_always_did():

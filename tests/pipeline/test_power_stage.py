@@ -10,9 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign, SimulatedDiagnosis
-from vinetrack.figures.prediction_figures import draw_power
 from vinetrack.pipeline import power_stage
 from vinetrack.pipeline.power_stage import PowerRequest, power_of_target
 
@@ -79,16 +77,6 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
 
 
-def test_trials_to_add_need_a_size(folder: Path) -> None:
-    with pytest.raises(ExperimentError, match="needs a size"):
-        power_of_target(PowerRequest(folder, ("leak",), reach=0.9))
-
-
-def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:
-    with pytest.raises(ExperimentError, match="leak"):
-        power_of_target(PowerRequest(folder, ("leek",)))
-
-
 def test_simulated_campaigns_are_counted_beside_the_prediction(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked_for: list[tuple[str, int]] = []
 
@@ -111,12 +99,3 @@ def test_the_trials_that_would_reveal_most_are_recommended(tmp_path: Path) -> No
     assert power.recommended is not None
     assert sum(trial["replicates"] for trial in power.to_json()["recommended_trials"]) == 2
     assert any(power.recommended.then[name].size_at(0.9) < power[name].size_at(0.9) for name in ("leak", "air_drag"))
-
-
-def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:
-    power = power_of_target(PowerRequest(folder))
-    ax, told = draw_power(power).axes[:2]
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["leak, 1/τ", "air drag, C_D"]
-    texts = {text.get_text() for text in told.texts}
-    assert "3.0" in texts
-    assert {"50 %\npower", "90 %\npower"} <= texts

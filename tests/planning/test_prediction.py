@@ -1,27 +1,51 @@
-"""What is predicted, against the laws of motion written out by hand and against another integrator."""
+"""What is predicted, from which inputs, and what speaks against a vine, held against laws written out by hand."""
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from lsoda_vine import grown_position
 from scipy.integrate import solve_ivp
 
+import vinetrack as vt
 from vinetrack.core import published
 from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import make_model
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.planned import planned_trial
+from vinetrack.planning import predictive_inputs as guess
 from vinetrack.planning.prediction import (
     EDGE,
     LEAST_TENSION,
     TAIL,
     TENSION,
     TIME,
+    VinePrediction,
+    design_checks,
+    neglected,
     predict_vine,
     run,
 )
-from vinetrack.planning.predictive_inputs import BAND, YIELD, StatedValues, damping_prior, predictive_inputs
+from vinetrack.planning.predictive_inputs import (
+    BAND,
+    PRESSURE,
+    YIELD,
+    Size,
+    StatedValues,
+    damping_prior,
+    fit_numbers,
+    predictive_inputs,
+    pressure_problems,
+    read_sizes,
+)
+
+# What is predicted, against the laws of motion written out by hand and against another integrator.
+
 
 FAST = {name: str(value) for name, value in published.FAST_VINE.items()}
 EXACT = {"yield_pressure_sigma_kPa": "0"}
@@ -125,3 +149,284 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> Non
     assert np.quantile(positions, 0.05, method="inverted_cdf") == pytest.approx(
         float(prediction.curve["lead_position_m"].iloc[60]), rel=0.01
     )
+
+
+# Predictive inputs: which source a number comes from, and that draws have the spread and covariance that are said.
+
+
+B, N = "eversion_damping.B", "eversion_damping.n"
+VINE = "24mm-200um-280mm"
+
+
+def trial_inputs(**values: object) -> Trial:
+    known = {"diameter_mm": 25, "thickness_um": 100, "length_mm": 400, "pressure_kPa": 62, **values}
+    return planned_trial({name: str(value) for name, value in known.items()}).trials[0]
+
+
+def number(key: str, vine: str, value: float, sigma: float, half: float = 1.959964) -> dict[str, Any]:
+    return {
+        "parameter": key,
+        "vine": vine,
+        "symbol": key.split(".")[1],
+        "unit": "",
+        "value": value,
+        "sigma": sigma,
+        "low_95": value - half * sigma,
+        "high_95": value + half * sigma,
+        "interval": "linear",
+        "bound": None,
+    }
+
+
+def fitted(half: float = 1.959964, **changes: Any) -> dict[str, Any]:
+    """A fit.json by hand: B 6 ± 0.06, n 0.4 ± 0.01, correlation −0.8; P_y 3.2 ± 0.1 kPa by itself."""
+    entry = {
+        "model": ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"],
+        "refused": None,
+        "numbers": [
+            {**number(B, VINE, 6.0, 0.06), "low_95": 6 * math.exp(-half * 0.01), "high_95": 6 * math.exp(half * 0.01)},
+            number(N, "", 0.4, 0.01, half),
+            number("yield_pressure.P_y", VINE, 3200.0, 100.0, half),
+        ],
+        "covariance": [[0.0036, -0.00048, 0.0], [-0.00048, 1e-4, 0.0], [0.0, 0.0, 1e4]],
+        "spreads": {"pressure": {"value": 0.02, "estimated": True}, "B": {"value": 0.05, "estimated": True}},
+        "trials": {"a": {}, "b": {}},
+        **changes,
+    }
+    return json.loads(json.dumps(entry))
+
+
+def vine_of_the_fit(**values: object) -> Trial:
+    return trial_inputs(**{"diameter_mm": 24, "thickness_um": 200, "length_mm": 280, "pressure_kPa": 28, **values})
+
+
+def test_what_a_person_says_goes_before_the_fit_and_the_fit_before_the_guess() -> None:
+    numbers = fit_numbers(fitted(), "results/a")
+    assert predictive_inputs(vine_of_the_fit(), StatedValues(B=5.0), numbers).medians[B] == 5.0
+    assert predictive_inputs(vine_of_the_fit(), None, numbers).medians[B] == pytest.approx(6.0)
+    assert predictive_inputs(trial_inputs()).medians[B] == pytest.approx(3.32, abs=0.005)
+
+
+def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a_factor_three() -> None:
+    draws = predictive_inputs(trial_inputs()).draw(40_000, seed=1)[YIELD]
+    assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
+
+
+def test_draws_from_a_fit_have_its_covariance() -> None:
+    inputs = predictive_inputs(vine_of_the_fit(), StatedValues(spreads=(0.0, 0.0)), fit_numbers(fitted(), "a"))
+    draws = inputs.draw(40_000, seed=3)
+    found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
+    # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
+    expected = [[1e-4, -0.8e-4, 0.0], [-0.8e-4, 1e-4, 0.0], [0.0, 0.0, 1e-6]]
+    assert found == pytest.approx(np.array(expected), abs=3e-6)
+
+
+def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
+    """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
+    content = fitted(trials={str(k): {} for k in range(13)})
+    content["spreads"]["B"]["estimated"] = False
+    inputs = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "a"))
+    draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
+    assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
+    assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
+
+
+def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess() -> None:
+    inputs = predictive_inputs(
+        trial_inputs(diameter_mm=24, thickness_um=100, length_mm=280), None, fit_numbers(fitted(), "a")
+    )
+    assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
+    assert any("carried over from 24mm-200um-280mm" in words for words in inputs.notes)
+    assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
+
+
+def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> None:
+    numbers = fit_numbers(fitted(), "a")
+    assert predictive_inputs(vine_of_the_fit(yield_pressure_kPa=3), None, numbers).medians[YIELD] == 3200.0
+    assert predictive_inputs(vine_of_the_fit(yield_pressure_kPa=8), None, numbers).medians[YIELD] == 8000.0
+
+
+def test_the_same_seed_gives_the_same_draws_and_vines_share_what_they_have_in_common() -> None:
+    one, other = predictive_inputs(trial_inputs()), predictive_inputs(trial_inputs(length_mm=300))
+    assert np.array_equal(one.draw(50, 7)[B], one.draw(50, 7)[B])
+    assert np.array_equal(one.draw(50, 7)[N], other.draw(50, 7)[N])
+    assert not np.array_equal(one.draw(50, 7, ["guess of B"])[B], other.draw(50, 7, ["guess of B"])[B])
+
+
+def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
+    from lsoda_vine import small_campaign
+
+    found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
+    inputs = predictive_inputs(vine_of_the_fit(), None, found)
+    n = found["n"]
+    draws = inputs.draw(20_000, 1)
+    assert (np.mean(draws[N]), np.std(draws[N])) == pytest.approx((n.value, (n.high - n.low) / 3.92), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "sizes"),
+    [
+        ("air_drag", {}),
+        ("air_drag=0.8", {"air_drag.C_D": Size(0.8, 0.8)}),
+        ("reservoir_depletion=1.4:1", {"reservoir_depletion.gamma": Size(1.0, 1.4)}),
+        ("supply_refill=0.1, 1:1.4", {"supply_refill.tau": Size(0.1, 0.1), "supply_refill.gamma": Size(1.0, 1.4)}),
+    ],
+)
+def test_sizes_of_effects_are_numbers_or_ranges(text: str, sizes: dict[str, Size]) -> None:
+    assert read_sizes(text)[1] == sizes
+
+
+# The guesses for vines nobody has measured: they join what is printed, and say how far they may be off.
+
+
+def printed(scale: int) -> tuple[float, float]:
+    return 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
+
+
+def test_the_guess_is_exact_for_the_largest_printed_vine_and_within_a_fifth_for_all() -> None:
+    assert guess.damping_prior(*printed(4)) == pytest.approx(6.44)
+    for scale, B in published.DAMPING_B.items():
+        assert guess.damping_prior(*printed(scale)) == pytest.approx(B, rel=0.18)
+
+
+def test_the_scatter_is_that_of_the_four_printed_values_by_hand() -> None:
+    # 6.44 (R/4)^1.75 = 0.5692, 1.9146, 3.8927, 6.44 against 0.57, 1.83, 4.54, 6.44; two of four numbers are used up.
+    off = np.log([0.57 / 0.5692, 1.83 / 1.9146, 4.54 / 3.8927, 1.0])
+    assert guess.damping_scatter() == pytest.approx(math.sqrt(np.sum(off**2) / 2), rel=1e-3)
+
+
+def test_the_error_of_the_guess_is_that_of_a_regression_read_off_beyond_its_points() -> None:
+    z = np.log([guess.damping_prior(*printed(scale)) for scale in published.DAMPING_B])
+    design = np.column_stack([np.ones(4), z])
+    for size in ((25e-3, 100e-6), (2.5e-3, 50e-6), (100e-3, 400e-6)):
+        row = np.array([1.0, math.log(guess.damping_prior(*size))])
+        expected = guess.damping_scatter() * math.sqrt(1 + row @ np.linalg.inv(design.T @ design) @ row)
+        assert guess.damping_log_sigma(*size) == pytest.approx(expected)
+
+
+# A pressure in psi under the name of kPa shows in the speeds; other films do not.
+
+
+PSI = 6.894757
+
+
+def campaign(damping: float = 1.0) -> list[tuple[Trial, float]]:
+    """Speeds by F = B·ẋⁿ with the prior's B times `damping`, at three pressures."""
+    pairs = []
+    for i, kPa in enumerate((24, 30, 60)):
+        trial = Trial(
+            name=f"t{i}", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=1e3 * kPa,
+            yield_pressure_Pa=3e3,
+        )  # fmt: skip
+        force = (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
+        tail = (force / (damping * damping_prior(0.012, 1e-4))) ** (1 / published.EXPONENT)
+        pairs.append((trial, tail / 2))
+    return pairs
+
+
+@pytest.mark.parametrize(
+    ("damping", "added_Pa"), [(0.3, 0.0), (1.0, 0.0), (3.0, 0.0), (100.0, 0.0), (100.0, 101_325.0)]
+)
+def test_a_right_campaign_and_a_film_that_no_unit_explains_bring_nothing(damping: float, added_Pa: float) -> None:
+    pairs = [(replace(t, pressure_Pa=t.pressure_Pa + added_Pa), v) for t, v in campaign(damping)]
+    assert pressure_problems(pairs) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "yield_factor", "added_Pa", "suspected"),
+    [
+        (1 / PSI, 1.0, 0.0, "psi, not kPa"),
+        (1 / PSI, 1 / PSI, 0.0, "psi, not kPa"),
+        (PSI, 1.0, 0.0, "kPa, not psi"),
+        (1.0, 1.0, 101_325.0, "absolute pressure"),
+    ],
+)
+def test_a_wrong_unit_of_pressure_is_suspected(
+    factor: float, yield_factor: float, added_Pa: float, suspected: str
+) -> None:
+    wrong = [
+        (replace(t, pressure_Pa=factor * t.pressure_Pa + added_Pa, yield_pressure_Pa=yield_factor * 3e3), v)
+        for t, v in campaign()
+    ]
+    (problem,) = pressure_problems(wrong)
+    assert (problem.severity, suspected in problem.message) == ("warning", True)
+
+
+def test_falling_bodies_are_passed_over() -> None:
+    ball = Trial(name="b", diameter_m=0.02, travel_ratio=1, pressure_Pa=0.0, yield_pressure_Pa=0.0)
+    assert pressure_problems([(ball, 2.0)]) == []
+
+
+# What speaks against a vine: one case a hazard, and none where there is none.
+
+
+SAFE = {
+    "diameter_mm": "18",
+    "thickness_um": "150",
+    "length_mm": "250",
+    "pressure_kPa": "24",
+    "yield_pressure_kPa": "3",
+    "growth_angle_deg": "180",
+    "chamber_l": "50",
+}
+
+
+def prediction(said: StatedValues | None = None, tail_slack: str = "taut", **values: object) -> VinePrediction:
+    from dataclasses import replace
+
+    trial = planned_trial({**SAFE, **{name: str(value) for name, value in values.items()}}).trials[0]
+    return predict_vine(predictive_inputs(replace(trial, tail_slack=tail_slack), said), samples=60)
+
+
+def test_a_sound_vine_has_no_hazard() -> None:
+    assert design_checks(prediction()) == ()
+
+
+PUSHING = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 14, "growth_angle_deg": 0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        # PD/2t = 7.8 MPa at 2 × 150 µm × 7.8 MPa/18 mm = 130 kPa.
+        ({"pressure_kPa": 129}, "130 kPa"),
+        ({"pressure_kPa": 131}, "130 kPa"),
+        ({"pressure_kPa": 2.5}, "2.5 kPa lies below the yield pressure"),
+        (PUSHING, "predicts compression in the tail"),
+        # 60 cm³ of vine at y/L = 0.95 in 1 L: 125.3 kPa/1.060 is 7.1 kPa less, 30 % of 24 kPa; γ = 1.4 makes 41 %.
+        ({"chamber_l": 1}, "reservoir of 1 L loses 30% (slow) to 41% (fast)"),
+    ],
+)
+def test_a_hazard_is_told_once_with_its_number(changes: dict[str, float], told: str) -> None:
+    assert sum(told in one for one in design_checks(prediction(**changes))) == 1
+
+
+def test_a_tail_that_may_go_slack_does() -> None:
+    loose = prediction(tail_slack="free", **PUSHING)
+    found = design_checks(loose)
+    assert loose.final.name == "speed of the leading edge"
+    with pytest.raises(KeyError):
+        loose["ejection speed of the payload"]
+    assert any("slack on the way in every draw" in one for one in found)
+    assert not any("predicts compression in the tail" in one for one in found)
+
+
+def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:
+    inputs = prediction().inputs
+    drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
+    model = make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
+    found = simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
+    speed = np.interp(0.95 * 0.25, found.lead_position_m, found.lead_velocity_m_s)
+    assert drag.final_m_s == pytest.approx(speed, rel=1e-3)
+    assert drag.change < 0
+
+
+def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_those_left_out() -> None:
+    from vinetrack.planning.predictive_inputs import read_sizes
+
+    said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
+    names = {one.effect for one in neglected(prediction(said).inputs, 0.95)}
+    assert "air_drag" not in names
+    assert "inlet_loss" not in names  # no inlet in the sheet
+    assert "payload_drag" not in names  # no payload
+    assert {"reservoir_depletion", "fold_inertia", "gas_inertia"} <= names

@@ -90,12 +90,6 @@ def test_the_verdict_and_how_sure_are_on_a_phones_first_screen(chrome: Chrome, a
         assert chrome.run(f"document.querySelector('{what}').getBoundingClientRect().bottom") < 844
 
 
-def test_the_ladder_is_on_the_first_screen_of_a_desk(chrome: Chrome, address: str) -> None:
-    chrome.size(1400, 900)
-    chrome.open(address)
-    assert chrome.run("document.querySelector('#figure-ladder svg').getBoundingClientRect().bottom") < 900
-
-
 def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) -> None:
     colours = {}
     for scheme in ("light", "dark"):
@@ -113,16 +107,6 @@ def test_page_and_pictures_follow_a_dark_screen(chrome: Chrome, address: str) ->
     assert brightness["light"]["page"] > 700 > 300 > brightness["light"]["text"]
     assert brightness["dark"]["page"] < 120 < 600 < brightness["dark"]["text"]
     assert brightness["dark"]["page"] < brightness["dark"]["grid"] < brightness["dark"]["text"]
-
-
-def test_a_trial_opens_and_shows_its_pictures(chrome: Chrome, address: str) -> None:
-    chrome.size(1400, 900)
-    chrome.open(address)
-    trial = "document.querySelector('details.trial')"
-    assert not chrome.run(f"{trial}.querySelector('svg').checkVisibility()")
-    chrome.run(f"{trial}.querySelector('summary').click()")
-    assert chrome.run(f"{trial}.querySelectorAll('.pair svg').length") == 2
-    assert chrome.run(f"{trial}.querySelector('svg').checkVisibility()")
 
 
 def test_the_clip_can_be_played(chrome: Chrome, address: str) -> None:

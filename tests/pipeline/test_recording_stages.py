@@ -1,4 +1,4 @@
-"""Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused."""
+"""One recording tracked by command, and clips drawn from a results folder."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
+from click.testing import Result
+from plain_scene import Plan, Scene, plain_scene, write_images, write_video
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
@@ -26,8 +28,111 @@ from vinetrack.pipeline.overlays_stage import (
     playback_rate,
     position_to_px,
 )
-from vinetrack.results.folder_layout import Results, ResultsError, read_result
+from vinetrack.results.folder_layout import Results, read_result
 from vinetrack.video.write import write_clip
+
+# `vinetrack track`: one recording to a table, a strip and a clip; every obvious mistake is one sentence.
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return plain_scene(Plan(seed=20940, width=640, height=160, from_px=(30.0, 80.0), end_px=560.0, radius=22.0))
+
+
+@pytest.fixture(scope="module")
+def clip(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_video(tmp_path_factory.mktemp("films") / "vine.mp4", scene.frames, options={"crf": "12"})
+
+
+def track(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["track", *map(str, arguments)], catch_exceptions=False)
+
+
+def refused(*arguments: object) -> str:
+    """What is said on the terminal of a recording that is refused: one sentence, and nothing is written."""
+    done = track(*arguments)
+    assert done.exit_code == 1
+    (sentence,) = done.stderr.strip().splitlines()
+    return sentence
+
+
+def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, clip: Path, tmp_path: Path) -> None:
+    done = track(clip, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.stderr
+    assert f"{len(scene.frames)} frames of 640 × 160 px, 8 bit" in done.stdout
+    assert "Capture rate unknown; it plays at 60 per second" in done.stdout
+    table = pd.read_csv(tmp_path / "out" / "track.csv")
+    assert list(table) == [
+        "frame", "time_s", "edge_px", "edge_sigma_px", "edge_systematic_px", "x_px", "y_px", "flag",
+    ]  # fmt: skip
+    assert len(table) == len(scene.frames)
+    assert table["time_s"].isna().all()
+    off = (table["x_px"] - (scene.edge_px + 30.0))[scene.moving]
+    assert float(off.abs().median()) < 0.5
+    assert table["y_px"].sub(80.0).abs().max() < 1.5
+    assert (tmp_path / "out" / "strip.png").stat().st_size > 10_000
+    with av.open(str(tmp_path / "out" / "overlay.mp4")) as container:
+        assert sum(1 for _ in container.decode(video=0)) > 20
+
+
+def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_path: Path) -> None:
+    done = track(
+        clip, "--capture-fps", 2000, "--exposure-us", 100, "--mm-per-px", 0.25, "--out", tmp_path, "--json", "-"
+    )
+    content = json.loads(done.stdout)
+    assert content["duration_s"] == pytest.approx(len(scene.frames) / 2000)
+    assert content["mm_per_px"] == 0.25
+    assert content["fastest_m_s"] == pytest.approx(20 * 0.25e-3 * 2000, rel=0.05)
+    table = pd.read_csv(content["written"]["table"])
+    assert np.allclose(np.diff(table["time_s"]), 1 / 2000)
+    assert table["time_s"][0] == pytest.approx(50e-6)
+    assert np.allclose(table["position_m"], 0.25e-3 * table["edge_px"])
+    assert np.allclose(table["sigma_m"], 0.25e-3 * table["edge_sigma_px"])
+    assert np.allclose(table["systematic_m"], 0.25e-3 * table["edge_systematic_px"])
+
+
+def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / "experiment.yaml").write_text(
+        "calibration: {kind: two_points, from_px: [10, 20], to_px: [410, 20], length_mm: 200}\n"
+    )
+    done = track(clip, "--calibration", tmp_path, "--out", tmp_path / "out", "--json", "-")
+    assert json.loads(done.stdout)["mm_per_px"] == pytest.approx(0.5)
+
+
+def test_a_folder_of_pictures_is_one_recording(scene: Scene, tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "shots", scene.frames)
+    done = track(folder, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("notes.txt", b"the vine grew well today\n" * 400, "a text, not a recording"),
+        ("noise.mp4", bytes(range(256)) * 40, "not a video"),
+        ("sheet.pdf", b"%PDF-1.7\n" + bytes(range(256)) * 40, "not a video"),
+        ("empty.mp4", b"", "the file is empty"),
+    ],
+)
+def test_what_is_no_film_is_told(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert words in refused(tmp_path / name)
+
+
+def test_a_film_without_motion_is_told(scene: Scene, tmp_path: Path) -> None:
+    still = write_video(tmp_path / "still.mp4", np.repeat(scene.frames[:1], 40, axis=0))
+    assert refused(still, "--out", tmp_path / "out") == "still.mp4: nothing moves in the picture"
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_axis_that_is_none_is_a_fault_of_the_command(clip: Path) -> None:
+    done = track(clip, "--axis", "10,20")
+    assert done.exit_code == 2
+    assert "--axis" in done.stderr
+
+
+# Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused.
+
 
 N, WIDTH, HEIGHT = 60, 480, 120
 MM_PER_PX = 0.5
@@ -108,15 +213,6 @@ def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone(tmp_path: Path) -> 
     assert release_s == pytest.approx(0.021)
 
 
-def test_where_nothing_was_added_there_is_no_model_after(tmp_path: Path) -> None:
-    _, results = campaign(tmp_path)
-    (results / "diagnosis.json").write_text(json.dumps({"effects": []}))
-    edges, release_s = edges_to_draw("a", Results(results), read_result(Results(results).track("a")))
-    assert [edge.name for edge in edges] == ["tracked edge", "initial model"]
-    assert release_s == 0.02
-    assert edges[1].off_mm == pytest.approx(np.full(N, 20.0))
-
-
 def test_no_model_is_drawn_before_the_first_frame_of_its_fit_nor_after_the_last(tmp_path: Path) -> None:
     _, results = campaign(tmp_path)
     path = results / "diagnosis" / "predictions" / "a.csv"
@@ -173,12 +269,6 @@ def test_a_recording_that_cannot_be_drawn_does_not_stop_the_others(tmp_path: Pat
     assert [path.name for path in (results / "overlays").iterdir()] == ["c.mp4"]
 
 
-def test_the_folder_is_there_even_without_a_clip(tmp_path: Path) -> None:
-    experiment, results = campaign(tmp_path)
-    assert draw_overlays(read_experiment(experiment), results, OverlaySettings(of="none")) == []
-    assert (results / "overlays").is_dir()
-
-
 def test_a_clip_begins_a_little_before_the_motion_and_ends_a_little_after() -> None:
     shown = frames_to_show(pd.DataFrame({"edge_px": edge_px()}))
     assert shown.start == 21 - MARGIN_FRAMES
@@ -191,22 +281,3 @@ def test_a_clip_lasts_about_as_long_as_asked_and_plays_at_a_rate_that_players_kn
     assert 4 <= play_fps <= 30
     lasts_s = n_frames / stride / play_fps
     assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)
-
-
-@pytest.mark.parametrize(
-    ("trial", "words"),
-    [("torn", "its edge was not found"), ("nobody", "there are a, b, c, torn")],
-)
-def test_what_cannot_be_drawn_is_said_in_a_sentence(tmp_path: Path, trial: str, words: str) -> None:
-    _, results = campaign(tmp_path)
-    with pytest.raises(ResultsError, match=words):
-        overlay_one(results, trial)
-
-
-def test_the_command_says_where_the_clip_is_or_why_there_is_none(tmp_path: Path) -> None:
-    _, results = campaign(tmp_path)
-    done = CliRunner().invoke(app, ["overlay", str(results), "a", "--seconds", "1"])
-    assert (done.exit_code, done.output) == (0, f"Clip: {results / 'overlays' / 'a.mp4'}\n")
-    wrong = CliRunner().invoke(app, ["overlay", str(tmp_path / "nowhere"), "a"])
-    assert wrong.exit_code == 1
-    assert "provenance.json does not exist" in wrong.output

@@ -1,4 +1,4 @@
-"""`vinetrack predict`: what it says, what it writes, and how it refuses."""
+"""`vinetrack predict` and `vinetrack design`: numbers, files, refusals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,12 @@ import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
 from vinetrack.inference.fit_summary import summary_of
+from vinetrack.pipeline.design_stage import read_list, read_range
 from vinetrack.pipeline.predict_stage import PredictionRequest, inputs_of, read_basis
 from vinetrack.planning.prediction import CURVE_COLUMNS
+
+# `vinetrack predict`: what it says, what it writes, and how it refuses.
+
 
 FAST = ("--diameter-mm", 25, "--thickness-um", 100, "--length-mm", 400, "--pressure-kPa", 62)
 SHEET = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,payload_g\n"
@@ -51,17 +55,6 @@ def test_the_fast_vine_in_a_table_with_units() -> None:
     assert (name, at, unit) == ("speed of the leading edge", "0.95", "m/s")
     low, high = (float(text) for text in band.split(" to "))
     assert low < float(median) < high
-    assert "guess of P_y" in output
-    assert "! the vine is about to burst" in output
-
-
-def test_every_final_speed_says_where_it_was_taken() -> None:
-    assert row(run("predict", *FAST, *FEW, "--final-at-fraction", 0.8).output, "speed of the leading edge")[1] == "0.8"
-
-
-def test_a_payload_has_an_ejection_speed() -> None:
-    output = run("predict", *FAST, "--payload-g", 10, *FEW).output
-    assert row(output, "ejection speed of the payload")[1] == "1"
 
 
 def test_numbers_that_are_given_have_no_error_unless_one_is_given() -> None:
@@ -94,30 +87,16 @@ def test_a_sheet_is_a_row_a_condition(tmp_path: Path) -> None:
     assert "uncertainties included" in output
 
 
-def test_options_of_the_vine_beside_a_sheet_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "trials.csv").write_text(SHEET + "a,24,200,280,14,3,0\n")
-    done = run("predict", tmp_path, "--payload-g", 5)
-    assert done.exit_code == 1
-    assert "--payload-g '5' is given in addition to a sheet: write it in the sheet" in done.output
-
-
 def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
     vine = ("--diameter-mm", 24, "--thickness-um", 200, "--length-mm", 280, "--pressure-kPa", 25)
     output = run("predict", *vine, "--fit", fitted, *FEW).output
     assert float(row(output, "n ")[1]) == pytest.approx(N_TRUE, abs=0.02)
     assert float(row(output, "B ")[1]) == pytest.approx(6.4, rel=0.06)
-    assert f"B, n, P_y of {fitted.as_posix()}, with their covariance" in output
     assert "guess" not in output
 
 
-def test_a_vine_that_the_fit_does_not_know_is_said_to_be_guessed(fitted: Path) -> None:
-    output = run("predict", *FAST, "--fit", fitted, *FEW).output
-    assert "no vine of" in output
-    assert "scaled from 18mm-150um-210mm" in output
-
-
 def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_path: Path) -> None:
-    own = Path(__file__).parents[1] / "docs" / "own_effect.md"
+    own = Path(__file__).parents[2] / "docs" / "own_effect.md"
     code = own.read_text().split("```python\n")[1].split("```")[0]
     experiment, results = tmp_path / "mine", tmp_path / "results"
     experiment.mkdir()
@@ -133,41 +112,25 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     done = run("predict", *FAST, "--fit", results)
     assert done.exit_code == 1
-    assert "spring_line, an effect of its experiment, which is no longer in" in done.output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "status"),
     [
-        (("--diameter-mm", 25), "--thickness-um is missing"),
-        ((*FAST[:-1], 62000), "62000 Pa is 62 kPa"),
-        ((*FAST, "--effect", "air_drg"), "Did you mean 'air_drag'"),
-        (
-            (*FAST, "--effect", "reservoir_depletion"),
-            "reservoir_depletion needs it: give it as --chamber-l",
-        ),
-        ((*FAST, "--fit", "nowhere"), "nowhere/fit.json does not exist"),
-        ((*FAST, "--figure", "a.doc"), "end it in one of .png, .svg, .pdf"),
-        ((*FAST, "--chamber-l", 0), "--chamber-l '0' is not above 0 litres"),
+        (("--diameter-mm", 25), 1),
+        ((*FAST[:-1], 62000), 1),
+        ((*FAST, "--effect", "air_drg"), 1),
+        ((*FAST, "--effect", "reservoir_depletion"), 1),
+        ((*FAST, "--fit", "nowhere"), 1),
+        ((*FAST, "--figure", "a.doc"), 1),
+        ((*FAST, "--chamber-l", 0), 1),
+        ((*FAST, "--tail-slack", "loose"), 2),
     ],
 )
-def test_refusals_are_sentences(arguments: tuple[object, ...], words: str) -> None:
+def test_predict_refuses_with_its_exit_code(arguments: tuple[object, ...], status: int) -> None:
     done = run("predict", *arguments)
-    assert done.exit_code == 1
-    assert words in done.output
+    assert done.exit_code == status
     assert "Traceback" not in done.output
-
-
-def test_an_unknown_way_of_the_tail_is_refused() -> None:
-    done = run("predict", *FAST, "--tail-slack", "loose")
-    assert done.exit_code == 2
-    assert "neither taut nor free" in done.output
-
-
-def test_a_vine_that_never_gets_there_says_never() -> None:
-    output = run("predict", *FAST[:-1], 1, "--yield-pressure-kPa", 3, *FEW).output
-    assert row(output, "time to get there")[2] == "never"
-    assert "lies below the yield pressure" in output
 
 
 def test_python_predicts_what_the_command_does() -> None:
@@ -176,3 +139,77 @@ def test_python_predicts_what_the_command_does() -> None:
     shown = row(run("predict", *FAST, *FEW).output, "speed of the leading edge")[2]
     assert float(shown) == pytest.approx(prediction.final.median, rel=0.01)
     assert math.isnan(prediction["hoop stress PD/2t"].y_over_L)
+
+
+# `vinetrack design …`: what it says, what it writes, and how it refuses.
+
+
+INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--chamber-l", 0.003534)
+RESERVOIR = ("reservoir", *INJECTOR, "--thickness-um", 50)
+
+
+def run_design(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["design", *map(str, arguments)], catch_exceptions=False)
+
+
+def cells(output: str, begins: str) -> list[str]:
+    line = next(line for line in output.splitlines() if line.strip().startswith(begins))
+    return [cell.strip() for cell in line.split("  ") if cell.strip()]
+
+
+def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -> None:
+    done = run_design(
+        "vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--figure", tmp_path / "a.svg"
+    )
+    assert done.exit_code == 0, done.output
+    film, diameter, length, pressure, hoop, *_ = cells(done.output, "100")
+    assert (film, diameter, length, pressure, hoop) == ("100", "25", "400", "62", "7.75")
+    assert (tmp_path / "a.svg").read_text().startswith("<?xml")
+
+
+def test_the_injectors_chamber_loses_5_per_cent_of_gauge_and_not_1_7(tmp_path: Path) -> None:
+    done = run_design("reservoir", *INJECTOR, "--figure", tmp_path / "a.png")
+    assert done.exit_code == 0, done.output
+    assert cells(done.output, "asked about")[1:] == ["3.53 mL", "5.3", "7.4"]
+    assert cells(done.output, "needed if slow")[2] == "5.0"
+    assert "sweeps 0.0614 mL" in done.output
+    assert "speed" not in done.output
+    assert (tmp_path / "a.png").exists()
+
+
+def test_the_answers_of_both_designs_are_numbers_in_json(tmp_path: Path) -> None:
+    run_design("reservoir", *INJECTOR, "--json", tmp_path / "r.json")
+    asked = next(e for e in json.loads((tmp_path / "r.json").read_text())["chambers"] if e["chamber"] == "asked about")
+    assert asked["volume_l"] == pytest.approx(0.003534)
+    assert list(asked["loss_of_gauge_pressure"].values()) == pytest.approx([0.053, 0.074], abs=5e-4)
+    run_design("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--json", tmp_path / "v.json")
+    best = json.loads((tmp_path / "v.json").read_text())["films"][0]
+    assert (best["thickness_um"], best["diameter_mm"]) == pytest.approx((100, 25), rel=0.01)
+    speed = best["final_speed_m_s"]
+    assert speed["low_90"] < speed["median"] < speed["high_90"]
+
+
+MISSING_OR_WRONG = (
+    ("vine",),
+    ("vine", "--pressure-kPa", 62000),
+    ("vine", "--pressure-kPa", 2, "--yield-pressure-kPa", 3),
+    ("vine", "--pressure-kPa", 62, "--burst-fraction", 0.05, "--diameter-mm", 25, "--yield-pressure-kPa", 30),
+    *(("vine", "--pressure-kPa", 62, "--diameter-mm", text) for text in ("25:5", "5:15:25", "5000")),
+    *(("vine", "--pressure-kPa", 62, "--films-um", text) for text in ("2000", "thin", ",")),
+    ("vine", "--pressure-kPa", 62, "--effect", "reservoir_depletion"),
+    ("reservoir", "--diameter-mm", 25),
+    (*RESERVOIR, "--effect", "inlet_loss"),
+)
+
+
+@pytest.mark.parametrize("arguments", MISSING_OR_WRONG)
+def test_design_refuses_with_exit_code_1(arguments: tuple[object, ...]) -> None:
+    done = run_design(*arguments)
+    assert done.exit_code == 1
+    assert "internal error of the program" not in done.output
+
+
+def test_ranges_and_lists_are_in_si_and_judged_as_cells_are() -> None:
+    assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
+    assert read_range("pressure_kPa", "62") == (62e3, 62e3)
+    assert read_list("thickness_um", "50, 100,50") == pytest.approx((50e-6, 100e-6))

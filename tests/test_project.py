@@ -1,4 +1,4 @@
-"""Setting up from a bare clone, as far as it can be tried without the network: the make targets and the lock."""
+"""The make targets, the lock, the file for hosted machines and Snakemake's profiles name what is here."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
+
+# Setting up from a bare clone, as far as it can be tried without the network: the make targets and the lock.
+
 
 ROOT = Path(__file__).parents[1]
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 DOCS_LOCK = (ROOT / "requirements-docs.lock").read_text(encoding="utf-8")
 MAKE = shutil.which("make")
-
 needs_make = pytest.mark.skipif(MAKE is None, reason="needs make")
 
 
@@ -32,31 +35,6 @@ def test_help_is_the_default_and_lists_every_target(arguments: tuple[str, ...]) 
     assert done.returncode == 0
     targets = {"help", "venv", "demo", "guide", "test", "test-all", "lint", "docs"}
     assert {line.split()[1] for line in done.stdout.splitlines()} == targets
-
-
-@needs_make
-def test_without_a_python_make_says_what_to_install(tmp_path: Path) -> None:
-    shutil.copy(ROOT / "Makefile", tmp_path)
-    (tmp_path / "requirements.lock").touch()
-    (tmp_path / "pyproject.toml").touch()
-    (tmp_path / "bin").mkdir()
-    done = make(tmp_path, "demo", path=str(tmp_path / "bin"))
-    assert done.returncode != 0
-    assert "needs Python 3.11 or newer" in done.stderr
-    assert "make PYTHON=" in done.stderr
-    assert not (tmp_path / ".venv").exists()
-
-
-@needs_make
-def test_an_old_python_is_passed_over(tmp_path: Path) -> None:
-    shutil.copy(ROOT / "Makefile", tmp_path)
-    (tmp_path / "requirements.lock").touch()
-    (tmp_path / "pyproject.toml").touch()
-    (tmp_path / "bin").mkdir()
-    old = tmp_path / "bin" / "python3"
-    old.write_text("#!/bin/sh\nexit 1\n")
-    old.chmod(0o755)
-    assert "found none" in make(tmp_path, "venv", path=str(tmp_path / "bin")).stderr
 
 
 @needs_make
@@ -88,11 +66,6 @@ def test_everything_the_project_asks_for_is_locked() -> None:
     assert names - set(locked()) - set(locked(DOCS_LOCK)) == set()
 
 
-def test_the_site_is_built_with_the_versions_that_the_package_has() -> None:
-    site = locked(DOCS_LOCK)
-    assert {name: version for name, version in locked().items() if name in site and site[name] != version} == {}
-
-
 def test_every_locked_version_has_hashes() -> None:
     entries = re.split(r"^(?=[a-z0-9])", LOCK, flags=re.MULTILINE)[1:]
     assert len(entries) == len(locked()) > 80
@@ -107,3 +80,52 @@ def test_continuous_integration_is_a_sound_script() -> None:
     script = ROOT / ".ci" / "run"
     assert script.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", str(script)], check=True)
+
+
+# The file for hosted machines and the profiles of Snakemake name what is here: versions, files, targets, options.
+
+
+TEXT = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+JOBS = yaml.safe_load(TEXT)["jobs"]
+
+
+def commands() -> str:
+    """Every line that a job runs."""
+    return "\n".join(step["run"] for job in JOBS.values() for step in job["steps"] if "run" in step)
+
+
+def test_versions_of_python_begin_with_the_oldest_that_is_supported() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["requires-python"] == f">={JOBS['tests']['strategy']['matrix']['python'][0]}"
+
+
+def test_files_extras_and_targets_that_jobs_name_exist() -> None:
+    run = commands()
+    for path in re.findall(r"[\w./-]+\.(?:py|lock)\b", run):
+        assert (ROOT / path).is_file(), path
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for line in re.findall(r"^make (.+)$", run, re.MULTILINE):
+        assert set(line.split()) <= targets
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for named in re.findall(r'"\.\[(.+?)\]"', run):
+        assert set(named.split(",")) <= set(extras)
+
+
+@pytest.mark.parametrize("profile", ["default", "slurm"])
+def test_profiles_hold_options_that_snakemake_knows(profile: str) -> None:
+    from snakemake.cli import get_argument_parser
+
+    if profile == "slurm":
+        pytest.importorskip("snakemake_executor_plugin_slurm")
+    known = {word.lstrip("-") for action in get_argument_parser()._actions for word in action.option_strings}
+    settings = yaml.safe_load((ROOT / "profiles" / profile / "config.yaml").read_text(encoding="utf-8"))
+    assert set(settings) <= known
+
+
+def test_the_profile_for_a_cluster_names_rules_that_are_there() -> None:
+    settings = yaml.safe_load((ROOT / "profiles" / "slurm" / "config.yaml").read_text(encoding="utf-8"))
+    workflow = (ROOT / "vinetrack" / "pipeline" / "Snakefile").read_text(encoding="utf-8")
+    rules = set(re.findall(r"^ *rule (\w+):", workflow, re.MULTILINE))
+    grouped = dict(entry.split("=") for entry in settings["groups"])
+    assert {*settings["set-resources"], *grouped} <= rules
+    assert {entry.split("=")[0] for entry in settings["group-components"]} == set(grouped.values())

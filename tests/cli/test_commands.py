@@ -1,0 +1,285 @@
+"""The command line: exit codes and files written; `diagnose`, `add` and `propose` on campaigns of known truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from explorer_campaign import FEW_CANDIDATES
+from grown import FORCES, effect_file, grown
+from grown import sheet as sheet_command
+from hidden_truth import sheet
+from typer.testing import CliRunner
+
+import vinetrack
+from vinetrack.cli.main import app
+from vinetrack.diagnosis import propose as search
+from vinetrack.diagnosis.propose import add, propose
+from vinetrack.dynamics.model import Model
+from vinetrack.effects import own_effects
+from vinetrack.experiment.settings import read_experiment_settings
+from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow, write_experiment
+from vinetrack.pipeline.workflow import command_for_results
+
+# The command line: exit codes, sentences, no tracebacks.
+
+
+SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20))
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n") -> Path:
+    folder.mkdir()
+    (folder / "trials.csv").write_text(SHEET + rows)
+    (folder / "a.csv").write_text(TRACK)
+    return folder
+
+
+def test_a_page_ends_without_waiting_for_its_thread() -> None:
+    program = (
+        "import atexit, sys, threading, time; atexit.register(print, 'waited')\n"
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True, name='vinetrack-fit').start()\n"
+        "from vinetrack.cli.main import main; sys.argv = ['vinetrack', '--version']; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, f"vinetrack {vinetrack.__version__}\n")
+
+
+def test_check_of_a_sound_experiment_exits_with_0(tmp_path: Path) -> None:
+    done = run("check", experiment(tmp_path / "v"))
+    assert done.exit_code == 0
+
+
+def test_check_of_any_error_exits_with_1_and_names_file_trial_and_column(tmp_path: Path) -> None:
+    done = run("check", experiment(tmp_path / "v", "a,a.csv,12,100,300,9999,3\n"))
+    assert done.exit_code == 1
+    assert all(word in done.output for word in ("trials.csv", "trial a", "pressure_kPa", "9999"))
+
+
+def test_check_says_a_problem_that_two_hundred_trials_share_once(tmp_path: Path) -> None:
+    rows = "".join(f"t{i},a.csv,12,100,300,9999,3\n" for i in range(200))
+    done = run("check", experiment(tmp_path / "v", rows))
+    assert done.exit_code == 1
+    assert "t0 and 199 more" in done.output
+    assert len(done.output.splitlines()) == 2
+
+
+def test_effects_lists_every_effect_with_its_formula_and_units() -> None:
+    from vinetrack.effects import catalogue
+
+    output = run("effects").output
+    for effect in catalogue().values():
+        assert effect.name in output
+        assert effect.formula in output
+    assert "N·(s/m)ⁿ" in output
+
+
+@pytest.mark.parametrize(("settings", "status"), [("{}", 1), ("seed=3", 2), ('{"damping": {"resamples": 3}}', 1)])
+def test_a_stage_that_cannot_begin_exits_with_its_code(tmp_path: Path, settings: str, status: int) -> None:
+    """Without its input, with settings that are no JSON, with a setting out of bounds."""
+    done = run("damping", tmp_path, "--settings", settings)
+    assert done.exit_code == status
+    assert "Traceback" not in done.output
+
+
+def test_a_fault_of_the_program_is_one_sentence_and_its_traceback_is_in_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_down(*_: object) -> None:
+        raise RuntimeError("the bottom fell out")
+
+    monkeypatch.setattr("vinetrack.pipeline.tracks_stage.fit_law", break_down)
+    done = run("damping", tmp_path, "--log", tmp_path / "logs" / "d.log")
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output
+    assert "RuntimeError: the bottom fell out" in (tmp_path / "logs" / "d.log").read_text()
+
+
+def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def break_down(*_: object) -> None:
+        raise ZeroDivisionError("unforeseen")
+
+    monkeypatch.setattr("vinetrack.kinematics.summary.summarise_trial", break_down)
+    folder = experiment(tmp_path / "v")
+    done = run("tracks", folder, tmp_path / "r", "--log", tmp_path / "t.log")
+    assert done.exit_code == 0
+    assert "1 trials, 1 failed" in run("gather", folder, tmp_path / "r").output
+    assert "ZeroDivisionError: unforeseen" in (tmp_path / "t.log").read_text()
+
+
+# `vinetrack diagnose` and `vinetrack add` from a folder of tracks to files and sentences.
+
+
+LADDER = (
+    "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
+)
+
+
+def run_commands(*arguments: str | Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, [str(one) for one in arguments])
+    return done.exit_code, done.output
+
+
+@pytest.fixture(scope="module")
+def experiment_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hidden") / "campaign"
+    trials = sheet()[6:]  # one vine at three pressures, twice each
+    nature = GroundTruth(
+        effects=(*BASE, "reservoir_depletion"),
+        values={**damping_values(trials), "reservoir_depletion.gamma": 1.2},
+        damping_scatter=0.02,
+        pressure_scatter=0.005,
+        seed=7200,
+    )
+    write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\n" + FEW_CANDIDATES)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(experiment_commands: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("out") / "campaign"
+    for stage in (("tracks",), ("gather",), ("model",)):
+        if stage == ("model",):
+            assert run_commands("damping", folder)[0] == 0
+        code, output = run_commands(*stage, experiment_commands, folder)
+        assert code == 0, output
+    assert run_commands("diagnosis", experiment_commands, folder)[0] == 0
+    (folder / "provenance.json").write_text(json.dumps({"experiment": str(experiment_commands)}))
+    return folder
+
+
+def test_straight_from_a_folder_of_tracks_to_one_file_and_no_other(experiment_commands: Path, tmp_path: Path) -> None:
+    before = sorted(experiment_commands.rglob("*"))
+    code, output = run_commands("diagnose", experiment_commands, "--json", tmp_path / "answer.json")
+    assert code == 0, output
+    assert output.startswith("missing: reservoir_depletion is missing")
+    answer = json.loads((tmp_path / "answer.json").read_text())
+    assert answer["effects"] == ["reservoir_depletion"]
+    assert answer["final_verdict"] == "adequate"
+    assert [path.name for path in tmp_path.iterdir()] == ["answer.json"]
+    assert sorted(experiment_commands.rglob("*")) == before
+
+
+def test_the_stage_writes_the_contract(results: Path) -> None:
+    answer = json.loads((results / "diagnosis.json").read_text())
+    assert answer["verdict"] == "missing"
+    assert {"effects", "answer_set", "explanation", "rounds", "final_verdict", "parameters", "cosines", "drift"} <= set(
+        answer
+    )
+    assert "next_experiment" in answer
+    with (results / "ladder.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert (results / "ladder.csv").read_text().splitlines()[0] == LADDER
+    assert [row["added"] for row in rows] == ["", "reservoir_depletion"]
+    assert float(rows[1]["rms_left_out_m"]) < 0.5 * float(rows[0]["rms_left_out_m"])
+
+
+def test_every_trial_has_what_both_models_say_of_it(results: Path) -> None:
+    paths = sorted((results / "diagnosis" / "predictions").glob("*.csv"))
+    assert len(paths) == 6
+    assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
+
+
+def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    added = []
+    monkeypatch.setattr(search, "add", lambda *given: added.append(add(*given)) or added[-1])
+    code, output = run_commands("add", "air_drag", results)
+    assert code == 0, output
+    assert re.search(r"Δχ² = -", output) is None
+    assert "highest pressure" in output
+    rows = list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
+    assert [row["added"] for row in rows] == ["", "reservoir_depletion", "air_drag"]
+    monkeypatch.setattr(search, "add", lambda *_: added[0])  # the same once more, without the fits
+    assert run_commands("add", "air_drag", results)[0] == 0
+    assert len(list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))) == 3
+
+
+def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experiment_commands: Path) -> None:
+    code, output = run_commands("add", "reservoir_depletion", results, "--save")
+    assert code == 0, output
+    assert "reservoir_depletion" in (experiment_commands / "experiment.yaml").read_text()
+    assert command_for_results(experiment_commands, results) in output.replace("\n", " ")
+    code, output = run_commands("add", "reservoir_depletion", results)
+    assert code == 1
+
+
+@pytest.mark.parametrize("arguments", [("diagnose", "nowhere"), ("add", "air_drag", "nowhere"), ("check", "nowhere")])
+def test_a_wrong_folder_exits_with_1(arguments: tuple[str, ...]) -> None:
+    assert run(*arguments).exit_code == 1
+
+
+# `vinetrack propose`: from a verdict of `unexplained` to an effect file that `vinetrack add` takes.
+
+
+def run_command(*arguments: str | Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, [str(one) for one in arguments])
+    return done.exit_code, done.output
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
+    place = tmp_path_factory.mktemp("lawful")
+    values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
+    virtual = grown(sheet_command((4,), replicates=1), 103, own=[effect_file(place)], values=values)
+    experiment, results = place / "bench", place / "results"
+    write_experiment(virtual, experiment, "candidates: [air_drag]\n")
+    for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):
+        code, output = run_command(*stage)
+        assert code == 0, output
+    for stage in ("model", "diagnosis"):
+        code, output = run_command(stage, experiment, results)
+        assert code == 0, output
+    (results / "provenance.json").write_text(json.dumps({"experiment": str(experiment)}))
+    return experiment, results
+
+
+def test_a_law_is_written_beside_the_experiment_and_added(
+    bench: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment, results = bench
+    assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
+    proposals = []
+    monkeypatch.setattr(search, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
+    code, output = run_command("propose", results)
+    assert code == 0, output
+    path = experiment / "proposed_time.py"
+    effect = own_effects([path])["proposed_time"]
+    assert "4 trials of bench" in effect.text
+    monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
+    code, output = run_command("propose", results)
+    assert code == 1
+    assert "exists already" in output
+    elsewhere = shutil.copy(path, tmp_path)
+    code, output = run_command("add", elsewhere, results, "--save")
+    assert code == 1
+    # Without the rest of the catalogue, with which this effect would be compiled once more.
+    monkeypatch.setattr("vinetrack.diagnosis.ladder.host_for", lambda model, more: Model((*model.effects, *more)))
+    code, output = run_command("add", path, results, "--save")
+    assert code == 0, output
+    settings = read_experiment_settings(experiment / "experiment.yaml")
+    assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
+
+
+def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Path], tmp_path: Path) -> None:
+    copy = shutil.copytree(bench[1], tmp_path / "results")
+    diagnosis = json.loads((copy / "diagnosis.json").read_text())
+    for asked in diagnosis["rounds"]:
+        asked["verdict"] = "adequate"
+    (copy / "diagnosis.json").write_text(json.dumps(diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}))
+    code, output = run_command("propose", copy)
+    assert code == 1
+    assert "Traceback" not in output

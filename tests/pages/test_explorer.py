@@ -1,0 +1,395 @@
+"""The explorer below its page: predictions of a choice, background fits, recordings, its local server."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import socket
+import threading
+import time
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pandas as pd
+import pytest
+from explorer_campaign import DEMO, SMALL, make_experiment, make_results, write_bars
+from served import Served
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
+from tornado.ioloop import IOLoop
+from tornado.websocket import websocket_connect
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.effects import Parameter
+from vinetrack.inference.optimiser import Step, Watch
+from vinetrack.laboratory.tracks import grow, read_ground_truth
+from vinetrack.pages.campaign import (
+    BackgroundFit,
+    Campaign,
+    FitJob,
+    Fitted,
+    choice_in_use,
+    commands,
+    first_fit,
+    fit_choice,
+    likelihood_change_text,
+    overall_m,
+    predict_choice,
+    slider_range,
+)
+from vinetrack.pages.explorer_server import address as where
+from vinetrack.pages.explorer_server import open_campaign, start_server
+from vinetrack.pages.film_panel import DecodedRecording, RecordingView, recording_view
+from vinetrack.results.folder_layout import Results, ResultsError
+from vinetrack.video.axis import Axis
+
+# What a choice predicts, and the lines, labels and commands that follow from it.
+
+
+GAMMA = "reservoir_depletion.gamma"
+
+
+def test_the_origin_behind_a_door_is_that_of_the_comparison(tmp_path: Path) -> None:
+    """No point of a doubtful rest is fitted, but it still determines the origin."""
+    experiment = make_experiment(tmp_path / "vines", SMALL[:4])
+    for path in (experiment / "tracks").iterdir():
+        table = pd.read_csv(path)
+        table.assign(sigma_m=np.where(table["time_s"] < 0.015, 2e-3, 1e-4)).to_csv(path, index=False)
+    door = open_campaign(make_results(experiment, tmp_path / "results"))
+    table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
+    prediction = predict_choice(door, choice_in_use(door))
+    for seen, predicted in zip(door.trials, prediction.trials, strict=True):
+        assert seen.data.imprecise_rest is not None
+        assert predicted.origin_m == seen.origin_m
+    assert prediction.errors_m == pytest.approx(table["rms_position_m"].to_dict(), rel=1e-6)
+
+
+def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
+    start = choice_in_use(campaign)
+    none = predict_choice(campaign, start.with_effect("air_drag").with_size("air_drag.C_D", 0.0))
+    for bare, with_it in zip(predict_choice(campaign, start).trials, none.trials, strict=True):
+        np.testing.assert_allclose(with_it.predicted_position_m, bare.predicted_position_m, atol=1e-9)
+
+
+def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    shutil.copytree(campaign.folder, folder)
+    (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
+    bare = open_campaign(folder)
+    assert bare.refused == "no reason"
+    assert bare.floors_m == {}
+    assert choice_in_use(bare).numbers["eversion_damping.n"] == 0.37
+    true = {one.stated.name: one for one in grow(bare.experiment.trials, read_ground_truth(DEMO))}
+    assert len(bare.trials) == 6
+    for seen in bare.trials:
+        # The last frame at rest, where 0.1 mm of noise hides the first two milliseconds of the motion.
+        assert seen.release_s == pytest.approx(true[seen.name].release_s, abs=2.5e-3)
+        assert seen.origin_m == pytest.approx(true[seen.name].origin_m, abs=1e-4)
+
+
+def test_a_folder_without_usable_trials_is_refused(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    shutil.copytree(campaign.folder, folder)
+    for path in (folder / "tracks").iterdir():
+        path.write_text(path.read_text().splitlines()[0] + "\n")
+    with pytest.raises(ResultsError):
+        open_campaign(folder)
+
+
+def test_slider_ranges_include_zero_the_plausible_range_and_the_fitted_value() -> None:
+    drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
+    assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
+    low, high = slider_range("air_drag.C_D", drag, 17.0)
+    assert low == 0.0
+    assert 17.0 < high < 200.0
+    assert slider_range("air_drag.C_D", drag, 200.0)[1] == 200.0
+    gauge = Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3))
+    assert slider_range("pressure_gauge.delta", gauge, -3e3) == (-3e3, 2e3)
+    damping = Parameter("B", "B", "N·(s/m)ⁿ", 3.0, bounds=(0.0, math.inf), shared="vine")
+    assert slider_range("eversion_damping.B", damping, 6.0) == (0.0, 12.0)
+
+
+def test_the_page_shows_the_command_that_reproduces_it(campaign: Campaign) -> None:
+    start = choice_in_use(campaign)
+    folder = campaign.folder.as_posix()
+    assert commands(campaign, start, fitted=True) == [f"vinetrack compare {folder}"]
+    more = start.with_effect("reservoir_depletion").with_effect("leak")
+    assert commands(campaign, more, fitted=True, save=True) == [
+        f"vinetrack add reservoir_depletion {folder} --save",
+        f"vinetrack add leak {folder} --save",
+    ]
+    assert commands(campaign, more, fitted=False) == []
+    assert commands(replace(campaign, in_use=(*campaign.in_use, "leak")), start, fitted=True) == []
+
+
+# Background fits: the missing effect is found, progress reported, a fit cancelled, errors given in a sentence.
+
+
+@pytest.fixture(scope="module")
+def first(campaign: Campaign) -> Fitted:
+    return first_fit(campaign, choice_in_use(campaign))
+
+
+def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted) -> None:
+    for name, value in campaign.numbers.items():
+        assert first.choice.numbers[name] == pytest.approx(value, rel=0.02)
+
+
+def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campaign: Campaign, first: Fitted) -> None:
+    steps: list[Step] = []
+    choice = first.choice.with_effect("reservoir_depletion")
+    found = fit_choice(campaign, first.fit, choice, steps.append)
+    assert steps
+    assert found.choice.numbers[GAMMA] == pytest.approx(1.4, abs=0.05)
+    number = found.number(GAMMA)
+    assert number is not None
+    assert number.low <= 1.4
+    after, before = (overall_m(one.prediction.errors_m, campaign.conditions) for one in (found, first))
+    floor = overall_m(campaign.floors_m, campaign.conditions)
+    assert after < 0.5 * before
+    assert after < 1.3 * floor
+    assert likelihood_change_text(first.fit, found.fit).endswith("for 1 parameter more.")
+    assert "fell" in likelihood_change_text(first.fit, found.fit)
+    back = fit_choice(campaign, found.fit, found.choice.with_effect("reservoir_depletion", False))
+    assert "rose" in likelihood_change_text(found.fit, back.fit)
+    assert overall_m(back.prediction.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
+
+
+class RecordedCallbacks:
+    """Records the callbacks of a job."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+        self.results: list[Fitted] = []
+        self.reasons: list[str] = []
+
+    def job(self, work: object) -> FitJob:
+        return FitJob(
+            work, on_progress=self.steps.append, on_success=self.results.append, on_failure=self.reasons.append
+        )  # type: ignore[arg-type]
+
+
+def test_a_job_reports_progress_and_its_result(campaign: Campaign, first: Fitted) -> None:
+    recorded = RecordedCallbacks()
+    job = recorded.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
+    job.wait(60)
+    assert not job.running
+    assert recorded.steps
+    assert recorded.results[0].fit.model.names == first.fit.model.names
+
+
+def test_a_cancelled_job_calls_no_callback() -> None:
+    recorded, started = RecordedCallbacks(), threading.Event()
+
+    def endless(watch: Watch) -> Fitted:
+        started.set()
+        while True:
+            watch(Step(1, {}, 1.0))
+            time.sleep(0.01)
+
+    job = recorded.job(endless)
+    started.wait(10)
+    job.cancel()
+    assert not job.running
+    job.wait(10)
+    count = len(recorded.steps)
+    time.sleep(0.05)
+    assert len(recorded.steps) == count
+    assert not recorded.results
+    assert not recorded.reasons
+
+
+def test_the_background_fit_runs_once_for_all_pages(campaign: Campaign) -> None:
+    background = BackgroundFit(campaign)
+    news: list[bool] = []
+
+    def hear() -> None:
+        news.append(background.fitted is not None)
+
+    background.add_listener(hear)
+    background.begin().wait(120)
+    assert background.failure == ""
+    assert not background.running
+    assert background.prediction is not None
+    assert background.fitted is not None
+    assert background.step is not None
+    assert len(news) > 2
+    assert news[-1]
+    background.remove_listener(hear)
+    background.remove_listener(hear)
+
+
+# A recording in the explorer: positions of edges in its picture, and the message for a trial without one.
+
+
+def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
+    """A bar whose right end moves by 8 px per frame."""
+    return write_bars(path, 20 + 8.0 * np.arange(count), width, height)
+
+
+def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
+    told: list[int] = []
+    film = DecodedRecording(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
+    assert film.complete
+    assert film.error == ""
+    assert (film.count, film.expected, film.shape, film.scale) == (30, 30, (96, 320), 1.0)
+    assert told[0] == 1
+    assert told[-1] == 30
+    row = film.picture(10)[48]
+    assert abs(int(np.argmax(row < 120)) - 100) <= 1
+
+
+def test_a_file_that_is_not_a_recording_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"not a film")
+    film = DecodedRecording(tmp_path / "a.mp4").decode()
+    assert film.complete
+    assert film.count == 0
+    assert "a.mp4" in film.error
+
+
+def view(angle: float = 0.0) -> RecordingView:
+    frames = np.arange(20.0)
+    edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
+    return RecordingView(
+        trial="a",
+        path=Path("a.mp4"),
+        axis=Axis((100.0, 50.0), (100.0 + 300 * float(np.cos(angle)), 50.0 + 300 * float(np.sin(angle)))),
+        half_width_px=10.0,
+        time_s=frames / 1000,
+        edge_px=edge_px,
+        lead_position_m=1e-3 * (edge_px - 10),
+        shake_px=np.where(frames == 3, 2.0, 0.0),
+    )
+
+
+def test_positions_of_the_model_are_mapped_to_pixels_by_the_track() -> None:
+    one = view()
+    along = one.along_px(np.array([0.0, 0.0125, 0.1, -0.01]))
+    np.testing.assert_allclose(along, [10.0, 22.5, 110.0, 0.0], atol=1e-9)
+
+
+def test_an_edge_is_drawn_across_the_axis() -> None:
+    assert view().across(20.0) == ((120.0, 120.0), (60.0, 40.0))
+    (xs, ys) = view(angle=np.pi / 2).across(20.0)
+    np.testing.assert_allclose(xs, (90.0, 110.0))
+    np.testing.assert_allclose(ys, (70.0, 70.0))
+
+
+def test_an_edge_follows_a_shaken_picture() -> None:
+    assert view().across(20.0, 3) == view().across(22.0)
+    assert view().across(20.0, 4) == view().across(20.0)
+
+
+def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
+    seen = campaign.trials[0]
+    results = Results(tmp_path)
+    trial = replace(seen.data.trial, video=tmp_path / "gone.mp4", track=None)
+    assert "no longer exists" in str(recording_view(results, trial))
+    trial = replace(trial, video=write_clip(tmp_path / "a.mp4", count=2))
+    assert "does not exist" in str(recording_view(results, trial))
+    results.track(trial.name).parent.mkdir()
+    results.analysed(trial.name).parent.mkdir()
+    results.track(trial.name).write_text(
+        "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag\n0,0,5,0,0,\n"
+    )
+    results.analysed(trial.name).write_text("{}")
+    assert "run snakemake again" in str(recording_view(results, trial))
+    axis = {"from_px": [0, 10], "to_px": [300, 10], "width_px": None}
+    results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
+    found = recording_view(results, trial)
+    assert isinstance(found, RecordingView)
+    assert found.half_width_px == pytest.approx(15.0)
+    assert (found.axis.from_px, found.axis.to_px) == ((0.0, 10.0), (300.0, 10.0))
+    bent = {"from_px": [0, 10], "via_px": [[100, 40]], "to_px": [300, 10], "width_px": 20}
+    results.analysed(trial.name).write_text(json.dumps({"axis": bent}))
+    found = recording_view(results, trial)
+    assert isinstance(found, RecordingView)
+    (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px)
+    middle, direction = found.axis.points(0.5 * found.axis.length_px), np.array([y0 - y1, x1 - x0]) / 30
+    assert np.allclose([(x0 + x1) / 2, (y0 + y1) / 2], middle)
+    assert np.allclose(direction, found.axis.direction_at(0.5 * found.axis.length_px), atol=1e-9)
+
+
+# The command: refusals, and a local server that Ctrl-C ends.
+
+
+def refused(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output
+    return done.output
+
+
+def test_an_experiment_that_has_moved_is_named_by_its_option(campaign: Campaign, tmp_path: Path) -> None:
+    shutil.copytree(campaign.folder, tmp_path / "results")
+    (tmp_path / "results" / "provenance.json").write_text(json.dumps({"experiment": str(tmp_path / "vines")}))
+    refused("explore", tmp_path / "nowhere")
+    assert "--experiment" in refused("explore", tmp_path / "results")
+    assert open_campaign(tmp_path / "results", campaign.experiment.folder).conditions == campaign.conditions
+
+
+async def _origin_of_elsewhere(address: str) -> str:
+    request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
+    try:
+        (await websocket_connect(request)).close()
+    except HTTPClientError as error:
+        return str(error.code)
+    return "let in"
+
+
+def test_the_server_is_for_this_machine_only_and_ends_with_ctrl_c(campaign: Campaign) -> None:
+    with Served(campaign.folder, "--port", "0") as served:
+        address = served.address
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            page = answer.read().decode("utf-8")
+        assert "vinetrack explorer" in page
+        assert "cdn.bokeh.org" not in page
+        port = urlsplit(address).port
+        with pytest.raises(OSError, match="refused"), socket.create_connection((_own_address(), port), timeout=5):
+            pass
+        assert IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address)) == "403"
+        assert served.interrupt() == 0
+    assert served.lines[-1] == "Explorer ended."
+    assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
+
+
+async def _answers(address: str, host: str) -> int:
+    client = AsyncHTTPClient()
+    return (await client.fetch(HTTPRequest(address, headers={"Host": host}), raise_error=False)).code
+
+
+@pytest.fixture
+def bare_server():
+    """A server without an open page."""
+    server = start_server(None, 0)
+    yield server
+    server.stop()
+
+
+@pytest.mark.parametrize(
+    "route", ["", "ws", "autoload.js?bokeh-autoload-element=a", "static/js/bokeh.min.js", "metadata"]
+)
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "localhost.evil.example:{port}"])
+def test_no_route_answers_under_another_name(bare_server, route: str, host: str) -> None:
+    name = host.format(port=bare_server.port)
+    assert bare_server.io_loop.run_sync(lambda: _answers(where(bare_server) + route, name)) == 403
+
+
+@pytest.mark.parametrize("route", ["/", "/autoload.js?bokeh-autoload-element=a", "/ws", "/static/js/bokeh.min.js"])
+def test_nothing_answers_without_the_secret_of_the_address(bare_server, route: str) -> None:
+    own = f"127.0.0.1:{bare_server.port}"
+    assert bare_server.io_loop.run_sync(lambda: _answers(f"http://{own}{route}", own)) == 404
+
+
+def _own_address() -> str:
+    """An address of this machine other than the loopback address, or else one without a listener."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return "127.0.0.2"
+        return str(probe.getsockname()[0])

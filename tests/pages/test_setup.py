@@ -1,0 +1,392 @@
+"""The set-up page without a browser: names, drafts, pasted blocks, and answers of its server."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vinetrack.core.problems import ExperimentError
+from vinetrack.core.tables import list_recordings, read_table
+from vinetrack.core.yaml_document import parse_yaml
+from vinetrack.pages.clip_names import columns_from_names, list_pictures, list_tables
+from vinetrack.pages.draft_files import (
+    SHARED_ROW,
+    first_settings,
+    open_draft,
+    place_block,
+    read_block,
+    shared_values,
+    with_shared,
+    write_draft,
+)
+from vinetrack.pages.setup_server import (
+    SetupServer,
+    draft_from_json,
+    draft_problems,
+    page_state,
+    start_server,
+    write_templates,
+)
+
+# Listing of recordings, and columns from their names.
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+
+
+def test_recordings_are_films_and_folders_of_pictures_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    touch(tmp_path, "run 10.mp4", "run 2.MOV", "notes.txt", ".hidden.mp4", "board.png", "calibration/board.mp4")
+    touch(tmp_path, *(f"burst/{i:03d}.png" for i in range(5)), "two/1.png", "two/2.png", "monday/a.avi")
+    touch(tmp_path, "results/provenance.json", "results/overlay.mp4")
+    assert list_recordings(tmp_path) == ["burst", "monday/a.avi", "run 2.MOV", "run 10.mp4"]
+    assert list_pictures(tmp_path) == ["board.png", "calibration/board.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("name", "cells"),
+    [
+        ("d12_24kPa_1.mp4", {"diameter_mm": "12", "pressure_kPa": "24"}),
+        ("D12 24KPA run 3.mov", {"diameter_mm": "12", "pressure_kPa": "24"}),
+        ("24mm-200um-280mm_30.5kPa_20g.mp4", {
+            "diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30.5", "payload_g": "20",
+        }),
+        ("d0p5in_4psi.mp4", {"diameter_in": "0.5", "pressure_psi": "4"}),
+        ("p36_m20_l280_t100_2.avi", {
+            "pressure_kPa": "36", "payload_g": "20", "length_mm": "280", "thickness_um": "100",
+        }),
+        ("l28cm 1000fps.mp4", {"length_cm": "28", "capture_fps": "1000"}),
+        ("d12/24kPa/1.mp4", {"diameter_mm": "12", "pressure_kPa": "24"}),
+        ("d12/d24_1.mp4", {"diameter_mm": "24"}),
+        ("GX010042.mp4", {}),
+        ("2024-05-01 17.22.mp4", {}),
+        ("day3_tube2.mp4", {"day": "3", "specimen": "2"}),
+    ],
+)  # fmt: skip
+def test_a_name_says(name: str, cells: dict[str, str]) -> None:
+    assert columns_from_names([name]) == [cells]
+
+
+def test_a_unit_that_all_names_share_is_kept_and_mixed_ones_are_converted() -> None:
+    assert columns_from_names(["4psi.mp4", "5psi.mp4"]) == [{"pressure_psi": "4"}, {"pressure_psi": "5"}]
+    assert columns_from_names(["4psi.mp4", "30kPa.mp4"]) == [{"pressure_kPa": "27.579"}, {"pressure_kPa": "30"}]
+
+
+def test_tables_are_offered_as_pressure_traces(tmp_path: Path) -> None:
+    touch(tmp_path, "trials.csv", "corrections.csv", "p 10.csv", "p 2.csv", "traces/a.csv", "results/provenance.json")
+    touch(tmp_path, "results/trials.csv")
+    assert list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]
+
+
+# The two files are made, completed and never overwritten.
+
+
+SHEET = "trial;video;pressure_kPa;note\nold;a.mp4;24,5;keep me\n"
+SETTINGS = "# of the lab\nyield_pressure_kPa: 3  # measured twice\nthickness_um: 100\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("a.mp4", "d12_30kPa_1.mp4"):
+        (tmp_path / name).write_bytes(b"x")
+    return tmp_path
+
+
+def test_a_folder_of_recordings_gets_both_files_with_blanks(folder: Path) -> None:
+    lines: list[str] = []
+    write_templates(folder, lines.append)
+    table = read_table(folder / "trials.csv")
+    assert table.rows[1]["diameter_mm"] == "12"
+    assert table.rows[1]["pressure_kPa"] == "30"
+    assert table.rows[0]["pressure_kPa"] == ""
+    assert (folder / "experiment.yaml").read_text() == first_settings()
+    assert any("capture_fps" in line and "calibration" in line for line in lines if line.startswith("To fill in"))
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "a.mp4", "d12_30kPa_1.mp4", "experiment.yaml", "trials.csv",
+    ]  # fmt: skip
+
+
+def test_a_sheet_that_is_there_keeps_every_cell_and_gains_a_row(folder: Path) -> None:
+    (folder / "trials.csv").write_text(SHEET)
+    (folder / "experiment.yaml").write_text(SETTINGS)
+    write_templates(folder, lambda _line: None)
+    text = (folder / "trials.csv").read_text()
+    assert text.startswith("trial;video;pressure_kPa;note")
+    assert "old;a.mp4;24,5;keep me" in text
+    assert "d12_30kPa_1;d12_30kPa_1.mp4;30" in text
+    assert (folder / "experiment.yaml").read_text() == SETTINGS
+
+
+def test_files_that_changed_since_are_left_alone(folder: Path) -> None:
+    draft = open_draft(folder)
+    (folder / "trials.csv").write_text(SHEET)
+    with pytest.raises(ExperimentError):
+        write_draft(folder, draft)
+    assert (folder / "trials.csv").read_text() == SHEET
+
+
+def test_cells_without_a_column_are_refused_not_lost(folder: Path) -> None:
+    (folder / "trials.csv").write_text("trial,video\nold,a.mp4,stray\n")
+    with pytest.raises(ExperimentError):
+        open_draft(folder)
+
+
+def test_shared_values_are_set_in_place_and_in_the_unit_chosen() -> None:
+    after = with_shared(SETTINGS, {"yield_pressure_psi": "0.5", "thickness_um": "100", "capture_fps": "1069"})
+    assert after.startswith("# of the lab\nyield_pressure_psi: 0.5 # measured twice\n")
+    assert parse_yaml(after, "").content == {
+        "yield_pressure_psi": 0.5, "thickness_um": 100, "capture_fps": 1069,
+    }  # fmt: skip
+    assert shared_values(after) == {"thickness_um": 100, "yield_pressure_psi": 0.5, "capture_fps": 1069}
+
+
+def test_no_blank_key_is_written_beside_the_same_quantity_in_another_unit() -> None:
+    """A new file has a blank `yield_pressure_kPa:`; that of an older version of the page has both."""
+    after = with_shared(first_settings(), {"yield_pressure_psi": "0.42", "capture_fps": "1000"})
+    assert parse_yaml(after, "").content["yield_pressure_psi"] == 0.42
+    assert "yield_pressure_kPa" not in parse_yaml(after, "").content
+    assert after.count("#") == first_settings().count("#")
+    both = with_shared("yield_pressure_psi: 0.4\nyield_pressure_kPa:\n", {"yield_pressure_psi": "0.42"})
+    assert parse_yaml(both, "").content == {"yield_pressure_psi": 0.42}
+    back = with_shared(after, {"yield_pressure_kPa": "3"})
+    assert parse_yaml(back, "").content["yield_pressure_kPa"] == 3
+
+
+# Blocks pasted from notes or a spreadsheet: each number stands beside its own film, or nowhere.
+
+
+COLUMNS = ["capture_fps", "diameter_mm", "pressure_kPa", "payload_g"]
+ROWS = [
+    {"trial": "d15_24kPa_1", "video": "d15 24kPa 1.mp4"},
+    {"trial": "d15_30kPa_1", "video": "d15 30kPa 1.mp4"},
+    {"trial": "late", "video": "monday/d15 36kPa 1.mov"},
+]
+EXPECTED = {(0, "pressure_kPa"): "24.1317", (0, "payload_g"): "0", (1, "pressure_kPa"): "31.0264",
+            (1, "payload_g"): "20", (2, "pressure_kPa"): "36.5422", (2, "payload_g"): "5"}  # fmt: skip
+
+
+def changed(text: str, at_row: int | str = 0, at_column: str = "trial", decimal: str = ".") -> dict[tuple, str]:
+    placed = place_block(text, COLUMNS, ROWS, at_row, at_column, decimal)
+    assert len({cell[:2] for cell in placed.cells}) == len(placed.cells)
+    return {(row, column): text for row, column, text in placed.cells}
+
+
+def notes(text: str, at_row: int | str = 0, at_column: str = "trial") -> int:
+    return len(place_block(text, COLUMNS, ROWS, at_row, at_column).notes)
+
+
+@pytest.mark.parametrize("mark", ["\t", ";", ",", "  "])
+@pytest.mark.parametrize("header", ["clip{0}pressure (psi){0}payload_g", "Trial{0}Pressure [psi]{0}Payload"])
+@pytest.mark.parametrize("at_column", ["trial", "capture_fps", "payload_g"])
+def test_a_header_names_columns_and_units_and_rows_are_matched_by_their_clips(
+    mark: str, header: str, at_column: str
+) -> None:
+    lines = [header.format(mark), "monday/d15 36kPa 1.mov|5.3|5", "d15 24kPa 1.mp4|3.5|0", "d15_30kPa_1|4.5|20"]
+    text = "\r\n".join(lines).replace("|", mark) + "\r\n"
+    assert changed(text, 1, at_column) == EXPECTED
+    assert notes(text, 1, at_column) == 0
+
+
+def test_blanks_separate_cells_without_blanks() -> None:
+    assert changed("name pressure_psi payload_g\nlate 5.3 5\nd15_24kPa_1 3.5 0\nd15_30kPa_1 4.5 20") == EXPECTED
+
+
+def test_without_a_header_columns_follow_the_one_pasted_into_and_rows_their_names() -> None:
+    text = "late\t36\t5\nd15_24kPa_1\t24\t0\n"
+    expected = {(2, "pressure_kPa"): "36", (2, "payload_g"): "5", (0, "pressure_kPa"): "24", (0, "payload_g"): "0"}
+    assert changed(text, 0, "pressure_kPa") == expected
+
+
+def test_a_block_of_numbers_alone_goes_where_it_is_pasted() -> None:
+    assert changed("24\t0\n30\t20", 1, "pressure_kPa") == {
+        (1, "pressure_kPa"): "24", (1, "payload_g"): "0", (2, "pressure_kPa"): "30", (2, "payload_g"): "20",
+    }  # fmt: skip
+    assert changed("1000\n24\n", SHARED_ROW, "pressure_kPa") == {
+        (SHARED_ROW, "pressure_kPa"): "1000", (0, "pressure_kPa"): "24",
+    }  # fmt: skip
+    assert changed("pressure\n24", 1, "diameter_mm") == {(1, "pressure_kPa"): "24"}
+
+
+def test_what_matches_nothing_is_named_and_changes_nothing() -> None:
+    text = "clip\tpressure_kPa\tcolour\nd15_24kPa_1\t24\tred\nd99_1\t99\tblue"
+    assert changed(text) == {(0, "pressure_kPa"): "24"}
+    assert notes(text) == 2
+    assert changed("24\n30\n36\n42", 1, "pressure_kPa") == {(1, "pressure_kPa"): "24", (2, "pressure_kPa"): "30"}
+    assert notes("24\n30\n36\n42", 1, "pressure_kPa") == 2
+    assert changed("1\t2\n3\t4", 0, "trial") == {}
+    assert notes("1\t2\n3\t4", 0, "trial") == 1
+    assert notes("24\t0\t5", 0, "pressure_kPa") == 1
+
+
+def test_a_name_of_two_recordings_is_of_neither() -> None:
+    rows = [{"trial": "a", "video": "x/1.mp4"}, {"trial": "b", "video": "y/1.mp4"}]
+    assert place_block("1.mp4\t24\nx/1.mp4\t30", COLUMNS, rows, 0, "pressure_kPa").cells == [(0, "pressure_kPa", "30")]
+
+
+def test_decimal_commas_are_read_and_written_as_the_sheet_has_them() -> None:
+    assert read_block("24,5\n30,5") == [["24,5"], ["30,5"]]
+    assert changed("24,5\n30,5", 0, "pressure_kPa") == {(0, "pressure_kPa"): "24.5", (1, "pressure_kPa"): "30.5"}
+    assert changed("late;36,5", 0, "pressure_kPa", ",") == {(2, "pressure_kPa"): "36,5"}
+    assert read_block("late,36") == [["late", "36"]]
+
+
+# State sent to the page, and drafts sent back.
+
+
+def sent(folder: Path, **more: Any) -> dict[str, Any]:
+    """The content that an unchanged page sends."""
+    state = page_state(folder)
+    return {key: state[key] for key in ("sheet", "shared", "calibration", "axis", "stamp")} | more
+
+
+def fields(folder: Path, **more: Any) -> set[tuple[str, str, str]]:
+    draft = draft_from_json(folder, sent(folder, **more))
+    return {(one["field"], one["trial"], one["column"]) for one in draft_problems(folder, draft)["problems"]}
+
+
+def test_a_new_folder_is_unsaved_and_filled_in_from_names(clips: Path) -> None:
+    state = page_state(clips)
+    assert state["unsaved"]
+    assert [row["pressure_kPa"] for row in state["sheet"]["rows"]] == ["24", "30"]
+    assert state["known"]["pressure_kPa"]["units"][0] == "kPa"
+
+
+def test_a_wrong_cell_is_named_by_its_trial_and_its_column_in_the_unit_of_the_sheet(clips: Path) -> None:
+    sheet = page_state(clips)["sheet"]
+    sheet["columns"] = [name if name != "pressure_kPa" else "pressure_psi" for name in sheet["columns"]]
+    for row in sheet["rows"]:
+        row["pressure_psi"] = "four"
+    shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+    found = fields(clips, sheet=sheet, shared=shared)
+    assert ("cell", "d15_24kPa_1", "pressure_psi") in found
+
+
+def test_a_whole_draft_has_no_errors(clips: Path) -> None:
+    shared = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+    scale = {"kind": "two_points", "from_px": [10, 150], "to_px": [460, 150], "length_mm": 337.5}
+    draft = draft_from_json(clips, sent(clips, shared=shared, calibration=scale))
+    found = draft_problems(clips, draft)["problems"]
+    assert [one for one in found if one["severity"] == "error"] == []
+    assert parse_yaml(draft.settings, "").content["calibration"] == scale
+
+
+@pytest.mark.parametrize("text", ["trial,video,note\nold,d15 24kPa 1.mp4,of Monday\n"])
+def test_a_sheet_that_is_there_is_shown_with_its_unknown_columns(clips: Path, text: str) -> None:
+    (clips / "trials.csv").write_text(text)
+    state = page_state(clips)
+    assert state["kept"] == ["trial", "video", "note"]
+    assert state["sheet"]["rows"][0] == {"trial": "old", "video": "d15 24kPa 1.mp4", "note": "of Monday"}
+    assert state["sheet"]["rows"][1]["video"] == "d15 30kPa 1.mp4"
+
+
+# Responses of the server, without a browser: frames, axis, track, save; and refusal of foreign requests.
+
+
+OURS = {"X-Vinetrack": "setup"}
+
+
+@pytest.fixture
+def server(clips: Path) -> Iterator[SetupServer]:
+    made = start_server(clips, 0)
+    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    yield made
+    made.shutdown()
+    made.server_close()
+    thread.join(10)
+
+
+def ask(
+    server: SetupServer, path: str, body: Any = None, headers: dict[str, str] | None = None
+) -> tuple[int, bytes, str]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)
+    data = None if body is None else json.dumps(body)
+    connection.request(
+        "GET" if body is None else "POST", server.secret + path, data, headers or (OURS if body is not None else {})
+    )
+    answer = connection.getresponse()
+    made = answer.status, answer.read(), answer.getheader("Content-Type") or ""
+    connection.close()
+    return made
+
+
+def test_the_page_its_style_and_its_scripts_are_served(server: SetupServer) -> None:
+    assert b"<title>vinetrack set-up</title>" in ask(server, "/")[1]
+    assert b"--ink" in ask(server, "/setup.css")[1]
+    assert ask(server, "/table.js")[2].startswith("text/javascript")
+    assert ask(server, "/setup_server.py")[0] == 404
+
+
+def test_frames_are_pictures_and_the_axis_lies_along_the_tube(server: SetupServer) -> None:
+    status, data, kind = ask(server, "/api/frame?recording=d15%2024kPa%201.mp4&frame=3")
+    assert (status, kind, data[:2]) == (200, "image/jpeg", b"\xff\xd8")
+    clip = json.loads(ask(server, "/api/clip?recording=d15%2024kPa%201.mp4")[1])
+    (x0, y0), (x1, y1) = clip["axis"]["from_px"], clip["axis"]["to_px"]
+    assert x1 - x0 > 300
+    assert abs(y0 - 80) < 1.5
+    assert abs(y1 - 80) < 1.5
+
+
+def test_one_row_is_tracked_before_the_sheet_is_filled_in(server: SetupServer, clips: Path) -> None:
+    made = json.loads(ask(server, "/api/track", sent(clips, row=0))[1])
+    assert not made["timed"]
+    assert not made["scaled"]
+    edge = np.array([np.nan if value is None else value for value in made["edge_px"]])
+    assert np.nanmax(edge) - np.nanmin(edge) == pytest.approx(360, abs=5)
+    assert made["strip"].startswith("data:image/jpeg;base64,")
+    assert not (clips / "trials.csv").exists()
+
+
+def test_a_pressure_trace_comes_with_the_motion(server: SetupServer, clips: Path) -> None:
+    (clips / "p.csv").write_text("time_s,pressure_kPa\n0,24\n0.05,22\n")
+    content = sent(clips, row=0)
+    content["sheet"]["columns"].append("pressure_trace")
+    content["sheet"]["rows"][0]["pressure_trace"] = "p.csv"
+    content["shared"] = {"capture_fps": "1000"}
+    made = json.loads(ask(server, "/api/track", content)[1])
+    assert made["timed"]
+    assert made["pressure"] == {"time_s": [0.0, 0.05], "pressure_kPa": [24.0, 22.0]}
+
+
+def test_saving_writes_two_files_and_the_next_stamp(server: SetupServer, clips: Path) -> None:
+    before = {path.name for path in clips.iterdir()}
+    made = json.loads(ask(server, "/api/save", sent(clips))[1])
+    assert made["written"] == ["trials.csv", "experiment.yaml"]
+    assert {path.name for path in clips.iterdir()} - before == {"trials.csv", "experiment.yaml"}
+    assert made["stamp"] == json.loads(ask(server, "/api/state")[1])["stamp"]
+
+
+def test_a_file_that_changed_meanwhile_is_not_overwritten(server: SetupServer, clips: Path) -> None:
+    content = sent(clips)
+    (clips / "experiment.yaml").write_text("chamber_l: 2\n")
+    assert ask(server, "/api/save", content)[0] == 422
+    assert (clips / "experiment.yaml").read_text() == "chamber_l: 2\n"
+
+
+@pytest.mark.parametrize("headers", [{"Host": "elsewhere.example"}, {**OURS, "Origin": "http://elsewhere.example"}])
+def test_requests_from_other_pages_are_refused(server: SetupServer, clips: Path, headers: dict[str, str]) -> None:
+    assert ask(server, "/api/save", sent(clips), headers)[0] == 403
+    assert not (clips / "trials.csv").exists()
+
+
+@pytest.mark.parametrize("path", ["/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"])
+def test_no_route_is_served_under_another_name(server: SetupServer, path: str) -> None:
+    assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
+
+
+def test_nothing_is_served_without_the_secret_of_the_address(server: SetupServer) -> None:
+    assert len(server.secret) > 20
+    assert ask(server, "/api/state")[0] == 200
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    connection.request("GET", "/api/state")
+    assert connection.getresponse().status == 403
+    connection.close()

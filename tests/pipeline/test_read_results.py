@@ -1,0 +1,337 @@
+"""What a results folder holds, read back: fit, diagnosis and its tables, pictures, contradictions of the sheet."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hand_diagnosis import VERDICTS, diagnosis, ladder, moved, one_round, refused
+
+from vinetrack.core import published
+from vinetrack.core.records import Track, Trial, plain_track
+from vinetrack.core.tables import write_json
+from vinetrack.diagnosis.result import Diagnosis, Round
+from vinetrack.figures.registry import diagnosis_figures, draw
+from vinetrack.figures.style import render
+from vinetrack.inference.fit_result import BetweenTrialSpread, Number
+from vinetrack.inference.fit_summary import FitSummary, TrialEstimates
+from vinetrack.pipeline import report_stage
+from vinetrack.pipeline.diagnosis_stage import (
+    DiagnosisTables,
+    cosines_by_rank,
+    predicted_trials,
+    read_diagnosis_tables,
+    sheet_contradictions,
+    with_contradictions,
+    worst_condition,
+)
+from vinetrack.pipeline.predict_stage import choose_fit
+from vinetrack.pipeline.report_stage import with_final_model
+from vinetrack.planning.predictive_inputs import damping_prior
+from vinetrack.results.folder_layout import Results, ResultsError, read_diagnosis, read_fit
+
+# The fit and the diagnosis of a results folder, read back as they were written.
+
+
+OPEN = math.nan
+
+
+def fit() -> FitSummary:
+    damping = Number("eversion_damping.B", "v", "B", "N·(s/m)ⁿ", 6.4, 0.1, 6.2, 6.6, OPEN, "linear")
+    onset = Number("yield_pressure.P_y", "", "P_y", "Pa", 3000.0, OPEN, OPEN, OPEN, OPEN, "none", 0.0)
+    return FitSummary(
+        names=("gravity", "eversion_damping"),
+        numbers=(damping, onset),
+        covariance=np.array([[0.01, 0.0], [0.0, OPEN]]),
+        spreads={"B": BetweenTrialSpread(0.03, True)},
+        noise_m=1e-4,
+        noise_correlation=0.4,
+        chi2_per_dof=1.2,
+        log_likelihood=-12.5,
+        converged=True,
+        messages=("a",),
+        warnings=("b",),
+        left_out={"c": "never moves"},
+        trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))},
+        between=np.array([[0.04, 0.0], [0.0, 0.0]]),
+    )
+
+
+def test_a_fit_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    write_json(results.fit, fit().to_json())
+    back = read_fit(results)
+    write_json(tmp_path / "again.json", back.to_json())
+    assert (tmp_path / "again.json").read_text() == results.fit.read_text()
+    assert back["B"].value == 6.4
+    assert back.between[0, 0] == 0.04
+    assert back.fitted_values == {"eversion_damping.B": {"v": 6.4}, "yield_pressure.P_y": 3000.0}
+    assert back.trial_table()["release_sigma_s"].tolist() == [0.1]
+    assert str(back) == str(fit())
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_diagnosis_comes_back_as_it_was_written(verdict: str) -> None:
+    written = json.loads(json.dumps(Diagnosis.from_json(diagnosis(verdict)).to_json(), default=float))
+    again = json.loads(json.dumps(Diagnosis.from_json(written).to_json(), default=float))
+    assert json.dumps(again) == json.dumps(written)
+    told = diagnosis(verdict)
+    assert {key: again[key] for key in ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")} == {
+        key: told[key] for key in ("verdict", "effects", "answer_set", "final_verdict", "where", "cosines")
+    }
+
+
+def test_a_refused_diagnosis_says_why_and_has_no_verdict(tmp_path: Path) -> None:
+    write_json(Results(tmp_path).diagnosis, refused("no trial moves"))
+    back = read_diagnosis(Results(tmp_path))
+    assert back is not None
+    assert (back.verdict, back.final_verdict, back.refused) == ("", "", "no trial moves")
+
+
+@pytest.mark.parametrize("content", ["[]", '{"model": 3}', '{"numbers": [1]}'])
+def test_a_fit_that_is_none_of_ours_is_one_sentence(tmp_path: Path, content: str) -> None:
+    Results(tmp_path).fit.write_text(content, encoding="utf-8")
+    with pytest.raises(ResultsError, match="delete it and run snakemake again"):
+        read_fit(Results(tmp_path))
+
+
+# What a diagnosis left in a results folder, read back for pictures and page: whole, in parts, and not there.
+
+
+RELEASE_S, ORIGIN_M = 0.05, 0.2
+TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
+
+
+def conditions() -> pd.DataFrame:
+    labels = {"slow": "12 mm, 24 kPa", "fast": "12 mm, 60 kPa"}
+    rows = [{"trial": t, "vine": "v", "condition": c, "condition_label": labels[c]} for t, c in TRIALS.items()]
+    return pd.DataFrame(rows)
+
+
+def prediction(off_m: float, after: bool) -> pd.DataFrame:
+    """0.2 m in 0.1 s, of which the model before misses `off_m` at the end, the one after nothing."""
+    since_s = np.arange(-20, 101) * 1e-3
+    growth_m = 2.0 * np.maximum(since_s, 0)
+    table = pd.DataFrame({"time_s": since_s + RELEASE_S, "lead_position_m": ORIGIN_M + growth_m})
+    before_m = table["lead_position_m"] - off_m * growth_m / 0.2
+    return table.assign(model_before_m=before_m, model_after_m=table["lead_position_m"] if after else math.nan)
+
+
+def folder(path: Path, content: dict | None, after: bool = True, compared: bool = True) -> Results:
+    results = Results(path)
+    (path / "diagnosis" / "predictions").mkdir(parents=True)
+    (path / "comparison").mkdir()
+    if content is not None:
+        (path / "diagnosis.json").write_text(json.dumps(content))
+    ladder("", *content.get("effects", []) if content else ()).to_csv(results.ladder, index=False)
+    moved().to_csv(results.diagnosed("moved.csv"), index=False)
+    for condition in ("slow", "fast"):
+        parts = []
+        for trial in (t for t, c in TRIALS.items() if c == condition):
+            table = prediction(0.02 if condition == "slow" else 0.004, after)
+            table.to_csv(results.predictions(trial), index=False)
+            since = {"time_s": table["time_s"] - RELEASE_S, "lead_position_m": table["lead_position_m"] - ORIGIN_M}
+            model = {"model_position_m": table["model_before_m"] - ORIGIN_M}
+            parts.append(pd.DataFrame({"trial": trial, **since, **model}))
+        if compared:
+            pd.concat(parts).to_csv(results.trajectories(condition), index=False)
+    return results
+
+
+@pytest.mark.parametrize("compared", [True, False])
+def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: bool) -> None:
+    trials = predicted_trials(folder(tmp_path / "r", diagnosis(), compared=compared), conditions())
+    one = trials[trials["trial"] == "a"]
+    # Without the comparison the release is the first frame that moves: a frame or two late.
+    assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
+    assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
+
+
+def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Path) -> None:
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
+    assert found is not None
+    assert found.worst == "12 mm, 24 kPa"
+    assert set(found.before_after["trial"]) == {"a", "b"}
+    assert worst_condition(found.before_after.iloc[:0]) == ""
+
+
+def test_misfits_are_averaged_along_the_growth_before_and_after(tmp_path: Path) -> None:
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis()), conditions())
+    assert found is not None
+    slow = found.where[found.where["condition"] == "slow"]
+    middle = (slow["growth_from"] + slow["growth_to"]) / 2
+    assert slow["misfit_before_m"].to_numpy() == pytest.approx(0.02 * middle.to_numpy(), abs=3e-4)
+    assert slow["misfit_after_m"].to_numpy() == pytest.approx(np.zeros(len(slow)), abs=1e-12)
+    assert set(found.where["condition_label"]) == {"12 mm, 24 kPa", "12 mm, 60 kPa"}
+    assert slow["n_trials"].tolist() == [2] * len(slow)
+
+
+def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: Path) -> None:
+    results = folder(tmp_path / "r", diagnosis())
+    row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
+    row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
+    pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
+    found = read_diagnosis_tables(results, conditions())
+    assert found is not None
+    (slow,) = found.where[found.where["condition"] == "slow"].to_dict("records")
+    assert (slow["growth_from"], slow["growth_to"]) == (0.5, 1.0)
+    assert (slow["misfit_before_m"], slow["scatter_m"]) == (0.011, 0.001)
+    assert slow["misfit_after_m"] == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, verdict: str) -> None:
+    found = read_diagnosis_tables(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
+    assert found is not None
+    drawn = {name: figure for name in diagnosis_figures() if (figure := draw(name, found))}
+    assert set(drawn) == {"ladder", "before_after", "where", "candidates", "cosines"}
+    for name, figure in drawn.items():
+        assert render(figure, ["svg"])["svg"]
+        assert len(getattr(found, diagnosis_figures()[name].data)) > 0
+
+
+@pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
+def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dict | None) -> None:
+    assert read_diagnosis_tables(folder(tmp_path / "r", content), conditions()) is None
+    assert not any(draw(name, DiagnosisTables()) for name in diagnosis_figures())
+
+
+def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:
+    results = folder(tmp_path / "r", diagnosis())
+    trajectories = {
+        "slow": pd.read_csv(results.trajectories("slow")),
+        "fast": pd.read_csv(results.trajectories("fast")),
+    }
+    joined = with_final_model(trajectories, read_diagnosis_tables(results, conditions()))
+    difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
+    assert float(np.abs(difference).max()) < 1e-12
+    assert "model_after_m" not in with_final_model(trajectories, None)["slow"]
+    shorter = {"slow": trajectories["slow"].iloc[1:]}
+    assert "model_after_m" not in with_final_model(shorter, read_diagnosis_tables(results, conditions()))["slow"]
+
+
+def test_ties_stand_in_the_order_of_the_ranking() -> None:
+    cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
+    names, matrix = cosines_by_rank(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    assert names == ["air_drag", "leak", "time_base"]
+    assert matrix == [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]]
+    assert cosines_by_rank(Round.from_json({"verdict": ""})) == ([], [])
+
+
+# Predictions come from the model that the diagnosis ended with, never silently from one that it refuted.
+
+
+def results(folder: Path, verdicts: tuple[str, ...], effects: tuple[str, ...] = (), final: bool = False) -> Path:
+    """A folder with a fit, a diagnosis of these verdicts, and the fit that it ended with."""
+    where = Results(folder)
+    write_json(where.fit, {"model": ["base"]})
+    if final:
+        write_json(where.final_fit, {"model": ["base", *effects]})
+    if verdicts:
+        rounds = [
+            {"model": ["base"], "verdict": v, "answer_set": [], "explanation": f"it is {v}", "ranking": []}
+            for v in verdicts
+        ]
+        content = {
+            "verdict": verdicts[0], "final_verdict": verdicts[-1], "effects": list(effects), "answer_set": [],
+            "explanation": f"it is {verdicts[0]}", "rounds": rounds, "parameters": [], "where": [], "drift": [],
+            "next_experiment": None, "missing_force": None, "notes": [], "refused": None,
+        }  # fmt: skip
+        write_json(where.diagnosis, content)
+    return folder
+
+
+def test_an_adequate_model_is_used_as_it_is(tmp_path: Path) -> None:
+    chosen = choose_fit(results(tmp_path, ("adequate",)))
+    assert (chosen.content["model"], chosen.heading) == (["base"], ())
+
+
+def test_the_model_that_the_diagnosis_ended_with_is_used_and_named(tmp_path: Path) -> None:
+    chosen = choose_fit(results(tmp_path, ("missing", "adequate"), ("air_drag",), final=True))
+    assert chosen.content["model"] == ["base", "air_drag"]
+    assert "air_drag added" in chosen.heading[0]
+
+
+@pytest.mark.parametrize("verdicts", [("artefact",), ("unexplained",), ("ambiguous",), ("missing", "unexplained")])
+def test_a_refuted_model_is_refused_with_the_reason(tmp_path: Path, verdicts: tuple[str, ...]) -> None:
+    with pytest.raises(ResultsError):
+        choose_fit(results(tmp_path, verdicts))
+
+
+def test_a_last_model_that_is_not_stored_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError):
+        choose_fit(results(tmp_path, ("missing", "adequate"), ("air_drag",)))
+
+
+# What recordings and speeds contradict in the sheet stands beside the verdict, for it passes for physics.
+
+
+PSI = 6.894757
+VINE = Trial(
+    name="a", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=30e3, yield_pressure_Pa=3e3,
+    capture_fps=1000,
+)  # fmt: skip
+
+
+def steady(trial: Trial) -> Track:
+    """A track at the steady speed of F = B·ẋⁿ with the B that tubes of this size have."""
+    force_N = (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
+    tail_m_s = (force_N / damping_prior(trial.diameter_m, trial.thickness_m)) ** (1 / published.EXPONENT)
+    return plain_track(np.arange(40) / 1000, np.arange(40) / 1000 * tail_m_s / 2)
+
+
+def written(folder: Path, *contradictions: tuple[str, dict[str, str]]) -> Results:
+    for name in "ab":
+        noted = [entry for trial, entry in contradictions if trial == name]
+        write_json(Results(folder).analysed(name), {"row": {}, "contradictions": noted})
+    return Results(folder)
+
+
+def test_right_trials_contradict_nothing(tmp_path: Path) -> None:
+    pairs = [(replace(VINE, name=name), steady(VINE)) for name in "ab"]
+    results = written(tmp_path)
+    assert sheet_contradictions(results, pairs) == {}
+    made = Diagnosis.from_json(diagnosis("missing"))
+    assert with_contradictions(made, results, pairs) == made
+
+
+def test_psi_under_the_name_of_kpa_and_a_wrong_scale_stand_beside_the_verdict(tmp_path: Path) -> None:
+    typed = replace(VINE, pressure_Pa=VINE.pressure_Pa / PSI, yield_pressure_Pa=VINE.yield_pressure_Pa / PSI)
+    pairs = [(replace(typed, name=name), steady(VINE)) for name in "ab"]
+    narrow = {"column": "diameter_mm", "reason": "diameter_mm '12' differs: the tube is 9.6 mm wide, a factor 1.25"}
+    results = written(tmp_path, ("a", narrow), ("b", narrow))
+    seen = sheet_contradictions(results, pairs)
+    assert list(seen) == ["diameter_mm", "pressure_kPa"]
+    assert seen["diameter_mm"] == f"a: {narrow['reason']} (and 1 more trial)"
+    assert "looks like psi, not kPa" in seen["pressure_kPa"]
+    told = with_contradictions(Diagnosis.from_json(diagnosis("missing")), results, pairs)
+    assert set(seen.values()) <= set(told.notes)
+
+
+# Which file of a figure the page shows, for every choice of `figures.formats`.
+
+
+@pytest.mark.parametrize(
+    ("formats", "shown"), [(("png", "svg"), "<svg/>"), (("svg",), "<svg/>"), (("png",), b"png"), (("pdf",), b"")]
+)
+def test_a_figure_is_shown_from_the_files_there_are(tmp_path: Path, formats: tuple[str, ...], shown: object) -> None:
+    path = partial(Results(tmp_path).figure, "ladder")
+    path(".svg").parent.mkdir()
+    for form in formats:
+        path(f".{form}").write_text({"svg": "<svg/>"}.get(form, form))
+    assert report_stage._picture(path) == shown
+
+
+def test_a_large_svg_gives_way_to_its_png(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = partial(Results(tmp_path).figure, "ladder")
+    path(".svg").parent.mkdir()
+    path(".svg").write_text("<svg/>")
+    path(".png").write_bytes(b"png")
+    monkeypatch.setattr(report_stage, "MAX_SVG_BYTES", 5)
+    assert report_stage._picture(path) == b"png"

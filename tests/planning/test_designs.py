@@ -1,0 +1,211 @@
+"""The fastest vine, its chamber, and trials that are feasible."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import make_model
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.experiment.planned import planned_trial
+from vinetrack.experiment.schema import with_names
+from vinetrack.experiment.settings import Limits
+from vinetrack.planning.discriminating_design import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, feasible_conditions
+from vinetrack.planning.fastest_vine import (
+    GAMMAS,
+    Room,
+    chamber_for,
+    fastest,
+    final_speeds,
+    final_with,
+    gauge_loss,
+    supplied_chamber,
+    supplied_loss,
+    swept_m3,
+)
+from vinetrack.planning.prediction import predict_vine
+from vinetrack.planning.predictive_inputs import StatedValues, predictive_inputs
+
+# The fastest vine: what the laws of scaling say of it, and that a search by brute force finds nothing faster.
+
+
+EXACT = StatedValues(n=0.37, spreads=(0.0, 0.0))
+
+
+def room(pressure_kPa: float = 62, **values: object) -> Room:
+    options = {name: str(values.pop(name)) for name in ("payload_g", "growth_angle_deg") if name in values}
+    rig = planned_trial({"yield_pressure_kPa": "3", **options}, needed=()).trials[0]
+    known: dict[str, object] = {
+        "films_m": (100e-6,),
+        "diameter_m": (5e-3, 25e-3),
+        "length_m": (0.1, 0.4),
+        "burst_share": 1.0,
+    }
+    return Room(pressure_Pa=1e3 * pressure_kPa, rig=rig, **{**known, **values})  # type: ignore[arg-type]
+
+
+def test_the_papers_fast_vine_is_the_fastest_of_its_setup() -> None:
+    """25 mm and 40 cm were the largest the setup held; 62 kPa is just under burst for 100 µm."""
+    best = fastest(room(), EXACT, samples=50)[0].prediction.inputs.trial
+    assert (best.diameter_m, best.length_m, best.pressure_Pa) == pytest.approx((0.025, 0.4, 62e3), rel=1e-3)
+
+
+def test_no_vine_of_a_fine_grid_is_faster() -> None:
+    limits = room(pressure_kPa=60, diameter_m=(10e-3, 60e-3), length_m=(0.1, 0.3), payload_g=20)
+    (choice,) = fastest(limits, EXACT, samples=50)
+    grid = [
+        predictive_inputs(limits.trial(D, 100e-6, L), EXACT)
+        for D in np.linspace(10e-3, 60e-3, 41)
+        for L in np.linspace(0.1, 0.3, 9)
+    ]
+    assert choice.prediction.final.median > 0.995 * final_speeds(grid, 0.95).max()
+
+
+def test_at_the_burst_stress_acceleration_is_the_same_for_every_film() -> None:
+    """P = 2tσ/D: force ½PA = ¼πσtD, mass λL = ρπDtL, so a = σ/(4ρL) whatever t and D; without damping speeds agree."""
+    limits = room(1000, films_m=(50e-6, 200e-6), burst_share=0.5, growth_angle_deg=90)
+    limits = replace(limits, rig=replace(limits.rig, yield_pressure_Pa=0.0))
+    sights = [
+        predict_vine(
+            predictive_inputs(limits.trial(D, film, 0.4), StatedValues(B=1e-9, n=0.37, spreads=(0.0, 0.0))),
+            samples=2,
+            at_fraction=0.8,
+        )
+        for D, film in ((10e-3, 50e-6), (20e-3, 200e-6))
+    ]
+    expected = 0.5 * math.sqrt(4 * math.log(5) * 0.5 * 7.8e6 / (2 * 1200 * 2))  # ẋ² = 4F/λ ln 5, F/λ = σ/(4ρ)
+    speeds = [prediction.final.median for prediction in sights]
+    assert speeds[0] == pytest.approx(speeds[1], rel=0.01)
+    assert speeds[1] == pytest.approx(expected, rel=0.01)
+
+
+def test_with_a_payload_speed_is_that_of_the_payload() -> None:
+    (choice,) = fastest(room(payload_g=10), EXACT, samples=50)
+    assert choice.prediction.final.name == "ejection speed of the payload"
+    assert choice.prediction.final.y_over_L == 1.0
+
+
+# The chamber that keeps the pressure, against the gas law worked by hand and against a vine grown out of it.
+
+
+ATM = 101_325.0
+
+
+def trial(**values: object) -> Trial:
+    known = {
+        "diameter_mm": 24,
+        "thickness_um": 200,
+        "length_mm": 280,
+        "pressure_kPa": 28,
+        "yield_pressure_kPa": 3,
+        "chamber_l": 3.7,
+    }
+    return planned_trial({name: str(value) for name, value in {**known, **values}.items()}).trials[0]
+
+
+def test_the_injectors_1_7_per_cent_are_5_3_of_gauge() -> None:
+    one = trial(
+        diameter_mm=2.5, thickness_um=50, length_mm=12.5, pressure_kPa=48, chamber_l=20 * math.pi * 7.5**2 / 1e6
+    )
+    assert swept_m3(one) / one.chamber_m3 == pytest.approx(0.017, abs=5e-4)
+    assert gauge_loss(48e3, swept_m3(one), one.chamber_m3, 1.0, ATM) == pytest.approx(0.053, abs=5e-4)
+
+
+@pytest.mark.parametrize("gamma", GAMMAS.values())
+@pytest.mark.parametrize("loss", [0.01, 0.05, 0.5])
+def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma: float, loss: float) -> None:
+    volume = chamber_for(28e3, 1e-4, loss, gamma, ATM)
+    assert gauge_loss(28e3, 1e-4, volume, gamma, ATM) == pytest.approx(loss)
+
+
+def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
+    inputs = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
+    model = make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
+        {**inputs.model.values, "reservoir_depletion.gamma": 1.0}
+    )
+    times = np.linspace(0.0, 1.0, 20_001)
+    found = simulate(model, inputs.trial, times)
+    assert final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
+
+
+def test_a_quick_supply_saves_a_chamber() -> None:
+    inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    closed = chamber_for(28e3, swept_m3(inputs.trial), 0.05, 1.4, ATM)
+    volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
+    assert volumes[0] < volumes[1] < closed
+    assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
+
+
+# Which trials are looked at for the next experiment: within the limits, held by the film, able to grow.
+
+
+def trial_trials(pressure_kPa: float, **more: Any) -> Trial:
+    """A trial of a 24 mm × 200 µm × 280 mm vine, P_y 3 kPa."""
+    sizes: dict[str, Any] = {
+        "diameter_m": 0.024,
+        "thickness_m": 200e-6,
+        "length_m": 0.28,
+        "pressure_Pa": 1e3 * pressure_kPa,
+        "pressure_sigma_Pa": 10 * pressure_kPa,
+        "yield_pressure_Pa": 3e3,
+        "yield_pressure_sigma_Pa": 200.0,
+    }
+    return Trial(name=f"t{pressure_kPa:g}", **{**sizes, **more})
+
+
+def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
+    """Conditions for an experiment of these trials."""
+    return feasible_conditions(with_names(trials), Limits(**limits))
+
+
+def values(found: list[Condition], name: str, unit: float) -> set[float]:
+    return {round(getattr(one.trial, name) / unit, 6) for one in found}
+
+
+def test_pressures_go_from_the_lowest_used_to_a_quarter_above_the_highest() -> None:
+    found = looked_at([trial_trials(14), trial_trials(40)], new_vines=False)
+    pressures = values(found, "pressure_Pa", 1e3)
+    assert (min(pressures), max(pressures)) == (14, 50)
+    assert len(pressures) == 6
+
+
+def test_no_pressure_bursts_a_vine_by_what_film_is_thought_to_hold() -> None:
+    found = looked_at([trial_trials(14), trial_trials(60)], thickness_um=(40.0, 200.0), diameter_mm=(24.0,))
+    stress = [one.trial.pressure_Pa * one.trial.diameter_m / 2 / one.trial.thickness_m for one in found]
+    assert max(stress) <= 7.8e6 * (1 + 1e-9)
+    assert any(one.trial.thickness_m == pytest.approx(40e-6) for one in found)
+
+
+def test_a_bare_vine_is_not_asked_to_grow_near_its_yield_pressure() -> None:
+    found = looked_at([trial_trials(20)], pressure_kPa=(1.0, 20.0), new_vines=False)
+    bare = [one.trial.pressure_Pa for one in found if one.trial.payload_kg == 0]
+    assert min(bare) == pytest.approx(1.15 * 3e3)
+    assert min(one.trial.pressure_Pa for one in found) == 1e3
+
+
+def test_a_chamber_is_halved_and_doubled_where_it_is_stated_one_thing_at_a_time() -> None:
+    found = looked_at([trial_trials(14, chamber_m3=4e-3, inlet_m=8e-3)], new_vines=False)
+    rigs = {(round(one.trial.chamber_m3 * 1e3, 3), round(one.trial.inlet_m * 1e3, 3), one.effort) for one in found}
+    assert rigs == {(4, 8, SAME_RIG), (2, 8, OTHER_RIG), (8, 8, OTHER_RIG), (4, 5.7, OTHER_RIG), (4, 11, OTHER_RIG)}
+    assert {one.changed for one in found} == {(), ("chamber_l",), ("inlet_mm",)}
+
+
+def test_new_vines_come_only_in_the_sizes_that_are_listed_and_where_wanted() -> None:
+    found = looked_at([trial_trials(14)], diameter_mm=(12.0, 24.0), thickness_um=(100.0,), length_mm=(140.0,))
+    assert {one.trial.vine for one in found} == {"12mm-100um-140mm", "24mm-100um-140mm"}
+    assert {one.effort for one in found} == {NEW_VINE}
+    assert looked_at([trial_trials(14)], diameter_mm=(12.0,), new_vines=False) == []
+
+
+def test_a_vine_of_the_experiment_keeps_its_name_and_a_new_one_is_like_the_nearest() -> None:
+    two = [trial_trials(14), trial_trials(30, diameter_m=0.012, thickness_m=100e-6, length_m=0.14)]
+    found = looked_at(two, diameter_mm=(12.0, 13.0, 24.0), thickness_um=(100.0, 200.0))
+    assert {one.trial.vine for one in found if one.effort == SAME_RIG} == {"24mm-200um-280mm", "12mm-100um-140mm"}
+    thirteen = [one for one in found if one.trial.vine.startswith("13mm-100um")]
+    assert {one.trial.length_m for one in thirteen} == {0.14}
+    assert {one.like for one in thirteen} == {1}

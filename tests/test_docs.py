@@ -1,0 +1,242 @@
+"""Pages and docstrings: links lead somewhere, commands exist and print what is shown, examples run."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer.main
+import yaml
+from doc_commands import Shown, pieces, printed
+from own_effect import PAGE as OWN_EFFECT
+from own_effect import block, write_effect
+from typer.testing import CliRunner
+
+import vinetrack
+from vinetrack.cli.main import app
+from vinetrack.effects import EffectError, own_effects
+
+# README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on.
+
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LARGEST_PICTURE_BYTES = 200_000
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+
+def links(page: Path) -> list[str]:
+    found = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    return [link.split("#")[0] for link in found if not link.startswith(("http:", "https:", "#"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_pictures_lead_somewhere(page: Path) -> None:
+    assert [link for link in links(page) if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_pictures_are_small_and_open(page: Path) -> None:
+    from PIL import Image
+
+    for name in links(page):
+        if name.endswith((".png", ".webp")):
+            path = page.parent / name
+            assert path.stat().st_size < LARGEST_PICTURE_BYTES, name
+            with Image.open(path) as image:
+                assert min(image.size) > 200, name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_on_the_page_exist_with_their_options(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    lines = [line.strip().removeprefix("$ ") for line in text.splitlines() if line.startswith("    ")]
+    for line in lines:
+        words = line.removeprefix(".venv/bin/")
+        if not words.startswith("vinetrack ") or words.endswith("\\"):
+            continue
+        arguments = shlex.split(words.split("|")[0])[1:]
+        command = COMMANDS.get(arguments[0])
+        if command is None:
+            assert arguments[0].startswith(("--", "0", "1")), line
+            continue
+        command = getattr(command, "commands", {}).get(arguments[1], command) if len(arguments) > 1 else command
+        known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        asked = {word.split("=")[0] for word in arguments if re.match(r"--\w", word)}
+        assert asked - {"--help"} <= known, line
+
+
+def test_every_page_of_the_docs_is_reached_from_the_readme() -> None:
+    assert {page.name for page in PAGES[1:]} <= {Path(link).name for link in links(PAGES[0])}
+
+
+def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives() -> None:
+    text = PAGES[0].read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120
+    assert "![" in text.split("\n## ")[0]
+    for name, command in COMMANDS.items():
+        if command.rich_help_panel is None or "Stages" not in str(command.rich_help_panel):
+            assert f"`{name}" in text, name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_no_page_names_a_folder_of_the_machine_it_was_written_on(page: Path) -> None:
+    assert re.findall(r"(?<![\w.])/(?:tmp|home|root|work|Users)\b", page.read_text(encoding="utf-8")) == []
+
+
+def test_the_citation_and_the_changelog_name_the_version_of_the_package() -> None:
+    import vinetrack
+
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    released = re.findall(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [vinetrack.__version__]
+    assert released[:1] == [vinetrack.__version__]
+
+
+# The site of the documentation leaves no page out, and the reference names only what exists.
+
+
+def pages(entry: object) -> list[str]:
+    """Files that an entry of the site's navigation names, nested ones included."""
+    if isinstance(entry, str):
+        return [entry]
+    parts = entry.values() if isinstance(entry, dict) else entry
+    return [page for part in parts for page in pages(part)]  # type: ignore[attr-defined]
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    assert sorted(pages(site["nav"])) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+
+
+def test_the_reference_holds_all_that_the_package_offers() -> None:
+    import vinetrack
+
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    offered = set(vinetrack.__all__) - {"__version__", "effects", "FitError"}
+    assert not {name for name in offered if f".{name}\n" not in text}
+
+
+# docs/design.md: its commands print what stands below them, its pictures are made by them, its Python runs.
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "design.md"
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+COMMANDS_PAGE = [piece for piece in pieces(PAGE.read_text(encoding="utf-8")) if isinstance(piece, Shown)]
+QUICK = [shown for shown in COMMANDS_PAGE if "campaign" not in shown.arguments and "vine" not in shown.arguments]
+
+
+@pytest.mark.parametrize("shown", QUICK, ids=lambda shown: " ".join(shown.arguments[:4]))
+def test_a_command_prints_what_stands_below_it(shown: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To 2 %: another processor may round a draw to the other side."""
+    monkeypatch.chdir(tmp_path)
+    now = printed(shown)
+    assert NUMBER.sub("#", " ".join(now.split())) == NUMBER.sub("#", " ".join(shown.output.split()))
+    expected = [float(number) for number in NUMBER.findall(shown.output)]
+    assert [float(number) for number in NUMBER.findall(now)] == pytest.approx(expected, rel=0.02, abs=2e-4)
+
+
+def test_pictures_on_the_page_exist_and_are_made_by_its_commands() -> None:
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", PAGE.read_text(encoding="utf-8"))
+    made = [
+        argument.removeprefix("docs/") for shown in COMMANDS_PAGE for argument in shown.arguments if ".png" in argument
+    ]
+    assert pictures == made
+    assert all((PAGE.parent / name).is_file() for name in pictures)
+
+
+def test_the_python_on_the_page_runs() -> None:
+    code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert code is not None
+    known: dict[str, object] = {}
+    exec(code[1].replace("vt.predictive_inputs(trial))  ", "vt.predictive_inputs(trial), samples=50)  "), known)
+    assert known["prediction"].table["unit"].tolist()[0] == "m/s"  # type: ignore[attr-defined]
+
+
+# docs/own_effect.md: its effect and settings work as they stand there, and its messages are those that are given.
+
+
+SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    """A folder with the effect and the settings as the page writes them."""
+    write_effect(tmp_path)
+    (tmp_path / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
+    (tmp_path / "trials.csv").write_text(SHEET, encoding="utf-8")
+    (tmp_path / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
+    return tmp_path
+
+
+def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experiment: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    for arguments in (
+        ["tracks", experiment, results],
+        ["gather", experiment, results],
+        ["damping", results],
+        ["model", experiment, results],
+        ["figures", experiment, results, "--settings", '{"figures": {"dpi": 50}}'],
+        ["report", experiment, results],
+    ):
+        done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
+    assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]
+
+
+def test_what_the_page_shows_of_the_effect_is_what_is_printed(experiment: Path) -> None:
+    shown = next(piece for piece in pieces(OWN_EFFECT.read_text(encoding="utf-8")) if isinstance(piece, Shown))
+    assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
+    done = CliRunner().invoke(app, ["effects", "spring_line", "--experiment", str(experiment)])
+    assert done.stdout.strip().replace(str(experiment), "my_experiment") == shown.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("    tail force −k x\n", "", "the docstring must say what it is and show the formula on an indented line"),
+        ("def tail_force", "def pull", "defines none of the functions"),
+        ("(s, rig, k)", "(s, rig)", "tail_force(s, rig) must be tail_force(s, rig, k)"),
+        ('"N/m", 0.5', '"N/m", 50.0', "the default of k lies outside its bounds"),
+        ("from vinetrack", "1 / 0\nfrom vinetrack", "this effect cannot be read ("),
+        ("s.tail_position\n", "s.tail_place\n", "tail_force cannot be compiled: "),
+        ("-0.1,", "-0.2,", "tail_force gives -0.1 where worked out by hand it is -0.2 ("),
+    ],
+)
+def test_its_messages_are_those_that_are_given(tmp_path: Path, old: str, new: str, told: str) -> None:
+    text = block("python")
+    assert old in text
+    path = tmp_path / "spring_line.py"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(EffectError) as caught:
+        own_effects([path])
+    assert told in str(caught.value)
+    assert f"`{told}" in OWN_EFFECT.read_text(encoding="utf-8")
+
+
+# Examples in docstrings say what happens; those of names of `vinetrack` itself run in `interface`.
+
+
+ROOT_EXAMPLES = Path(vinetrack.__file__).parent
+ELSEWHERE = {f"{home}.{name}" for name, home in vinetrack._HOMES.items()}
+MODULES = sorted(
+    ".".join(("vinetrack", *path.relative_to(ROOT_EXAMPLES).with_suffix("").parts))
+    for path in ROOT_EXAMPLES.rglob("*.py")
+    if path.name != "__init__.py" and ">>> " in path.read_text(encoding="utf-8")
+)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_examples_of_a_module_say_what_happens(name):
+    said: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    for test in doctest.DocTestFinder().find(importlib.import_module(name), name):
+        if test.name not in ELSEWHERE:
+            runner.run(test, out=said.append)
+    assert not said, "".join(said)
