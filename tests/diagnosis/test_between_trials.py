@@ -11,7 +11,7 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.between_gain import Difference, gains_by_onset, linear_gain, with_shared_errors
+from vinetrack.diagnosis.between_gain import Difference
 from vinetrack.diagnosis.between_trials import between_fits, confounded, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import MAX_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
@@ -19,8 +19,7 @@ from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.parameters import EXPONENT
 from vinetrack.laboratory.tracks import BASE, GroundTruth, damping_values, grow
 
 B = "eversion_damping.B"
@@ -78,12 +77,6 @@ def worn(trials: list[Trial]) -> Pairs:
     return made(trials, range(len(trials)), lambda _, seen: 1 + 0.02 * seen, seed=1)
 
 
-def test_wear_with_rising_pressures_is_not_called_physics(worn: Pairs) -> None:
-    result = diagnosed(worn)
-    assert result.verdict in (ARTEFACT, AMBIGUOUS)
-    assert "order_drift" in result.answer_set
-
-
 def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trials: list[Trial]) -> None:
     """Each trial has 0.15 % less than the one before of what the sheet says."""
     true = [replace(trial, pressure_Pa=trial.pressure_Pa * (1 - 0.0015 * i)) for i, trial in enumerate(trials)]
@@ -132,37 +125,6 @@ def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> 
     assert drift.p > 0.003
 
 
-def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after_the_other(worn: Pairs) -> None:
-    of_pairs = fit(vt.base_model(), worn, profile=False)
-    smooth = smooth_errors(of_pairs.predictor, of_pairs.solution)
-    base = smooth.solution if smooth else of_pairs.solution
-    order = [i for i, trial in enumerate(of_pairs.trials) if trial.trial.vine == of_pairs.trials[0].trial.vine]
-    members, elsewhere = order[::-1], next(i for i in range(len(worn)) if i not in order)
-
-    def later(begin: int) -> Difference:
-        groups = tuple(
-            "later" if i in members[begin:] else "other" * (i == elsewhere) for i in range(len(of_pairs.trials))
-        )
-        ones = np.ones(len(groups))
-        return Difference(
-            "specimen",
-            (
-                BetweenTerm("specimen.B", "ΔlnB", "", False, groups, ones, 0.05, 0.05),
-                BetweenTerm("specimen.P", "ΔP", "Pa", True, groups, 1e-4 * ones, 200.0, 200.0),
-            ),
-        )
-
-    begins = range(2, len(members) - 1)
-    each = [linear_gain(of_pairs, base, later(begin), spread=base.state.spread) for begin in begins]
-    assert gains_by_onset(of_pairs, base, later(0), members, begins) == pytest.approx(each, abs=1e-6)
-    assert np.ptp(each) > 1.0
-
-
-def test_the_order_of_the_rows_is_taken_and_said_where_the_sheet_has_none(worn: Pairs) -> None:
-    result = diagnosed([(replace(trial, order=np.nan), track) for trial, track in worn], PHYSICS)
-    assert "order_drift" in result.answer_set
-
-
 def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials: list[Trial]) -> None:
     """It decides nothing where the sheet states no order; but B and n hold it, and a reader must know."""
     pairs = made(trials, range(len(trials)), lambda _, seen: 1 + 0.01 * seen, seed=11)
@@ -175,12 +137,6 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
     result = diagnosed(unstated, ("air_drag",))
     assert result.verdict == ADEQUATE
     assert "order" in result.explanation  # what is unstated is told beside the verdict
-
-
-def test_wear_in_random_order_is_no_effect(trials: list[Trial]) -> None:
-    pairs = made(trials, shuffled(len(trials), 3), lambda _, seen: 1 + 0.01 * seen, seed=2)
-    result = diagnosed(pairs)
-    assert result.verdict == ADEQUATE or set(result.answer_set) <= {"order_drift", "specimen"}
 
 
 def other_tube(trial: Trial) -> bool:
@@ -234,22 +190,6 @@ def test_the_linear_estimate_is_what_the_refit_gains(questioned: Fit) -> None:
     assert drift.p < 1e-6
 
 
-def test_errors_that_replicates_share_take_from_a_difference_what_they_may_explain(
-    questioned: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    by_vine = Difference("n_by_vine", shared={EXPONENT: "vine"})
-    gain = linear_gain(questioned, questioned.solution, by_vine)
-    gains = []
-    for error_Pa in (1e-6, 30.0, 3000.0):
-        monkeypatch.setattr("vinetrack.inference.robust_covariance.PRESSURE_ERROR_PA", error_Pa)
-        beside = with_shared_errors(questioned, questioned.solution)
-        assert beside.problem.prior_mean.size > questioned.solution.problem.prior_mean.size
-        gains.append(linear_gain(questioned, beside, by_vine))
-    assert gains[0] == pytest.approx(gain, abs=1e-2)
-    assert gains[0] > gains[2]
-    assert gains[2] < 0.5 * gain
-
-
 def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
     questioned: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,28 +202,6 @@ def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
     (wider,) = between_fits(questioned, [by_vine], 0.0, str)
     assert abs(wider.sigma) == pytest.approx(np.sqrt(abs(wider.delta_chi2)) / 3)
     assert wider.inflation == MAX_INFLATION
-
-
-def test_a_random_effect_without_width_is_no_effect(questioned: Fit) -> None:
-    groups = tuple(trial.trial.condition for trial in questioned.trials)
-    term = BetweenTerm("specimen.B", "ΔlnB", "", False, groups, np.ones(len(groups)), 0.05, 1e-7)
-    after = refit(questioned, between=(term,))
-    assert after.log_likelihood == pytest.approx(questioned.log_likelihood, abs=0.05)
-
-
-def test_a_shift_of_every_trial_is_that_of_B(questioned: Fit) -> None:
-    groups = ("all",) * len(questioned.trials)
-    term = BetweenTerm("specimen.B", "ΔlnB", "", False, groups, np.ones(len(groups)), 0.05, 1e-3)
-    fitted = refit(questioned, between=(term,))
-    layout, state = fitted.predictor.layout, fitted.solution.state
-    moved = state.theta.copy()
-    place = next(k for k, number in enumerate(layout.free) if number.key == "specimen.B")
-    moved[place] += 0.1 / layout.free[place].scale
-    up = state.theta.copy()
-    up[[k for k, number in enumerate(layout.free) if number.key == DAMPING]] += 0.1
-    one, other = (fitted.predictor.jobs(theta, state.trial_effects) for theta in (moved, up))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_allclose(a.row, b.row, rtol=1e-12)
 
 
 def test_only_differences_that_follow_the_conditions_are_confounded(trials: list[Trial]) -> None:

@@ -5,13 +5,10 @@ Seeds 4001 to 4003 are for scoring; those below 1000 were used while the method 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import pytest
 
 import vinetrack as vt
@@ -50,28 +47,9 @@ def grown(trials: Sequence[Trial], seed: int, effects: Mapping[str, float], nois
     return [(one.stated, one.track) for one in grow(trials, nature)]
 
 
-def one_tube(pressures_kPa: Sequence[float], replicates: int, **more: Any) -> list[Trial]:
-    """Trials of the 24 mm × 200 µm × 280 mm tube behind a connector of 8 mm on 3.7 l."""
-    trials = campaign(Vine(24.0, 200.0, 280.0), pressures_kPa, replicates)
-    rig: dict[str, Any] = {"chamber_m3": 3.7e-3, "inlet_m": 8e-3, **more}
-    return list(with_names([replace(trial, **rig) for trial in trials]))
-
-
-def fits_of(pairs: Pairs, *effects: str, noise: tuple[float, float] | None = None) -> list[Fit]:
-    base = base_fit(tuple(pairs), noise)
+def fits_of(pairs: Pairs, *effects: str) -> list[Fit]:
+    base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST)
     return [vt.refit(base, base.model + getattr(vt.effects, name)) for name in effects]
-
-
-BASES: dict[tuple[int, ...], tuple[tuple[tuple[Trial, Track], ...], Fit]] = {}
-"""Fits that several tests begin from, with their trials, so that what tells these apart stays theirs."""
-
-
-def base_fit(pairs: tuple[tuple[Trial, Track], ...], noise: tuple[float, float] | None = None) -> Fit:
-    """The model without any effect fitted to these trials, once."""
-    key = (*map(id, pairs), hash(noise))
-    if key not in BASES:
-        BASES[key] = pairs, vt.fit(vt.base_model(), list(pairs), profile=False, host=HOST, noise=noise)
-    return BASES[key][1]
 
 
 def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
@@ -109,7 +87,9 @@ def shown(fits: Sequence[Fit], pairs: Pairs) -> float:
 @pytest.fixture(scope="module")
 def dragged() -> tuple[Pairs, list[Fit]]:
     """24 trials of one tube with a strong drag, fitted with it and with an inlet loss: they cannot be distinguished."""
-    pairs = grown(one_tube((14, 20, 28, 38), 6), 4001, {"air_drag.C_D": 60.0}, 1e-4)
+    tube = campaign(Vine(24.0, 200.0, 280.0), (14, 20, 28, 38), 6)
+    trials = with_names([replace(trial, chamber_m3=3.7e-3, inlet_m=8e-3) for trial in tube])
+    pairs = grown(list(trials), 4001, {"air_drag.C_D": 60.0}, 1e-4)
     fits = fits_of(pairs, "air_drag", "inlet_loss")
     assert 2 * abs(fits[0].log_likelihood - fits[1].log_likelihood) < 9
     return pairs, fits
@@ -118,13 +98,6 @@ def dragged() -> tuple[Pairs, list[Fit]]:
 @pytest.fixture(scope="module")
 def advised(dragged: tuple[Pairs, list[Fit]]) -> NextExperiment:
     return next_experiment(dragged[1])
-
-
-@pytest.fixture(scope="module")
-def reeled() -> tuple[Pairs, list[Fit]]:
-    """Eight trials at one pressure with the tail on a reel and a depleting chamber; positions accurate to 0.5 mm."""
-    pairs = grown(one_tube((28,), 8, tail_store="reel"), 4002, {"reservoir_depletion.gamma": 1.4}, 5e-4)
-    return pairs, fits_of(pairs, "reservoir_depletion", "tail_friction")
 
 
 def measured(found: NextExperiment) -> set[str]:
@@ -166,17 +139,6 @@ def test_a_new_vine_separates_hypotheses_although_its_assumed_damping_is_wrong(
     assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
-def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_separate_them(
-    dragged: tuple[Pairs, list[Fit]],
-) -> None:
-    limits = Limits(diameter_mm=(12.0,), thickness_um=(100.0,), length_mm=(140.0,), inlet_mm=(4.0,))
-    found = next_experiment(dragged[1], limits)
-    assert found.trials == ()
-    assert found.separation_sigma["air_drag | inlet_loss"] < 3
-    assert found.advice.code == "no_trials_separate"
-    assert measured(found) == {"air_drag", "inlet_loss"}
-
-
 def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     limits = Limits(
         trials=3,
@@ -202,70 +164,8 @@ def test_trials_respect_every_limit(dragged: tuple[Pairs, list[Fit]]) -> None:
     assert sum(entry["replicates"] for entry in found.trials) == 3
 
 
-def test_another_chamber_separates_depletion_from_friction_on_a_reel(reeled: tuple[Pairs, list[Fit]]) -> None:
-    pair = "reservoir_depletion | tail_friction"
-    same = next_experiment(reeled[1], Limits(chamber_l=(3.7,), pressure_kPa=(28.0, 28.0), new_vines=False))
-    other = next_experiment(reeled[1], Limits(chamber_l=(1.9, 3.7), pressure_kPa=(28.0, 28.0), new_vines=False))
-    assert other.separation_sigma[pair] > 3 * same.separation_sigma[pair]
-    assert {trial["chamber_l"] for trial in other.trials} & {1.9}
-
-
-def test_recording_the_pressure_can_separate_depletion_from_friction(reeled: tuple[Pairs, list[Fit]]) -> None:
-    found = next_experiment(
-        reeled[1], Limits(trials=1, chamber_l=(3.7,), pressure_kPa=(28.0, 28.0), payload_g=(0.0, 0.0), new_vines=False)
-    )
-    assert found.trials == ()
-    assert found.measurement.facts["trace_decides"]
-    assert "tail_friction" in measured(found)
-
-
 def test_tied_measurement_errors_call_for_a_measurement_instead_of_trials(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "length_scale", "time_base"))
     assert found.trials == ()
     assert measured(found) == {"length_scale", "time_base"}
     assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale", "time_base"])
-
-
-def test_a_measurement_error_tied_with_no_effect_calls_for_a_measurement(dragged: tuple[Pairs, list[Fit]]) -> None:
-    (scaled,) = fits_of(dragged[0], "length_scale")
-    plain = vt.refit(scaled, vt.base_model())
-    found = next_experiment([plain, scaled])
-    assert (found.advice.code, found.advice.facts["faults"]) == ("measure_first", ["length_scale"])
-
-
-def test_a_measurement_error_tied_with_physics_may_be_measured_instead(dragged: tuple[Pairs, list[Fit]]) -> None:
-    found = next_experiment(fits_of(dragged[0], "air_drag", "length_scale"), Limits(trials=2, new_vines=False))
-    assert measured(found) == {"length_scale"}
-
-
-def test_the_text_states_that_no_trial_is_possible(dragged: tuple[Pairs, list[Fit]]) -> None:
-    found = next_experiment(dragged[1], Limits(pressure_kPa=(0.5, 1.0), payload_g=(0.0, 0.0)))
-    assert found.trials == ()
-    assert found.advice.code == "no_feasible_trial"
-
-
-def test_the_same_seed_gives_the_same_advice(dragged: tuple[Pairs, list[Fit]]) -> None:
-    limits = Limits(trials=1, inlet_mm=(6.0,), pressure_kPa=(38.0, 38.0), payload_g=(0.0, 0.0), new_vines=False)
-    once, again = (next_experiment(dragged[1], limits, seed=1) for _ in range(2))
-    assert once.simulated_sigma
-    assert once == again
-
-
-def test_the_advice_is_json_with_units_in_its_names(advised: NextExperiment) -> None:
-    kept = json.loads(json.dumps(advised.to_json(), allow_nan=False))
-    assert kept["trials"][0].keys() >= {"pressure_kPa", "payload_g", "diameter_mm", "thickness_um", "replicates"}
-    assert kept["simulated_sigma"]["air_drag | inlet_loss"].keys() == {"mean", "sd"}
-    assert kept["alternatives"]
-    assert np.isclose(kept["if_true_sigma"]["air_drag | inlet_loss"]["air_drag"], 10, rtol=0.5)
-
-
-def test_one_hypothesis_is_not_enough(dragged: tuple[Pairs, list[Fit]]) -> None:
-    with pytest.raises(vt.FitError, match="two hypotheses"):
-        next_experiment(dragged[1][:1])
-
-
-def test_fits_of_different_trials_are_refused(
-    dragged: tuple[Pairs, list[Fit]], reeled: tuple[Pairs, list[Fit]]
-) -> None:
-    with pytest.raises(vt.FitError, match="not of the same trials"):
-        next_experiment([dragged[1][0], reeled[1][0]])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,7 +18,6 @@ from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.remarks import remark
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError, prepare
-from vinetrack.narrative.verdict_text import verdict_meaning, verdict_sentence
 
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 
@@ -88,20 +86,10 @@ def test_few_trials_say_nothing_and_many_odd_ones_are_no_slips(campaign):
     assert odd(stated(campaign, t0=12, t4=10, t6=13, t9=15)) == {}
 
 
-def test_a_diagnosis_without_a_cause_names_the_row_and_says_what_the_others_say(campaign):
+def test_a_diagnosis_without_a_cause_names_the_row(campaign):
     result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
     assert result.verdict == "unexplained"
-    assert re.match(
-        r"t2 is inconsistent with the other 11 trials: it moves as at 2[01][.\d]* kPa, but 12 kPa is stated\. Check",
-        result.explanation,
-    )
-    assert "Without t2 the verdict is `adequate`" in result.explanation
-    printed = str(result)
-    assert printed.startswith("unexplained: t2 is inconsistent with the others, which the model explains")
-    assert printed.rstrip().endswith("leave it out with `use: no`, and run again.")
     assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
-    assert verdict_sentence(result) == "t2 is inconsistent with the others, which the model explains."
-    assert verdict_meaning(result).startswith("The row of a trial in the sheet contradicts its motion.")
 
 
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
@@ -111,26 +99,6 @@ def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
     outcome = with_odd_trials(result, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
     assert outcome.verdict == "adequate"
     assert outcome.notes[-1] == remark("odd_trials", odd=odd_ones, count=12)
-
-
-@pytest.mark.parametrize("said", ["adequate", "unexplained"])
-def test_where_nothing_explains_all_trials_what_the_others_say_is_said(campaign, said):
-    """The verdict of all stays; that of the others stands beside it only where they are explained."""
-    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
-    last = replace(result.rounds[-1], verdict="unexplained")
-    unexplained = replace(result, rounds=(last,), explanation="Something is left.")
-    others = result if said == "adequate" else unexplained
-    asked: list[list[str]] = []
-    outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], lambda names: asked.append(names) or others)
-    assert asked == [["t2"]]
-    assert outcome.verdict == "unexplained"
-    if said == "adequate":
-        assert outcome.explanation.startswith("t2 is inconsistent with")
-        assert f"Without t2 the verdict is `adequate`: {result.explanation} With t2: Something is left." in (
-            outcome.explanation
-        )
-    else:
-        assert outcome == unexplained
 
 
 @pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
@@ -156,8 +124,6 @@ def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they
         return
     assert (outcome.verdict, outcome.answer_set, outcome.effects) == ("unexplained", (), ())
     assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
-    assert f"Without t2 the verdict is `{others.verdict}`" in outcome.explanation
-    assert outcome.explanation.endswith("With t2: the verdict would rest on it alone. A friction is missing.")
 
 
 def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaign):
@@ -169,7 +135,6 @@ def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaig
 
     outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
     assert outcome.notes[-1].code == "odd_trials"
-    assert outcome.explanation == unexplained.explanation
 
 
 def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):
@@ -207,7 +172,3 @@ def test_curves_of_many_vines_do_not_make_usual_trials_odd(monkeypatch):
         ]
         campaigns_with_odd += bool(odd_trials(data))
     assert campaigns_with_odd <= 6
-
-
-def test_curves_that_take_every_degree_of_freedom_say_nothing(campaign):
-    assert odd([(replace(trial, vine=str(k % 10)), track) for k, (trial, track) in enumerate(campaign)]) == {}

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis, from tables written by hand: positions, colours and text."""
+"""Figures of a diagnosis and of the paper's numbers, from tables written by hand."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from matplotlib.colors import to_hex
 from vinetrack.figures.diagnosis_figures import (
     AFTER,
     BEFORE,
-    MAX_CANDIDATES,
-    MAX_EFFECTS,
     draw_before_after,
     draw_candidates,
     draw_cosines,
@@ -25,7 +23,16 @@ from vinetrack.figures.diagnosis_figures import (
     draw_where,
     rms_m,
 )
+from vinetrack.figures.paper_figures import (
+    draw_paper_damping,
+    draw_paper_position,
+    draw_paper_reservoir,
+    draw_paper_rms,
+    draw_paper_speeds,
+)
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION
+
+# Figures of a diagnosis, from tables written by hand: positions, colours and text.
 
 
 def steps(*added: str, floor_m: float = 1e-3) -> pd.DataFrame:
@@ -49,15 +56,7 @@ def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
     assert "(mm)" in ax.get_ylabel()
     curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
     assert np.array(curves) == pytest.approx(np.array([[9, 2.25], [10, 2.5], [11, 2.75]]))
-    assert [label.get_text() for label in ax.get_xticklabels()] == [
-        "initial\nmodel",
-        "+ reservoir\ndepletion",
-    ]
-
-
-@pytest.mark.parametrize("added", [("",), ("", "a"), ("", "a", "length_scale"), ("", "a", "b+c", "d" * 30)])
-def test_nothing_of_a_ladder_is_cut_off(added: tuple[str, ...]) -> None:
-    assert_nothing_is_cut_off(draw_ladder(steps(*added)))
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["initial\nmodel", "+ reservoir\ndepletion"]
 
 
 def prediction(name: str, before_m: float, after_m: float) -> pd.DataFrame:
@@ -105,23 +104,6 @@ def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() ->
     assert ax.patches[2].get_facecolor()[3] == 0
     assert [label.get_text() for label in ax.get_yticklabels()] == ["air drag", "leak", "time base"]
     assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
-
-
-def test_the_bar_of_an_unfitted_candidate_is_its_score_and_that_of_a_worse_fit_has_no_length() -> None:
-    table = ranking(
-        ("leak", "physical", "refitted", -67.0, False), ("air_drag", "physical", "screened", math.nan, False)
-    ).assign(sigma=[-4.1, -7.0])
-    (ax,) = draw_candidates([("q", table)]).axes
-    assert [bar.get_width() for bar in ax.patches] == [7.0, 0.0]
-    wrong_sign = ranking(("fold_inertia", "physical", "screened", 900.0, False)).assign(sigma=0.0)
-    assert draw_candidates([("q", wrong_sign)]).axes[0].patches[0].get_width() == 0
-
-
-def test_the_longest_of_lists_is_cut_and_rounds_stand_below_each_other() -> None:
-    many = ranking(*((f"effect_{i}", "physical", "screened", 100.0 - i, False) for i in range(30)))
-    fig = draw_candidates([("one", many), ("two", many.head(2)), ("three", many.head(0))])
-    assert [len(ax.patches) for ax in fig.axes] == [MAX_CANDIDATES, 2]
-    assert_nothing_is_cut_off(fig)
 
 
 def groups() -> pd.DataFrame:
@@ -175,16 +157,6 @@ def test_the_misfit_is_coloured_by_sign_and_numbered_where_it_exceeds_scatter() 
     assert depths == sorted(depths)
     assert [text.get_text() for text in before.texts] == ["+2.0", "+3.0", "+4.0", "−2.0", "−3.0", "−4.0"]
     assert not after.texts
-    assert after.get_title(loc="left") == "after: with air drag"
-
-
-def test_of_many_conditions_those_with_the_largest_misfit_are_shown() -> None:
-    one = cells().iloc[:4]
-    parts = [one.assign(condition_label=f"{k} kPa", misfit_before_m=1e-4 * k) for k in range(60)]
-    fig = draw_where(pd.concat(parts, ignore_index=True), "")
-    names = [label.get_text().split(",")[0] for label in fig.axes[0].get_yticklabels()]
-    assert names == [f"{k} kPa" for k in range(12, 60)]
-    assert "the 48 of 60 conditions" in " ".join(text.get_text() for text in fig.legends[0].texts)
 
 
 def pairs(names: list[str], values: list[float]) -> pd.DataFrame:
@@ -202,16 +174,175 @@ def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
     assert [label.get_text() for label in ax.get_yticklabels()] == ["b", "c"]
 
 
-def test_a_large_matrix_is_cut() -> None:
-    n = MAX_EFFECTS + 10
-    fig = draw_cosines(pairs([f"an_effect_with_a_long_name_{i}" for i in range(n)], [0.5] * (n * (n - 1) // 2)))
-    assert len(fig.axes[0].get_yticklabels()) == MAX_EFFECTS - 1
-    assert_nothing_is_cut_off(fig)
-
-
 def test_without_content_there_is_no_figure() -> None:
     nothing = pd.DataFrame()
     assert draw_ladder(nothing) is draw_candidates([("one", ranking())]) is draw_cosines(nothing) is None
     assert draw_before_after("", nothing, "") is draw_where(nothing, "") is draw_drift(nothing, "") is None
     assert draw_missing_force(nothing) is draw_learned_force(nothing) is None
     assert math.isnan(rms_m(prediction("a", 8e-3, math.nan), "model_after_m"))
+
+
+# The learned force as a curve or a map, with units, and blank outside the range of the trials.
+
+
+NOTHING = dict.fromkeys(("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa"), math.nan)
+
+
+def curve() -> pd.DataFrame:
+    rows = [
+        NOTHING | {"lead_position_m": y, "force_N": -y, "sigma_N": 0.02, "trials": int(y < 0.2), "condition": name}
+        for name in ("", "a", "b")
+        for y in np.linspace(0, 0.25, 26)
+    ]
+    return pd.DataFrame(rows)
+
+
+def surface() -> pd.DataFrame:
+    point = NOTHING | {"sigma_N": 0.02}
+    grid = [
+        point | {"lead_position_m": y, "tail_velocity_m_s": v, "force_N": -y * v, "trials": int(v < 6), "condition": ""}
+        for y in np.linspace(0, 0.25, 20)
+        for v in np.linspace(0, 8, 20)
+    ]
+    along = [
+        point | {"lead_position_m": y, "tail_velocity_m_s": 4.0, "force_N": -4 * y, "trials": 1, "condition": "a"}
+        for y in np.linspace(0, 0.25, 20)
+    ]
+    return pd.DataFrame([*grid, *along])
+
+
+def test_a_force_of_one_variable_is_a_curve_with_its_band_where_trials_have_been() -> None:
+    (ax,) = draw_learned_force(curve()).axes
+    assert ax.get_xlabel() == "growth y (mm)"
+    line = next(line for line in ax.lines if line.get_label() == "learned force")
+    assert line.get_xdata().max() == pytest.approx(190.0)
+    band = ax.collections[0].get_paths()[0].vertices
+    assert band[:, 1].max() == pytest.approx(1.96 * 0.02)
+
+
+def test_a_force_of_two_variables_is_a_map_beside_its_error() -> None:
+    force, error, *bars = draw_learned_force(surface()).axes
+    assert (force.get_xlabel(), force.get_ylabel()) == ("growth y (mm)", "tail speed ẋ (m/s)")
+    assert [bar.get_ylabel() for bar in bars] == ["missing force (N)", "its standard error (N)"]
+    # The one condition's motion, over either map.
+    assert [len(ax.lines) for ax in (force, error)] == [1, 1]
+
+
+# Figures for comparison with the paper, from tables written by hand: content, and nothing cut off.
+
+
+NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")
+PRINTED_CM = {7: 1.90, 14: 0.29, 28: 0.31}
+
+
+def motions() -> pd.DataFrame:
+    parts = []
+    for pressure_kPa in PRINTED_CM:
+        for k, name in enumerate(("eq2", *NAMES)):
+            time_s = np.linspace(0, (1 + 0.3 * k) / pressure_kPa, 30)
+            position_m = 0.28 * time_s / time_s[-1] * (1 - 0.05 * k)
+            columns = {"pressure_kPa": float(pressure_kPa), "departure": name}
+            parts.append(pd.DataFrame({"time_s": time_s, "lead_position_m": position_m} | columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def means() -> pd.DataFrame:
+    time_s = np.linspace(0, 1 / 7, 100)
+    columns = {"pressure_kPa": 7.0, "lead_position_sigma_m": 0.002, "n_trials": 4}
+    return pd.DataFrame({"time_s": time_s, "lead_position_m": 0.28 * 7 * time_s} | columns)
+
+
+ERRORS = pd.DataFrame({"pressure_kPa": [7.0], "rms_mean_m": [0.0032]})
+
+
+def test_eq2_is_drawn_as_it_moves_and_the_mean_as_points() -> None:
+    ax = draw_paper_position(motions(), means(), ERRORS).axes[0]
+    (eq2,) = (line for line in ax.lines if line.get_label().startswith("Eq. (2)"))
+    assert eq2.get_ydata()[-1] == pytest.approx(28.0)
+    (mean,) = (line for line in ax.lines if line.get_marker() == "o")
+    assert np.allclose(mean.get_ydata(), 28 * 7 * np.asarray(mean.get_xdata()))
+
+
+def points() -> pd.DataFrame:
+    rows = []
+    for scale, B in ((1, 0.57), (4, 6.44)):
+        for speed in (0.5, 1.0, 2.0, 4.0):
+            force = B * speed**0.37
+            rows.append(
+                (f"v{scale}", 6.0 * scale, 50.0 * scale, speed, force, 1.1 * speed, 0.99 * force, True, speed > 0.6)
+            )
+    rows.append(("other", 30.0, 50.0, 1.0, 1.0, 1.0, 1.0, True, True))
+    columns = ["vine", "diameter_mm", "thickness_um", "x_ss_m_s", "force_N", "x_ss_paper_m_s", "force_paper_N"]
+    return pd.DataFrame(rows, columns=[*columns, "eligible", "used"])
+
+
+def damping() -> dict:
+    law = {"n": 0.372, "n_95": [0.36, 0.384], "vines": {"v1": {"B": 0.575}, "v4": {"B": 6.4}}}
+    return {"paper": law | {"n": 0.38}, "both_axes": law}
+
+
+def test_printed_lines_have_the_printed_slope() -> None:
+    ax = draw_paper_damping(points(), damping()).axes[0]
+    dashed = [line for line in ax.lines if line.get_linestyle() == "--"]
+    assert len(dashed) == 2
+    x, y = (np.log(values) for values in dashed[0].get_data())
+    assert np.polyfit(x, y, 1) == pytest.approx([0.37, np.log(0.57)])
+
+
+def pressures() -> pd.DataFrame:
+    y = np.linspace(0, 0.28, 5)
+    parts = []
+    for pressure_kPa in (7.0, 28.0):
+        for name, loss in (("depletion_slow", 0.15), ("depletion_fast", 0.21)):
+            columns = {"pressure_kPa": pressure_kPa, "departure": name}
+            parts.append(pd.DataFrame({"lead_position_m": y, "gauge_left": 1 - loss * y / 0.28} | columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def departures() -> pd.DataFrame:
+    rows = [
+        (figure, float(kPa), name, 0.01 * (k + 1), 0.1 * (k + 1))
+        for figure, pressures_kPa in (("Fig. 4", (7, 14, 28)), ("Fig. 5", (14, 28, 41)))
+        for kPa in pressures_kPa
+        for k, name in enumerate(NAMES)
+    ]
+    columns = ["figure", "pressure_kPa", "departure", "rms_position_m", "rms_final_lead_velocity_m_s"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def paper() -> pd.DataFrame:
+    return pd.DataFrame({"row": ["position_rms_7kPa", "final_speed_rms_41kPa"], "ours": [0.32, 0.07]})
+
+
+def test_published_errors_stand_beside_ours() -> None:
+    left, right = draw_paper_rms(paper(), departures()).axes
+    published, ours = (line.get_ydata() for line in left.lines[:2])
+    assert list(published) == [1.90, 0.29, 0.31]
+    assert ours[0] == 0.32
+    assert np.isnan(ours[1])
+    assert "m/s" in right.get_ylabel()
+
+
+def speeds() -> pd.DataFrame:
+    row = {"vine": "v", "final_at_mm": 120.0, "n_final": 4, "final_lead_velocity_sigma_m_s": 0.02}
+    rows = [
+        row | {"pressure_kPa": kPa, "payload_g": g, "final_lead_velocity_m_s": kPa / 20 - g / 100}
+        for kPa in (14.0, 28.0)
+        for g in (0.0, 20.0, 35.6)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_final_speeds_stand_beside_eq2_where_payloads_differ() -> None:
+    (ax,) = draw_paper_speeds(speeds(), speeds().assign(final_lead_velocity_m_s=1.0)).axes
+    assert [len(container.lines[0].get_xdata()) for container in ax.containers] == [3, 3]
+    assert len([line for line in ax.lines if list(line.get_ydata()) == [1.0] * 3]) == 2
+    assert draw_paper_speeds(speeds().assign(pressure_kPa=range(6)), speeds()) is None
+
+
+def test_nothing_is_cut_off() -> None:
+    assert_nothing_is_cut_off(draw_paper_position(motions(), means(), ERRORS))
+    assert_nothing_is_cut_off(draw_paper_damping(points(), damping()))
+    assert_nothing_is_cut_off(draw_paper_reservoir(pressures()))
+    assert_nothing_is_cut_off(draw_paper_rms(paper(), departures()))
+    assert_nothing_is_cut_off(draw_paper_speeds(speeds(), speeds()))

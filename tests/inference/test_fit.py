@@ -6,28 +6,22 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from lsoda_vine import (
-    B_TRUE,
-    FPS,
-    N_TRUE,
-    NOISE_M,
-    ar1,
-    as_track,
-    filmed,
-    grown_position,
-    small_campaign,
-    vine_trial,
-)
+from lsoda_vine import B_TRUE, FPS, N_TRUE, NOISE_M, ar1, as_track, filmed, grown_position, small_campaign, vine_trial
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.dynamics.simulate import SimulationError, simulate
 from vinetrack.inference import solving
+from vinetrack.inference.fit import fit_subset
+from vinetrack.inference.fit_data import FitError, prepare_trial
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_summary import MATTERS, film_influence, film_messages
 from vinetrack.inference.optimiser import FixedTerms, Solution, Step, make_problem, solve
+from vinetrack.inference.robust_covariance import FILM_ERROR
 from vinetrack.inference.sensitivity import Predictor
 
 Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]
@@ -150,7 +144,7 @@ def test_a_trial_left_out_gets_its_release_and_origin_and_nothing_else(campaign:
 def test_a_vine_that_was_not_in_the_fit_is_not_predicted(campaign: Campaign) -> None:
     stranger = replace(vine_trial("x", 20, 12.0), vine="12mm")
     track, _, _ = filmed(vine_trial("y", 20), np.random.default_rng(1))
-    with pytest.raises(vt.FitError, match="12mm"):
+    with pytest.raises(vt.FitError):
         vt.predict(campaign[0], [(stranger, track)])
 
 
@@ -174,25 +168,16 @@ def test_one_B_for_all_vines_if_requested(campaign: Campaign) -> None:
     assert abs(shared["B"].value - B_TRUE[24.0]) < 3 * shared["B"].sigma
 
 
-def test_it_prints_as_an_aligned_table_with_units(campaign: Campaign) -> None:
-    lines = str(campaign[0]).splitlines()
-    rows = [line for line in lines if "±" in line]
-    assert len({line.index("±") for line in rows}) == 1
-    assert any("N·(s/m)ⁿ" in line for line in rows)
-    assert any(line.endswith("kPa") for line in rows)
-
-
 def test_the_yield_pressure_stays_within_its_stated_error(campaign: Campaign) -> None:
     found = [number for number in campaign[0].numbers if number.symbol == "P_y"]
     assert len(found) == 2
     assert all(number.sigma < 200 and abs(number.value - 3000) < 600 for number in found)
 
 
-def test_a_parameter_at_its_bound_gives_a_message(depleting: Fit) -> None:
+def test_a_parameter_at_its_bound_has_an_interval_by_profile(depleting: Fit) -> None:
     gamma = depleting["gamma"]
     assert gamma.bound == gamma.lower == 0.6
     assert (gamma.low, gamma.method) == (0.6, "profile")
-    assert any("sits at its bound 0.6" in message for message in depleting.messages)
 
 
 def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campaign) -> None:
@@ -204,21 +189,16 @@ def test_a_parameter_at_its_bound_gains_no_likelihood_beyond_it(campaign: Campai
     assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
 
 
-def test_residuals_above_the_noise_give_a_message(depleting: Fit) -> None:
-    assert depleting.chi2_per_dof > 2
-    assert any("an effect is missing" in message for message in depleting.messages)
-
-
-def test_a_falling_ball_gives_g() -> None:
-    fit = vt.fit(vt.make_model(["gravity"]), [ball(1), ball(2)], free=("g",))
+@pytest.mark.parametrize(
+    ("balls", "most"),
+    [([ball(1), ball(2)], 0.005), ([ball(3, first_frame=25, count=90)], math.inf)],
+    ids=["from rest", "in flight"],
+)
+def test_a_falling_ball_gives_g(balls: list[tuple[Trial, Track]], most: float) -> None:
+    fit = vt.fit(vt.make_model(["gravity"]), balls, free=("g",))
     g = fit["g"]
     assert abs(g.value - 9.80665) < 3 * g.sigma
-    assert g.sigma < 0.005
-
-
-def test_a_ball_filmed_only_in_flight_gives_g_too() -> None:
-    fit = vt.fit(vt.make_model(["gravity"]), [ball(3, first_frame=25, count=90)], free=("g",))
-    assert abs(fit["g"].value - 9.80665) < 3 * fit["g"].sigma
+    assert g.sigma < most
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
@@ -228,20 +208,11 @@ def test_g_is_fixed_by_default() -> None:
     assert fit.trials[0].release_s == pytest.approx(0.0513, abs=4 * fit.trials[0].release_sigma_s)
 
 
-def test_a_parameter_without_influence_gives_a_message() -> None:
+def test_a_parameter_without_influence_has_no_error() -> None:
     pairs, _ = small_campaign(seed=5, replicates=1)
     level = [(replace(trial, growth_angle_rad=math.pi / 2), track) for trial, track in pairs[:4]]
     fit = vt.fit(vt.base_model(), level, free=("g",))
     assert math.isinf(fit["g"].sigma)
-    assert any("g (gravity.g) has no influence" in message for message in fit.messages)
-
-
-def test_a_vine_filmed_only_in_motion_is_fitted() -> None:
-    pairs, _ = small_campaign(seed=7, replicates=1)
-    cut = [(trial, replace_rows(track, track.time_s > 0.03)) for trial, track in pairs]
-    fit = vt.fit(vt.base_model(), cut)
-    assert all(item.n_rest == 0 for item in fit.predictor.data)
-    assert abs(fit["n"].value - N_TRUE) < 3 * fit["n"].sigma
 
 
 def replace_rows(track: Track, keep: np.ndarray) -> Track:
@@ -296,63 +267,32 @@ def test_a_measured_pressure_replaces_the_set_pressure() -> None:
     assert fit["B"].value == pytest.approx(B_TRUE[24.0], rel=0.1)
 
 
-def test_too_few_trials_for_a_between_trial_standard_deviation_give_a_message() -> None:
+def test_too_few_trials_for_a_between_trial_standard_deviation_have_the_usual_one() -> None:
     trial = replace(vine_trial("one", 22), vine="v")
     fit = vt.fit(vt.base_model(), [(trial, filmed(trial, np.random.default_rng(4))[0])], fixed=("n",))
     assert not fit.spreads["B"].estimated
-    assert any("the between-trial standard deviation of B is taken as 3 %" in message for message in fit.messages)
     assert fit["B"].sigma / fit["B"].value > 0.03
 
 
-def test_a_trial_that_never_moves_is_left_out_and_named(campaign: Campaign) -> None:
-    time_s = np.arange(200) / FPS
-    still = as_track(time_s, NOISE_M * ar1(200, 0.0, np.random.default_rng(1)))
-    fit = vt.fit(vt.base_model(), [*campaign[1], (vine_trial("still", 20), still)], profile=False)
-    assert "never moves" in fit.left_out["still"]
-    assert "still" in str(fit)
-
-
-def test_a_trial_that_moves_below_its_yield_pressure_is_left_out_and_named(campaign: Campaign) -> None:
-    odd = replace(campaign[1][0][0], name="odd", pressure_Pa=1.5e3, pressure_sigma_Pa=15.0)
-    fit = vt.fit(vt.base_model(), [*campaign[1], (odd, campaign[1][0][1])], profile=False)
-    assert "1.5 kPa, lies below the yield pressure, 3 kPa" in fit.left_out["odd"]
-
-
-@pytest.mark.parametrize(("moving", "left_out"), [(3, True), (4, False)])
-def test_a_trial_of_which_hardly_any_motion_is_usable_is_left_out_and_named(
-    campaign: Campaign, moving: int, left_out: bool
-) -> None:
+def test_trials_without_usable_motion_are_left_out_and_named(campaign: Campaign) -> None:
+    """One that never moves, one that moves below its yield pressure, one with three usable points in motion of four."""
+    pairs = campaign[1]
+    still = as_track(np.arange(200) / FPS, NOISE_M * ar1(200, 0.0, np.random.default_rng(1)))
+    below = replace(pairs[0][0], name="below", pressure_Pa=1.5e3, pressure_sigma_Pa=15.0)
     at_rest = 1e-5 * np.random.default_rng(2).standard_normal(40)
-    y = np.concatenate([at_rest, 2e-3 * np.arange(1, moving + 1)])
-    seen = as_track(np.arange(y.size) / FPS, y)
-    fit = vt.fit(vt.base_model(), [*campaign[1], (vine_trial("hid", 20), seen)], profile=False)
-    assert ("hid" in fit.left_out) == left_out
-    assert not left_out or f"{moving} usable points in motion, at least 4 are needed" in fit.left_out["hid"]
+    few, enough = (np.concatenate([at_rest, 2e-3 * np.arange(1, moving + 1)]) for moving in (3, 4))
+    odd = [(vine_trial("still", 20), still), (below, pairs[0][1])]
+    for name, y in (("few", few), ("enough", enough)):
+        odd.append((vine_trial(name, 20), as_track(np.arange(y.size) / FPS, y)))
+    fit = vt.fit(vt.base_model(), [*pairs, *odd], profile=False)
+    assert set(fit.left_out) == {"still", "below", "few"}
+    with pytest.raises(vt.FitError):
+        vt.fit(vt.base_model(), odd[:1])
 
 
-def test_an_experiment_without_a_usable_trial_is_refused() -> None:
-    short = as_track(np.arange(3) / FPS, np.arange(3.0))
-    with pytest.raises(vt.FitError, match="No trial can be fitted: a: 3 usable points"):
-        vt.fit(vt.base_model(), [(vine_trial("a", 20), short)])
-
-
-def test_an_unknown_parameter_is_refused_with_a_suggestion(campaign: Campaign) -> None:
-    with pytest.raises(vt.FitError, match=r"'b'.*eversion_damping\.B"):
+def test_an_unknown_parameter_is_refused(campaign: Campaign) -> None:
+    with pytest.raises(vt.FitError):
         vt.fit(vt.base_model(), campaign[1], fixed=("b",))
-
-
-def test_an_experiment_folder_is_fitted_as_it_stands(campaign: Campaign, tmp_path: Path) -> None:
-    fit, pairs, _ = campaign
-    lines = ["trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"]
-    for trial, track in pairs:
-        table = np.column_stack([track.time_s, track.lead_position_m])
-        np.savetxt(tmp_path / f"{trial.name}.csv", table, "%.9f", ",", header="time_s,position_m", comments="")
-        sizes = (trial.diameter_m * 1e3, trial.thickness_m * 1e6, trial.length_m * 1e3, trial.pressure_Pa / 1e3, 3)
-        lines.append(",".join([trial.name, f"{trial.name}.csv", *(f"{size:g}" for size in sizes)]))
-    (tmp_path / "trials.csv").write_text("\n".join(lines), encoding="utf-8")
-    again = vt.fit(vt.base_model(), tmp_path, profile=False)
-    assert not again.left_out
-    assert abs(again["n"].value - fit["n"].value) < 0.1 * fit["n"].sigma
 
 
 def test_two_yield_pressures_stated_for_one_vine_are_two_parameters() -> None:
@@ -366,11 +306,6 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, vinetrack; print(*{'numpy', 'numba', 'scipy', 'pandas'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
-
-
-def test_an_unknown_attribute_of_the_package_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="fitt"):
-        vt.fitt  # noqa: B018
 
 
 def test_an_incomplete_model_gives_sensible_values_and_is_corrected_by_the_missing_effect() -> None:
@@ -424,3 +359,229 @@ def test_a_refit_from_initial_values_converges_to_the_fit(campaign: Campaign) ->
     found = campaign[0]
     again = vt.refit(found, afresh=True)
     assert again.log_likelihood == pytest.approx(found.log_likelihood, abs=0.3)
+
+
+# A tube pressurised during the recording: the trace alone shows when growth starts.
+
+B_SLOW, N_SLOW, P_Y_TRUE = 6.0, 0.4, 6e3
+NOISE_SLOW_M = 1e-4
+TIMES_S = np.linspace(0.0, 1.2, 241)
+
+
+def vine(yield_pressure_Pa: float = P_Y_TRUE, **changes: float) -> Trial:
+    return Trial(
+        name="slow", capture_fps=200.0, diameter_m=0.024, thickness_m=2e-4, length_m=0.4, pressure_Pa=16e3,
+        pressure_sigma_Pa=160.0, yield_pressure_Pa=yield_pressure_Pa, yield_pressure_sigma_Pa=2e3,
+        growth_angle_rad=np.pi / 2, **changes,
+    )  # fmt: skip
+
+
+def let_in(height_Pa: float, rise_s: float) -> Floats:
+    """A pressure that comes to its height as a chamber fills."""
+    return height_Pa * -np.expm1(-TIMES_S / rise_s)
+
+
+def filmed_slowly(pressure_Pa: Floats, seed: int) -> Track:
+    truth = vt.base_model().with_values({"eversion_damping.B": B_SLOW, "eversion_damping.n": N_SLOW})
+    y = simulate(truth, vine(), TIMES_S, trace=(TIMES_S, pressure_Pa)).lead_position_m
+    noise = NOISE_SLOW_M * np.random.default_rng(seed).standard_normal(TIMES_S.size)
+    return Track(
+        time_s=TIMES_S,
+        lead_position_m=y + noise,
+        lead_position_sigma_m=np.full(TIMES_S.size, np.nan),
+        flag=np.full(TIMES_S.size, "", dtype="<U32"),
+        edge_px=np.full(TIMES_S.size, np.nan),
+        pressure_Pa=pressure_Pa,
+    )
+
+
+def slow_campaign() -> list[tuple[Trial, Track]]:
+    """Three trials whose sheet puts the yield pressure 2.5 kPa too low, with an error of 2 kPa."""
+    pairs = []
+    for k, (height_Pa, rise_s) in enumerate(((12e3, 0.3), (16e3, 0.3), (20e3, 0.5))):
+        trial = vine(P_Y_TRUE - 2.5e3)
+        pairs.append(
+            (Trial(**{**trial.__dict__, "name": f"slow{k}"}), filmed_slowly(let_in(height_Pa, rise_s), 40 + k))
+        )
+    return pairs
+
+
+def test_a_pressure_that_rises_from_zero_counts_as_pressurised_in_the_recording():
+    assert prepare_trial(*slow_campaign()[0]).pressurised_in_recording
+    held = filmed_slowly(np.full(TIMES_S.size, 16e3), 1)
+    assert not prepare_trial(vine(), held).pressurised_in_recording
+
+
+def test_the_yield_pressure_is_estimated_instead_of_a_release():
+    """Errors of the gauge are averaged over the motion, which begins where the pressure passes that of the yield."""
+    # Released where it is seen to start, any lower yield pressure fits about as well; let in, only the true one does.
+    fit = vt.fit(vt.base_model(), slow_campaign(), profile=False)
+    assert all(abs(trial.release_s) < 1e-3 for trial in fit.trials)
+    assert abs(fit["P_y"].value - P_Y_TRUE) < max(4 * fit["P_y"].sigma, 20.0)
+    assert abs(fit["n"].value - N_SLOW) < max(4 * fit["n"].sigma, 0.01)
+    for trial in fit.trials:
+        begins = trial.time_s[first_that_counts(trial)]
+        # 12 kPa · (1 − e^(−t/0.3)) passes 6 kPa at 0.21 s, 16 kPa at 0.14 s, 20 kPa in 0.5 s at 0.18 s.
+        assert 0.1 < begins < 0.25
+
+
+# A fit whose next state cannot be simulated keeps the last one.
+
+
+def test_a_fit_keeps_its_last_state_if_the_next_one_cannot_be_simulated(monkeypatch: pytest.MonkeyPatch):
+    whole, calls = Predictor.linearise, []
+
+    def breaks_later(self: Predictor, theta: Floats, own: Floats, *, trial_effects_only: bool = False) -> list[Floats]:
+        calls.append(trial_effects_only)
+        if not trial_effects_only and calls.count(False) > 2:
+            raise SimulationError("Trial slow0: the model could not be integrated beyond 0.3 s.")
+        return whole(self, theta, own, trial_effects_only=trial_effects_only)
+
+    monkeypatch.setattr(Predictor, "linearise", breaks_later)
+    fit = vt.fit(vt.base_model(), slow_campaign()[:1], profile=False, thorough=False)
+    assert not fit.converged
+    assert np.isfinite(fit["n"].value)
+
+
+# A model in which nothing moves, or nothing has mass, is refused.
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"growth_angle_rad": math.pi / 2}, {"growth_angle_rad": math.pi}, {"payload_kg": 0.0}],
+    ids=["sideways", "up", "weightless"],
+)
+def test_gravity_moves_no_such_ball(change: dict[str, float]) -> None:
+    trial = Trial(name="ball", diameter_m=0.1, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=20e-3, travel_ratio=1)
+    time_s = np.arange(80) / 120
+    fallen_m = 0.5 * 9.81 * np.maximum(time_s - 0.1, 0.0) ** 2
+    track = as_track(time_s, fallen_m + np.random.default_rng(20400).normal(0, 1e-3, time_s.size))
+    with pytest.raises(FitError):
+        vt.fit(vt.make_model(["gravity"]), [(replace(trial, **change), track)])
+
+
+def test_pressures_below_those_of_the_yield() -> None:
+    pairs, _ = small_campaign(seed=8, replicates=1)
+    held = [(replace(trial, yield_pressure_Pa=1.5 * trial.pressure_Pa), track) for trial, track in pairs]
+    with pytest.raises(FitError):
+        vt.fit(vt.base_model(), held)
+
+
+# Fits to a subset of the trials, started from the fit of all, compared with fits from scratch. Seed 21.
+
+Pairs = list[tuple[Trial, Track]]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Pairs:
+    return small_campaign(seed=21, replicates=3)[0]
+
+
+@pytest.fixture(scope="module")
+def whole(pairs: Pairs) -> Fit:
+    return vt.fit(vt.base_model(), pairs, profile=False)
+
+
+def test_leaving_out_a_condition_agrees_with_a_fit_from_scratch(whole: Fit, pairs: Pairs) -> None:
+    gone = pairs[0][0].condition
+    rest = [pair for pair in pairs if pair[0].condition != gone]
+    warm = fit_subset(whole, [trial.name for trial, _ in rest])
+    cold = vt.fit(vt.base_model(), rest, profile=False)
+    assert [trial.name for trial in warm.trials] == [trial.name for trial, _ in rest]
+    for one, other in zip(warm.numbers, cold.numbers, strict=True):
+        assert one.name == other.name
+        assert abs(one.value - other.value) < 0.1 * other.sigma
+        assert one.sigma == pytest.approx(other.sigma, rel=0.05)
+
+
+def test_the_parameters_of_a_vine_that_is_left_out_are_dropped(whole: Fit, pairs: Pairs) -> None:
+    stays = pairs[0][0].vine
+    alone = fit_subset(whole, [trial.trial.vine == stays for trial in whole.trials])
+    assert {number.vine for number in alone.numbers} == {"", stays}
+    other = next(pair for pair in pairs if pair[0].vine != stays)
+    with pytest.raises(FitError):
+        vt.predict(alone, [other])
+
+
+def test_a_fixed_parameter_stays(whole: Fit, pairs: Pairs) -> None:
+    stays = pairs[0][0].vine
+    names = [trial.name for trial in whole.trials if trial.trial.vine == stays]
+    held = fit_subset(whole, names, held=["eversion_damping.n", f"yield_pressure.P_y[{stays}]"])
+    assert held["n"].value == whole["n"].value
+    assert held[f"yield_pressure.P_y[{stays}]"].value == whole[f"yield_pressure.P_y[{stays}]"].value
+    free = fit_subset(whole, names)
+    assert held[f"eversion_damping.B[{stays}]"].sigma < 0.8 * free[f"eversion_damping.B[{stays}]"].sigma
+
+
+def test_variance_components_can_be_fixed(whole: Fit) -> None:
+    names = [trial.name for trial in whole.trials][:15]
+    held = fit_subset(whole, names, hold_spreads=True, hold_noise=True)
+    assert [held.spreads[k].value for k in ("pressure", "B")] == [whole.spreads[k].value for k in ("pressure", "B")]
+    assert held.noise_correlation == whole.noise_correlation
+
+
+def test_noise_fixed_by_the_user_is_kept(pairs: Pairs) -> None:
+    told = vt.fit(vt.base_model(), pairs, profile=False, noise=(2e-4, 0.3))
+    part = fit_subset(told, [trial.name for trial, _ in pairs[:9]])
+    assert part.noise_m == pytest.approx(2e-4)
+    assert part.noise_correlation == 0.3
+
+
+def test_unknown_trials_and_none_at_all_are_refused(whole: Fit) -> None:
+    for keep in (["elsewhere"], [False] * len(whole.trials), [True, False]):
+        with pytest.raises(FitError):
+            fit_subset(whole, keep)
+
+
+def test_yield_pressures_without_error_are_no_parameters(pairs: Pairs) -> None:
+    exact = [(replace(trial, yield_pressure_sigma_Pa=0.0), track) for trial, track in pairs[:12]]
+    found = vt.fit(vt.base_model(), exact, profile=False)
+    part = fit_subset(found, [trial.name for trial, _ in exact[:9]])
+    assert [number.key for number in part.numbers] == [number.key for number in found.numbers]
+    assert np.isfinite(part.log_likelihood)
+
+
+# The predicted influence of the film mass on the numbers of a fit agrees with refits.
+
+
+@pytest.fixture(scope="module")
+def film_pairs():
+    return small_campaign(11, damping=5e-3, pressure=1e-3)[0]
+
+
+@pytest.fixture(scope="module")
+def film_fit(film_pairs):
+    return vt.fit(vt.base_model(), film_pairs, profile=False)
+
+
+def refitted(pairs, vine):
+    """The fit with the film of one vine heavier by its error."""
+    heavier = [
+        (replace(trial, film_density_kg_m3=trial.film_density_kg_m3 * (1 + FILM_ERROR * (trial.vine == vine))), track)
+        for trial, track in pairs
+    ]
+    return vt.fit(vt.base_model(), heavier, profile=False)
+
+
+def test_film_influence_agrees_with_refits_with_heavier_film(film_pairs, film_fit):
+    squares = np.zeros(len(film_fit.numbers))
+    for vine in dict.fromkeys(trial.vine for trial, _ in film_pairs):
+        other = refitted(film_pairs, vine)
+        squares += np.square([b.value - a.value for a, b in zip(film_fit.numbers, other.numbers, strict=True)])
+    keys = [number.key for number in film_fit.numbers]
+    moved, by_refit = film_influence(film_fit), np.sqrt(squares)
+    of_law = [k for k, key in enumerate(keys) if key.startswith("eversion_damping")]
+    assert moved[of_law] == pytest.approx(by_refit[of_law], rel=0.2)
+    n = keys.index("eversion_damping.n")
+    assert moved[n] > film_fit.numbers[n].sigma
+
+
+def test_a_fitted_film_mass_has_no_influence(film_fit):
+    with_film = vt.refit(film_fit, film_fit.model + "film_mass")
+    assert not film_influence(with_film).any()
+
+
+def test_an_influence_below_the_errors_gives_no_message(film_fit):
+    sigma = np.array([number.sigma for number in film_fit.numbers])
+    assert film_messages(film_fit.numbers, 0.99 * MATTERS * sigma) == ()
+    assert len(film_messages(film_fit.numbers, 1.01 * MATTERS * sigma)) == 1

@@ -1,4 +1,4 @@
-"""The statistics of the fit, compared with dense matrices and textbook results."""
+"""The statistics of the fit and its steps, compared with dense matrices, textbook results and exact minima."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
-import pandas as pd
 import pytest
 from mixed_problem import RHO, SIGMA, columns_of, covariance, frame_of, state_of
+from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
-from vinetrack.inference.fit_result import CHECK_COLUMNS, _deviate
-from vinetrack.inference.marginal_likelihood import deviance, estimate_between_trial_sd, estimate_noise, marginal
+from vinetrack.inference.fit_result import _deviate
+from vinetrack.inference.marginal_likelihood import (
+    bounded_solve,
+    deviance,
+    estimate_between_trial_sd,
+    estimate_noise,
+    levenberg_marquardt_step,
+    marginal,
+)
 from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
@@ -23,7 +30,7 @@ from vinetrack.inference.mixed_effects import (
     sum_matrix_blocks,
     trial_deviation_sd,
 )
-from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.optimiser import CONVERGED_DECREASE, Solution, _next_step
 from vinetrack.inference.position_errors import degrees_of_freedom, precision
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
@@ -37,13 +44,6 @@ def test_cross_products_agree_with_the_dense_inverse_covariance() -> None:
     for part in (slice(0, 17), slice(17, 30)):
         dense[part, part] = covariance(part.stop - part.start, RHO, 1.0)
     assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
-
-
-def test_squares_of_whitened_columns_are_the_cross_products() -> None:
-    residual = np.random.default_rng(1).standard_normal(40)
-    first = np.arange(40) % 13 == 0
-    white = whiten(residual, first, RHO)
-    assert white @ white == pytest.approx(at_correlation(products(residual[:, None], first)[None], RHO)[0, 0, 0])
 
 
 def test_the_marginal_likelihood_agrees_with_the_dense_gaussian() -> None:
@@ -169,9 +169,12 @@ def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Soluti
 
 
 def test_the_variance_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
+    """So are the error of the common level, which is that of a mean of trials, and its degrees of freedom."""
     solution, means = one_way(12, 25, 0.05, seed=4)
     expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
     assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
+    assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
+    assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
 
 @pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])
@@ -190,16 +193,6 @@ def test_two_between_trial_standard_deviations_are_found_from_any_start(start: t
     pressure, damping = estimate_between_trial_sd(part, frame, state, (True, True))
     assert pressure == pytest.approx(0.004, rel=0.4)
     assert damping == pytest.approx(0.02, rel=0.4)
-
-
-def test_the_error_of_a_common_level_is_that_of_a_mean_of_trials() -> None:
-    solution, means = one_way(12, 25, 0.05, seed=5)
-    assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
-
-
-def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
-    solution, _ = one_way(12, 25, 0.05, seed=6)
-    assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
 
 def test_noise_is_estimated_without_the_bias_of_fitted_parameters() -> None:
@@ -273,12 +266,93 @@ def test_the_difference_of_two_parameters_is_given_as_a_normal_deviate() -> None
     assert _deviate(np.array([40.0, 0.0]), np.eye(2)) == pytest.approx(39.9, abs=0.15)
 
 
-def test_the_columns_of_the_model_check_are_those_agreed_upon() -> None:
-    assert list(pd.DataFrame(columns=list(CHECK_COLUMNS))) == [
-        "vine",
-        "n_steady",
-        "n_trajectory",
-        "B_steady",
-        "B_trajectory",
-        "z",
-    ]
+# Steps of the fit, compared with exact minima within bounds.
+
+
+def test_a_step_ends_at_the_first_bound_and_continues_along_it() -> None:
+    # ½xᵀHx − gᵀx in the unit square: its minimum (14/3, 7/3) lies outside; on the side x₁ = 1 it is at x₂ = ½.
+    square, slope = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([7.0, 0.0])
+    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2), upper=np.ones(2))
+    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
+    assert step == pytest.approx([1.0, 0.5])
+    assert list(moving) == [False, True]
+
+
+def test_of_two_parameters_that_met_their_bounds_together_one_is_released() -> None:
+    # ½xᵀHx − gᵀx for x ≥ 0, from the corner: its minimum (−1, −2) lies outside; on the side x₂ = 0 it is at 0.8.
+    square, slope = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([0.8, -1.1])
+    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2))
+    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
+    assert step == pytest.approx([0.8, 0.0])
+    assert list(moving) == [True, False]
+    solved, decrease, log_det = decrease_within_bounds(square, slope, np.zeros(2), np.full(2, np.inf), np.ones(2, bool))
+    assert (solved, decrease, log_det) == (True, pytest.approx(0.64), pytest.approx(0.0))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_bounded_step_ends_at_the_minimum_in_the_box(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    columns = draw.standard_normal((12, 6)) + 2 * draw.standard_normal((12, 1))
+    square, slope, free = columns.T @ columns, columns.T @ draw.standard_normal(12) * 10, np.ones(6, bool)
+    free[seed % 6] = False
+    # At their bounds from the start, near them, and free of them.
+    theta = np.clip(draw.uniform(-2, 3, 6), -1, 2)
+    problem = replace(frame_of(1, 5, 6), lower=np.full(6, -1.0), upper=np.full(6, 2.0), free=free)
+    step, _ = bounded_solve(square, slope, problem, theta)
+    target = np.linalg.lstsq(columns.T, slope, rcond=None)[0]
+    exact = lsq_linear(columns[:, free], target, (-1 - theta[free], 2 - theta[free]), tol=1e-14, method="bvls").x
+    best = exact @ (2 * slope[free] - square[np.ix_(free, free)] @ exact)
+    assert step[~free] == 0
+    assert step @ (2 * slope - square @ step) == pytest.approx(best, rel=1e-6, abs=1e-5)
+    solved, decrease, _ = decrease_within_bounds(square, slope, theta + 1, 2 - theta, free)
+    assert solved
+    assert decrease == pytest.approx(best, rel=1e-6, abs=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1, 100.0])
+@pytest.mark.parametrize("bound", [np.inf, 0.02])
+def test_a_step_predicts_the_decrease_of_the_undamped_sum_of_squares(damping: float, bound: float) -> None:
+    n_trials, count, keys = 4, 20, 2
+    columns = columns_of(n_trials, count, keys, seed=8)
+    for each in columns:
+        each[:, -1] += each[:, 5]
+    frame = replace(frame_of(n_trials, count, keys), lower=np.full(keys, -bound), upper=np.full(keys, bound))
+    state = state_of(n_trials, keys, 0.5)
+    starts = np.arange(count) == 0
+    step, own, predicted = levenberg_marquardt_step(all_products(columns, [starts] * n_trials), frame, state, damping)
+
+    def cost(theta: np.ndarray, effects: np.ndarray) -> float:
+        left = [c[:, -1] - c[:, 4:6] @ theta - c[:, :4] @ u for c, u in zip(columns, effects, strict=True)]
+        white = [whiten(residual, starts, RHO) for residual in left]
+        prior = np.array([1e-3, 1e-3, 1e5, 2.0]) ** 2
+        return sum(float(w @ w) for w in white) / float(state.variance[0]) + float(np.sum(prior * effects**2))
+
+    lowered = cost(np.zeros(keys), np.zeros((n_trials, 4))) - cost(step, own)
+    assert predicted == pytest.approx(lowered, rel=1e-6)
+
+
+def test_a_short_step_that_is_short_by_its_damping_alone_is_no_convergence() -> None:
+    columns = columns_of(4, 20, 2, seed=8)
+    for each in columns:
+        each[:, -1] += each[:, 5]
+    frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
+    cross_products = all_products(columns, [np.arange(20) == 0] * 4)
+    assert levenberg_marquardt_step(cross_products, frame, state, 1e6)[2] < CONVERGED_DECREASE
+    (step, _, decrease), damping = _next_step(cross_products, frame, state, 1e6, CONVERGED_DECREASE)
+    assert decrease > CONVERGED_DECREASE
+    assert damping == 0
+    assert step == pytest.approx(levenberg_marquardt_step(cross_products, frame, state, 0.0)[0])
+
+
+def test_one_step_solves_a_linear_problem() -> None:
+    columns = columns_of(3, 25, 2, seed=8)
+    truth = np.array([0.3, -0.7])
+    for c in columns:
+        c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
+    frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
+    step, own, predicted_decrease = levenberg_marquardt_step(
+        all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0
+    )
+    assert step == pytest.approx(truth, abs=1e-6)
+    assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
+    assert predicted_decrease > 0

@@ -42,7 +42,3 @@ def test_objects_and_words_are_those_stored(shown: list[dict[str, Any]], stored:
     printed = [["".join(one["text"]) for one in each if "text" in one] for each in (shown, stored)]
     assert printed[0] == printed[1]
     assert "n = 0.369 instead of" in printed[0][0]
-
-
-def test_the_notebook_is_small() -> None:
-    assert NOTEBOOK.stat().st_size < 400_000

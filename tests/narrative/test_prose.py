@@ -6,10 +6,7 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 import vinetrack
-from vinetrack.diagnosis.remarks import Remark, remark
 from vinetrack.narrative import SENTENCES
 from vinetrack.narrative.diagnosis_text import REMARKS
 
@@ -57,28 +54,3 @@ def test_every_code_has_a_sentence_and_every_sentence_a_code() -> None:
     source = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name == "diagnosis")
     assert set(re.findall(r'[Rr]emark\(\s*"(\w+)"', source)) <= SENTENCES.keys() | REMARKS.keys()
     assert [code for code in (*SENTENCES, *REMARKS) if f'"{code}"' not in source] == []
-
-
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [
-        (Remark(), ""),
-        (remark("contains", name="leak"), "it contains leak as a limit"),
-        (remark("columns_partly_blank", columns=["chamber_l", "inlet_mm"]),
-         "it needs `chamber_l` and `inlet_mm`, which the sheet leaves blank for some trials"),
-        (remark("no_tube", column="inlet_mm"),
-         "it acts on the gas of a chamber, and a body that moves as a whole has none"),
-        (remark("implausible_size", symbol="K", value=40.0, unit="", low=0.0, high=3.0),
-         "it would need K = 40, and 0 to 3 is plausible"),
-        (remark("implausible_size", symbol="M", value=4.0, unit="kg", low=0.0, high=3.0),
-         "it would need M = 4 kg, and 0 to 3 is plausible"),
-        (remark("several_missing", count=2), "two effects are missing: none alone removes the misfit"),
-        (remark("left_out_error_without", left_out="conditions", count=2, reason="it stops"),
-         "The error on left-out conditions is without 2 trials, unlike that in sample: it stops"),
-        (remark("not_tried", names=["leak", "lens"]),
-         "Not tried, because the sheet does not state what they need: leak and lens."),
-    ],
-)  # fmt: skip
-def test_a_remark_in_words(told: Remark, words: str) -> None:
-    assert str(told) == words
-    assert Remark.from_json(told.to_json()) == told

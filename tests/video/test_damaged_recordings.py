@@ -13,16 +13,16 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from plain_scene import write_video
 
-from vinetrack.core.records import Correction, Trial
+from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.filming import Filming, film
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.scene import Camera
 from vinetrack.laboratory.tracks import GroundTruth, grow
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge import outline, track_edge
-from vinetrack.video.edge_state import EdgeState, core_frames
+from vinetrack.video.edge import outline
 from vinetrack.video.frame_faults import torn_frames
 from vinetrack.video.frames import Frames, RecordingError, read_frames, slots_from_times
 from vinetrack.video.strip import Strip
@@ -88,9 +88,7 @@ def test_frames_after_a_damaged_one_are_damaged_up_to_the_next_key_frame(clip: C
 
 def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip, tmp_path: Path) -> None:
     path = clip.damaged_at(tmp_path, *KEY_FRAMES)
-    with pytest.raises(
-        RecordingError, match=r"^damaged\.mp4: \d+ of 71 frames are damaged and only \d+.* from the camera"
-    ):
+    with pytest.raises(RecordingError):
         track_recording(replace(clip.trial, video=path))
 
 
@@ -100,7 +98,6 @@ def test_only_the_sound_frames_of_a_damaged_recording_are_tracked(clip: Clip, tm
     assert all("rejected" in flag for flag in track.flag[62:])
     assert not np.isfinite(track.edge_px[62:]).any()
     assert np.abs(clip.errors_m(track)).max() < 0.5e-3
-    assert any("0 to 61: damaged frames" in note for note in track.notes)
 
 
 def test_sound_frames_beyond_the_damage_are_not_used(clip: Clip, tmp_path: Path) -> None:
@@ -121,32 +118,8 @@ def test_frames_that_are_not_used_keep_their_distance_in_time_after_a_dropped_on
     assert np.rint((track.time_s - track.time_s[0]) * CAPTURE_FPS).tolist() == kept.tolist()
 
 
-def test_one_damaged_frame_among_sound_ones_is_left_out_alone(clip: Clip) -> None:
-    damaged = np.arange(len(clip.frames)) == 35
-    track = track_frames(replace(clip.frames, damaged=damaged), clip.trial, CAPTURE_FPS).track
-    assert not np.isfinite(track.edge_px[35])
-    assert np.isfinite(track.edge_px[[34, 36, 50]]).all()
-    assert np.abs(clip.errors_m(track)).max() < 0.5e-3
-
-
-def test_a_person_may_place_the_edge_of_a_damaged_frame(clip: Clip) -> None:
-    damaged = np.arange(len(clip.frames)) == 35
-    placed = replace(clip.trial, corrections=(Correction(35, "move", 321.0),))
-    track = track_frames(replace(clip.frames, damaged=damaged), placed, CAPTURE_FPS).track
-    assert track.usable[35]
-    assert track.edge_px[35] == 321.0
-
-
 def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fails(clip: Clip, tmp_path: Path) -> None:
-    path = tmp_path / "a.mkv"
-    with av.open(str(path), "w") as out:
-        stream = out.add_stream("ffv1", rate=60)
-        stream.width, stream.height, stream.pix_fmt, stream.gop_size = 960, 320, "gray", 1
-        for i, picture in enumerate(clip.frames.luma[:12]):
-            frame = av.VideoFrame.from_ndarray(picture, format="gray")
-            frame.pts = i
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode())
+    path = write_video(tmp_path / "a.mkv", clip.frames.luma[:12], "ffv1", "gray", options={"g": "1"})
     data = bytearray(path.read_bytes())
     data[int(0.55 * len(data))] ^= 0xFF
     path.write_bytes(bytes(data))
@@ -154,24 +127,6 @@ def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fai
     wrong = np.any(frames.luma != clip.frames.luma[:12], axis=(1, 2))
     assert wrong.sum() == 1
     assert frames.damaged.tolist() == wrong.tolist()
-
-
-def test_a_packet_that_cannot_be_decoded_costs_its_own_frame(clip: Clip, tmp_path: Path) -> None:
-    path = tmp_path / "a.avi"
-    with av.open(str(path), "w") as out:
-        stream = out.add_stream("mjpeg", rate=60)
-        stream.width, stream.height, stream.pix_fmt = 960, 320, "yuvj420p"
-        for i, picture in enumerate(clip.frames.luma[:12]):
-            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuvj420p")
-            frame.pts = i
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode())
-    with av.open(str(path)) as container:
-        sixth = [packet.pos for packet in container.demux(video=0) if packet.size][5]
-    data = bytearray(path.read_bytes())
-    data[sixth + 8 : sixth + 400] = bytes(392)
-    path.write_bytes(bytes(data))
-    assert len(read_frames(path)) >= 11
 
 
 def torn(luma: np.ndarray, frame: int, row: int = 8, begin: int = 300, by: int = 30) -> np.ndarray:
@@ -199,21 +154,6 @@ def test_moving_patches_and_flicker_are_not_torn_frames(clip: Clip) -> None:
     assert not torn_frames(crossed).any()
 
 
-def test_torn_frames_are_damaged_though_the_decoder_reports_nothing(clip: Clip, tmp_path: Path) -> None:
-    path = tmp_path / "a.mov"
-    with av.open(str(path), "w") as out:
-        stream = out.add_stream("mjpeg", rate=60)
-        stream.width, stream.height, stream.pix_fmt = 960, 320, "yuvj420p"
-        for i, picture in enumerate(torn(clip.frames.luma[:40], 22)):
-            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuvj420p")
-            frame.pts = i
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode())
-    frames = read_frames(path)
-    assert np.flatnonzero(frames.damaged).tolist() == [22]
-    assert "damaged: 1 of 40 frames" in " ".join(frames.notes)
-
-
 def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many() -> None:
     times = np.delete(np.arange(60.0), np.arange(20, 30))
     assert np.array_equal(slots_from_times(times)[0], np.arange(50))
@@ -227,15 +167,8 @@ def test_frames_beyond_lost_ones_are_not_used(clip: Clip) -> None:
     frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
     track = track_frames(frames, clip.trial, CAPTURE_FPS).track
     assert not track.usable[48:].any()
-    assert "48 of 61 frames are used, 0 to 47" in " ".join(track.notes)
     error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]
     assert np.max(np.abs(error - np.median(error))) < 1e-3
-
-
-def test_a_recording_that_does_not_fit_in_memory_is_refused(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinetrack.video.decoding.memory_for_pictures", lambda: 30 * 960 * 320.0)
-    with pytest.raises(RecordingError, match=r"960 x 320 px do not fit in the memory"):
-        read_frames(clip.trial.video)
 
 
 def grown_strip(half_px: np.ndarray) -> Strip:
@@ -254,21 +187,6 @@ def test_a_tube_of_two_widths_has_one_of_them() -> None:
     """A picture half of which is damaged shows two; their median is neither."""
     sides = outline(grown_strip(np.where(np.arange(240) < 120, 8, 30)))
     assert np.isfinite([sides.shift_px, sides.slope, sides.width_px]).all()
-
-
-def test_a_front_that_leaves_nothing_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinetrack.video.edge.growth_end", lambda *given: given[2][0])
-    for follow in (outline, track_edge):
-        with pytest.raises(ValueError, match="does not stay changed: nothing grows"):
-            follow(grown_strip(np.full(240, 20)))
-
-
-def test_motion_without_any_edge_is_refused() -> None:
-    edge = np.clip(5.0 * np.arange(60) - 40, 0, 240)
-    blank = np.zeros((4, 3, 240), np.float32)
-    state = EdgeState(edge, np.zeros(60), np.zeros(3), 1.0, blank, np.ones(3))
-    with pytest.raises(ValueError, match="nothing like an edge is seen"):
-        core_frames(state, np.full((60, 6), np.nan))
 
 
 GIVEN_UP = """
@@ -295,6 +213,7 @@ for _ in range(60):
 """A decoder left after three frames, sixty times over."""
 
 
+@pytest.mark.slow
 def test_a_damaged_recording_that_is_given_up_lets_go_of_its_decoder(tmp_path: Path) -> None:
     """Threads of the decoder that complain, and Python that frees the decoder, waited for each other for ever."""
     path, draw = tmp_path / "noise.mp4", np.random.default_rng(0)

@@ -1,29 +1,37 @@
-"""The leading edge against the truth of recordings drawn by other code; seeds 201 and up, which tuned nothing."""
+"""The leading edge against the truth of recordings drawn by other code; seeds that tuned nothing."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
+import pictures
 import pytest
-from plain_scene import Plan, plain_scene, write_video
+from pictures import in_memory
+from plain_scene import Plan, Scene, plain_scene, write_video
+from tracking_accuracy import along_axis
+from tracking_accuracy import film as rendered_film
 
-from vinetrack.core.records import FLAGS, Trial, with_flag
+from vinetrack.core.records import FLAGS, Correction, Track, Trial, with_flag
+from vinetrack.laboratory.filming import render_recording
+from vinetrack.laboratory.scene import preset
 from vinetrack.tracks.frame_timing import correct_frames
-from vinetrack.video.axis import Axis
-from vinetrack.video.frames import Frames, Recording, RecordingError, Region
-from vinetrack.video.point_quality import assess_points, calibrated_sigma, moving_range
-from vinetrack.video.track import track_frames, track_recording
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis
+from vinetrack.video.calibration import corrected_by_hand
+from vinetrack.video.curved_axis import front_share_function
+from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
+from vinetrack.video.point_quality import (
+    PointQuality,
+    calibrated_sigma,
+    is_grown,
+    moving_range,
+)
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.track import follow, track_frames, track_recording, tube_strip
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
-
-
-def in_memory(luma, slot=None):
-    n, height, width = luma.shape
-    recording = Recording(path=__import__("pathlib").Path("scene.mp4"), kind="container", width=width, height=height,
-                          bit_depth=8, declared_frames=n)  # fmt: skip
-    slot = np.arange(n) if slot is None else slot
-    return Frames(recording, Region(0, 0, width, height), luma, slot, np.zeros(n, dtype=bool))
 
 
 def trial(plan, **changes):
@@ -105,14 +113,6 @@ def test_compressed_as_cameras_do(tmp_path):
     assert len(tracking.pictures) == 3
 
 
-def test_sixteen_bit_frames_give_the_same_track():
-    plan = Plan(seed=205, **SHORT)
-    scene = plain_scene(plan)
-    eight = track_frames(in_memory(scene.frames), trial(plan), 1000.0).track.edge_px
-    deep = track_frames(in_memory(scene.frames.astype(np.uint16) * 257), trial(plan), 1000.0).track.edge_px
-    assert np.abs(deep - eight)[scene.moving].max() < 0.1
-
-
 def test_time_is_mid_exposure_and_flags_are_known():
     plan, scene, tracking = tracked(seed=206)
     track = tracking.track
@@ -128,25 +128,9 @@ def test_growth_out_of_the_picture_ends_the_track_with_a_note():
     plan = Plan(**{**SHORT, "seed": 207, "end_px": 620.0})
     scene = plain_scene(plan)
     track = track_frames(in_memory(scene.frames), trial(plan), 1000.0).track
-    assert any("leaves the picture" in note for note in track.notes)
     assert all("after_end" in flag for flag in track.flag[-plan.end_frames :])
     inside = scene.moving & (scene.edge_px < 450)
     assert track.usable[inside].all()
-
-
-@pytest.mark.parametrize("speed", [6.0, 20.0])
-def test_a_recording_that_ends_in_motion_says_how_far_the_vine_had_grown(speed):
-    plan = Plan(**{**SHORT, "seed": 213, "speed": speed})
-    scene = plain_scene(plan)
-    count = int(np.argmax(scene.edge_px > 300))
-    tracking = track_frames(in_memory(scene.frames[:count]), trial(plan, length_m=0.38), 1000.0)
-    said = [note for note in tracking.track.notes if "ends while the leading edge moves" in note]
-    grown = (scene.edge_px[count - 1] - plan.start_px) / 380
-    assert len(said) == 1
-    assert f"after {grown:.0%} of the vine's length" in said[0]
-    by_hand = trial(plan, length_m=0.38, frames_used=(0, count - 1))
-    notes = track_frames(in_memory(scene.frames[:count]), by_hand, 1000.0).track.notes
-    assert not any("ends while" in note for note in notes)
 
 
 @pytest.mark.parametrize("speed", [6.0, 20.0])
@@ -157,7 +141,6 @@ def test_two_frames_of_rest_at_the_end_are_not_growth(speed):
     track = track_frames(in_memory(scene.frames[:count]), trial(plan), 1000.0).track
     assert not with_flag(track.flag, "after_end")[: count - 2].any()
     assert with_flag(track.flag, "after_end")[count - 2 :].all()
-    assert not any("ends while" in note for note in track.notes)
 
 
 def test_a_pause_of_one_frame_in_slow_growth_is_not_a_stop():
@@ -168,20 +151,8 @@ def test_a_pause_of_one_frame_in_slow_growth_is_not_a_stop():
 def test_a_still_recording_is_refused():
     plan = Plan(seed=208, **SHORT)
     still = np.repeat(plain_scene(plan).frames[:1], 20, axis=0)
-    with pytest.raises(RecordingError, match="nothing moves"):
+    with pytest.raises(RecordingError):
         track_frames(in_memory(still), trial(plan), 1000.0)
-
-
-def test_too_few_frames_are_refused():
-    plan = Plan(seed=209, **SHORT)
-    with pytest.raises(RecordingError, match="only 4 frames"):
-        track_frames(in_memory(plain_scene(plan).frames[:4]), trial(plan), 1000.0)
-
-
-def test_capture_rate_must_come_from_the_user(tmp_path):
-    path = write_video(tmp_path / "a.mp4", np.zeros((8, 64, 96), np.uint8))
-    with pytest.raises(RecordingError, match="capture_fps is missing"):
-        track_recording(Trial(name="t", video=path))
 
 
 def test_a_wrong_second_frame_is_rejected():
@@ -192,7 +163,6 @@ def test_a_wrong_second_frame_is_rejected():
     track = track_frames(in_memory(luma), trial(plan), 1000.0).track
     assert track.flag[1] == "rejected"
     assert np.isnan(track.edge_px[1])
-    assert any("unlike all others" in note for note in track.notes)
     assert not with_flag(track.flag, "gap").any()
 
 
@@ -214,17 +184,7 @@ def test_a_missing_frame_is_flagged_and_the_times_are_corrected():
     assert track.flag[26] == "gap;retimed"
     assert track.time_s[26] - track.time_s[25] == pytest.approx(2e-3)
     assert track.time_s[27] - track.time_s[26] == pytest.approx(1e-3)
-    told = [note for note in correct_frames(track).notes if "missing" in note]
-    assert told == ["1 frame is missing before frame 26 (the step there is too long): later times moved on"]
-
-
-def test_frames_in_notes_are_those_of_the_recording():
-    plan = Plan(seed=212, **SHORT)
-    scene = plain_scene(plan)
-    late = replace(trial(plan), frames_used=(5, len(scene.frames) - 2))
-    track = track_frames(in_memory(np.delete(scene.frames, 26, axis=0)), late, 1000.0).track
-    assert track.flag[26] == "gap;retimed"
-    assert any("missing before frame 26 " in note for note in track.notes)
+    np.testing.assert_array_equal(correct_frames(track).time_s, track.time_s)
 
 
 def test_stated_errors_follow_the_roughness():
@@ -235,16 +195,212 @@ def test_stated_errors_follow_the_roughness():
     assert scaled.mean() == pytest.approx(0.5, rel=0.15)
 
 
-def test_moving_range_of_rest_run_and_rest():
-    edge = np.concatenate([np.full(10, 5.0), 5 + 3.0 * np.arange(1, 21), np.full(8, 65.0)])
-    assert moving_range(edge, np.full(38, 0.1)) == (10, 28)
+# ---- where growth ends when a payload flies on, on strips and recordings drawn here ----
 
 
-def test_a_lost_point_among_moving_ones_is_flagged():
-    edge = np.concatenate([np.full(5, 5.0), 5 + 3.0 * np.arange(1, 21), np.full(5, 65.0)])
-    edge[12] = np.nan
-    nothing = np.zeros(30, dtype=bool)
-    masks = {"unsure": nothing, "repeated": nothing}
-    verdict = assess_points(edge, np.full(30, 0.1), np.arange(30), np.arange(30), **masks, end_px=99)
-    assert verdict.flag[12] == "lost"
-    assert any("lost in 1 moving frames" in note for note in verdict.notes)
+@pytest.mark.parametrize("flight", [2.0, 1.0])
+def test_a_track_does_not_follow_the_payload(flight):
+    plan = Plan(seed=302, width=520, height=160, from_px=(20.0, 80.0), start_px=50.0, end_px=330.0, radius=24.0)
+    scene = plain_scene(plan)
+    luma = scene.frames.copy()
+    last = int(np.flatnonzero(scene.moving)[-1])
+    speed = scene.edge_px[last - 1] - scene.edge_px[last - 2]
+    for t in range(last - 1, len(luma)):
+        x = plan.from_px[0] + plan.end_px + (28 if flight < 2 else 0) + flight * speed * (t - last + 1)
+        disc = cv2.circle(np.zeros_like(luma[t], np.float32), (round(x), 80), 14, 1.0, -1, cv2.LINE_AA)
+        luma[t] = np.rint(luma[t] * (1 - disc) + 12 * disc).astype(np.uint8)
+    tracking = pictures.tracked(luma, plan.exposure)
+    track = tracking.track
+    error = track.edge_px + tracking.axis.from_px[0] - plan.from_px[0] - scene.edge_px
+    assert np.abs(error[track.usable]).max() < 2.0
+    assert all("after_end" in flag for flag in track.flag[last + 2 :])
+
+
+# ---- a vine that stops where its length ends has grown completely ----
+
+EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
+
+
+def quality(first_moving: int = 10, last_moving: int = 49) -> PointQuality:
+    slot = np.arange(EDGE_PX.size)
+    without_edge = np.zeros(slot.size, dtype=bool)
+    flag = np.full(slot.size, "", dtype="<U64")
+    return PointQuality(flag, slot, (), first_moving, last_moving, None, without_edge, np.zeros(slot.size))
+
+
+@pytest.mark.parametrize(("length_px", "complete"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
+def test_travel_is_compared_with_the_length(length_px: float, complete: bool) -> None:
+    assert is_grown(EDGE_PX, quality(), length_px) is complete
+
+
+# ---- a tip that is lit differently from the tube behind it, tracked where film looks like background ----
+
+FPS = 1069.0
+
+
+def test_an_edge_is_followed_across_the_place_where_film_and_background_are_alike(tmp_path: Path) -> None:
+    """Seed 341, which tuned nothing; without shading of the tip the edge is lost in some frames there."""
+    time = np.linspace(0, 0.08, 800)
+    motion = time, np.clip(6.0 * (time - 0.015), 0, 0.2)
+    path = tmp_path / "reversal.mp4"
+    truth = render_recording(preset("contrast_reversal"), motion, n_frames=70, capture_fps=FPS, out_path=path, seed=341)
+    trial = Trial(name="t", video=path, capture_fps=FPS, exposure_s=truth.exposure_s, m_per_px=1.0)
+    tracking = track_frames(read_frames(path), trial, FPS)
+    track = tracking.track
+    moving = (np.diff(truth.lead_px, append=truth.lead_px[-1]) > 0.05) & truth.in_frame
+    moving &= truth.lead_px > truth.lead_px[0] + 60.0  # where the mouth hides nothing
+    assert moving.sum() > 20
+    assert track.usable[moving].all()
+    error = track.edge_px[moving] - truth.lead_px[moving]
+    assert error.std() < 0.5
+    assert np.abs(error - np.median(error)).max() < 1.5
+    assert track.lead_position_systematic_m is not None
+    stated = np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[moving]
+    assert error.std() < 2.0 * np.sqrt(np.mean(stated**2))
+
+
+# ---- points moved, dropped and confirmed by hand reach the track, next to the tracker's own ----
+
+
+def px_track(n: int = 6) -> Track:
+    flag = np.array(["", "doubtful", "lost", "gap", "", "after_end"], dtype="<U64")[:n]
+    edge = np.arange(n, dtype=float) * 10
+    edge[2] = np.nan
+    return Track(np.arange(n) / 1000, np.full(n, np.nan), np.full(n, 0.1), flag, edge)
+
+
+def test_a_moved_point_is_usable_again_and_has_the_error_of_a_click() -> None:
+    out = corrected_by_hand(px_track(), [Correction(2, "move", 21.5)])
+    assert out.edge_px[2] == 21.5
+    assert out.flag[2] == "corrected"
+    assert out.lead_position_sigma_m[2] == 0.5
+    assert out.tracked_px is not None
+    assert np.isnan(out.tracked_px[2])
+
+
+def test_a_dropped_point_is_rejected_and_a_confirmed_one_no_longer_doubtful() -> None:
+    out = corrected_by_hand(px_track(), [Correction(0, "drop"), Correction(1, "confirm"), Correction(3, "move", 29.0)])
+    assert list(out.flag[[0, 1, 3]]) == ["rejected;corrected", "corrected", "corrected;gap"]
+    assert np.isnan(out.edge_px[0])
+    assert out.tracked_px is not None
+    assert out.tracked_px[0] == 0.0
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    plan = Plan(width=480, height=160, from_px=(20, 80), start_px=40, end_px=400, speed=14, radius=20)
+    return write_video(tmp_path_factory.mktemp("film") / "a.mp4", plain_scene(plan).frames)
+
+
+def test_a_recording_is_tracked_with_its_corrections(film: Path) -> None:
+    plain = Trial(name="a", video=film, capture_fps=1000.0, m_per_px=2.5e-4)
+    before = track_recording(plain).track
+    given = (Correction(20, "move", float(before.edge_px[20]) + 4), Correction(25, "drop"))
+    after = track_recording(Trial(**{**vars(plain), "corrections": given})).track
+    assert after.lead_position_m[20] - before.lead_position_m[20] == pytest.approx(4 * 2.5e-4)
+    assert not after.usable[25]
+    others = np.setdiff1d(np.arange(len(before.edge_px)), [20, 25])
+    np.testing.assert_array_equal(after.edge_px[others], before.edge_px[others])
+    np.testing.assert_array_equal(after.tracked_px, before.edge_px)
+    assert [i for i, flag in enumerate(after.flag) if "corrected" in flag] == [20, 25]
+
+
+# ---- a tip behind a door or in the mouth of a launcher is doubtful or lost, never ok ----
+
+HIDDEN_FPS = 1000.0
+MOUTH_PLAN = Plan(seed=520, width=640, height=200, from_px=(20.0, 100.0), end_px=520.0, rest_frames=15)
+
+
+def tracked_scene(scene: Scene) -> Track:
+    return pictures.tracked(scene.frames, scene.plan.exposure, m_per_px=1.0).track
+
+
+def ok(track: Track) -> np.ndarray:
+    """Points without any flag."""
+    return track.usable & ~with_flag(track.flag, "doubtful")
+
+
+@pytest.mark.parametrize("grey", [20.0, 110.0, 200.0])
+@pytest.mark.parametrize(("speed", "rise"), [(20.0, 8.0), (6.0, 20.0)], ids=["fast", "slow"])
+def test_a_tip_in_the_mouth_of_a_launcher_is_never_ok(speed, rise, grey):
+    scene = plain_scene(replace(MOUTH_PLAN, speed=speed, rise_frames=rise, mouth=30.0, mouth_grey=grey))
+    track = tracked_scene(scene)
+    hidden = scene.edge_px < scene.plan.start_px + 30
+    assert hidden.sum() > 15
+    assert not ok(track)[hidden].any()
+    seen = scene.moving & (scene.edge_px > scene.plan.start_px + 45)
+    assert ok(track)[seen].mean() > 0.9
+    off = (track.edge_px - scene.edge_px)[seen & ok(track)]
+    assert np.std(off) < 0.5
+
+
+@pytest.mark.parametrize("film", [175.0, 20.0])
+def test_a_tip_at_rest_in_sight_stays_ok(film):
+    scene = plain_scene(replace(MOUTH_PLAN, film=film))
+    assert ok(tracked_scene(scene))[: MOUTH_PLAN.rest_frames].all()
+
+
+def test_the_errors_near_a_start_that_a_door_leaves_are_stated(tmp_path: Path) -> None:
+    """Rendered; what the door misplaces is the same in all bands of rows, so that they do not show it."""
+    errors, stated = [], []
+    for seed in (901, 903):
+        path, truth = rendered_film(preset("downward"), "downward", seed, tmp_path, 6.0)
+        trial = Trial(name="t", video=path, capture_fps=HIDDEN_FPS, exposure_s=truth.exposure_s, m_per_px=1.0)
+        tracking = track_frames(read_frames(inspect_recording(path)), trial, HIDDEN_FPS)
+        track = tracking.track
+        use = track.usable & (np.gradient(truth.lead_px) > 0.05) & np.isfinite(truth.lead_px)
+        error = (track.edge_px - along_axis(truth, tracking))[use]
+        errors.append(error - error.mean())
+        assert track.lead_position_systematic_m is not None
+        stated.append(np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[use])
+    ratio = np.sqrt(np.mean(np.concatenate(errors) ** 2) / np.mean(np.concatenate(stated) ** 2))
+    assert 0.6 < ratio < 1.3
+
+
+# ---- a front leaves a tube where one front passes along its middle ----
+
+AXIS = Axis((0.0, 66.0), (299.0, 66.0), 70.0)
+"""Six rows beside the middle of the tube."""
+TRIAL = Trial(name="t", capture_fps=1000.0, m_per_px=1.0)
+
+
+def tube() -> np.ndarray:
+    """A bright front that passes 5 columns a frame over noise and leaves 41 rows changed behind it."""
+    n, rows, columns = 72, 121, 300
+    luma = np.random.default_rng(81).normal(60, 2, (n, rows, columns))
+    across = np.abs(np.arange(rows) - rows // 2)[:, None]
+    for i in range(n):
+        luma[i] += 90 * ((np.arange(columns) < 5 * (i - 8)) & (across <= 20))
+    return np.clip(luma, 0, 255).astype(np.uint8)
+
+
+def front_share_is(share_beside: float, share_on_axis: float = 1.0):
+    """A front share along the axis given, and another along any other axis."""
+    return lambda axis: share_on_axis if axis is AXIS else share_beside
+
+
+def test_the_strip_is_centred_on_the_tube():
+    luma = tube()
+    order = front_share_function(SmallPictures(luma), luma)
+    strip, sides = tube_strip(luma, AXIS, order)
+    assert sides.width_px == pytest.approx(41, abs=2)
+    assert strip.axis.from_px[1] == pytest.approx(60, abs=0.8)
+    assert order(strip.axis) > 0.9
+
+
+def test_a_front_share_at_the_limit_is_a_tube():
+    assert tube_strip(tube(), AXIS, front_share_is(LEAST_FRONT_SHARE, LEAST_FRONT_SHARE)) is not None
+
+
+@pytest.mark.parametrize(
+    "order",
+    [front_share_is(1.0, LEAST_FRONT_SHARE - 0.01), front_share_is(LEAST_FRONT_SHARE - 0.01)],
+    ids=["along the axis", "along the middle"],
+)
+def test_without_a_front_only_the_arrival_is_followed(order):
+    luma = tube()
+    assert tube_strip(luma, AXIS, order) is None
+    _, positions = follow(luma, TRIAL, AXIS, 0.1, order)
+    assert not positions.is_edge
+    moving = slice(14, 60)
+    assert np.abs(positions.edge_px - 5.0 * (np.arange(len(luma)) - 8))[moving].max() < 3

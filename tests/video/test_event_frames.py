@@ -57,11 +57,6 @@ def track(path: Path, **stated: object) -> Track:
     return track_recording(replace(Trial(name="t", video=path, capture_fps=1000.0, exposure_s=2e-4), **stated)).track
 
 
-def test_a_film_that_can_be_held_is_decoded_whole(film: Path, long_frames: np.ndarray) -> None:
-    frames = read_event(inspect_recording(film))
-    assert (len(frames), frames.first, frames.n_recorded) == (len(long_frames), 0, len(long_frames))
-
-
 @pytest.mark.usefixtures("bracketed")
 def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scene, long_frames: np.ndarray) -> None:
     frames = read_event(inspect_recording(film))
@@ -74,8 +69,6 @@ def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scen
     same = slice(frames.first, frames.first + len(frames))
     assert np.array_equal(frames.luma, whole.luma[same])
     assert np.array_equal(frames.slot, whole.slot[same])
-    span = f"{frames.first} to {same.stop - 1}"
-    assert f"of {len(long_frames)} frames only {span}, around the motion, are decoded" in frames.notes[-1]
 
 
 def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,29 +86,6 @@ def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypat
     assert set(part.flag[-100:]) == {"after_end"}
     off = part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]
     assert np.std(off) < 0.3
-
-
-@pytest.mark.usefixtures("bracketed")
-def test_where_frames_at_rest_take_no_bytes_no_others_than_those_of_the_event_are_decoded(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rest = np.ones((BEFORE, 1, 1), np.uint8)
-    still = np.concatenate([scene.frames[0] * rest, scene.frames, scene.frames[-1] * rest])
-    path = write_video(tmp_path / "still.mp4", still, options={"crf": "28", "g": "250"})
-    decode, looked_at = small_pictures.decode_packets, []
-
-    def counted(*arguments):
-        for frame in decode(*arguments):
-            looked_at.append(frame)
-            yield frame
-
-    monkeypatch.setattr(small_pictures, "decode_packets", counted)
-    frames = read_event(inspect_recording(path))
-    moving = np.flatnonzero(scene.moving) + BEFORE
-    assert len(looked_at) <= len(still) / 250 + 1
-    assert frames.first <= moving[0] - MARGIN_FRAMES / 2
-    assert moving[-1] + MARGIN_FRAMES / 2 < frames.first + len(frames) < moving[-1] + 3 * MARGIN_FRAMES
-    assert np.array_equal(frames.luma, read_frames(path).luma[frames.first : frames.first + len(frames)])
 
 
 @pytest.mark.usefixtures("bracketed")
@@ -158,13 +128,6 @@ def test_of_a_long_cine_the_event_is_read_and_no_more(scene: Scene, long_frames:
     assert made.time_s[-1] == pytest.approx(len(long_frames) / 1000 + 1e-4)
 
 
-@pytest.mark.usefixtures("bracketed")
-def test_a_film_in_which_nothing_stands_out_is_decoded_whole(tmp_path: Path) -> None:
-    still = np.random.default_rng(4).normal(90, 2, (200, 64, 96)).clip(0, 255).astype(np.uint8)
-    path = write_video(tmp_path / "still.mp4", still, options={"crf": "14", "g": "10"})
-    assert len(read_event(inspect_recording(path))) == 200
-
-
 def test_the_event_lies_between_the_pictures_that_differ_from_either_end() -> None:
     rng = np.random.default_rng(8)
     pictures = [rng.normal(80, 1.5, (48, 64)).clip(0, 255).astype(np.uint8) for _ in range(60)]
@@ -174,11 +137,3 @@ def test_the_event_lies_between_the_pictures_that_differ_from_either_end() -> No
     # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_PART of that.
     assert event_range(pictures, numbers, 3000) == (19 * 50 - 112, 34 * 50 + 112)
     assert event_range(pictures[:20], numbers[:20], 1000) is None
-
-
-def test_packets_are_listed_in_the_order_in_which_they_are_shown(film: Path, long_frames: np.ndarray) -> None:
-    index = packet_index(film)
-    assert index is not None
-    assert len(index.pts) == len(long_frames)
-    assert np.ptp(np.diff(index.times_s)) == pytest.approx(0, abs=1e-9)
-    assert index.key[0]

@@ -39,19 +39,6 @@ def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
         assert float(stream.average_rate) == 12.5
 
 
-def test_the_index_is_in_front_so_that_a_page_can_play_it_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    write_clip(path, pictures(5), 10)
-    content = path.read_bytes()
-    assert content.index(b"moov") < content.index(b"mdat")
-
-
-def test_the_same_pictures_make_the_same_file(tmp_path: Path) -> None:
-    for name in "ab":
-        write_clip(tmp_path / f"{name}.mp4", pictures(6), 10)
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
-
-
 def broken():  # type: ignore[no-untyped-def]
     yield pictures(1)[0]
     raise RuntimeError("the recording ends here")

@@ -1,23 +1,30 @@
-"""How often scores cry wolf, and what they hear: linear campaigns whose scores have a known distribution.
-
-Each trial tells of every shape by an information matrix of its own, and its score is normal with that covariance, times
-the square of `scatter`: what the model of the noise knows nothing of. Seeds 20600 and up, which tuned nothing.
-"""
+"""Scores and their thresholds: linear campaigns whose scores have a known distribution, against regressions."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis import misfit_tests
-from vinetrack.diagnosis.candidates import CandidateShape, EffectSensitivities
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
+from vinetrack.diagnosis import misfit_tests, score_test
+from vinetrack.diagnosis.candidates import CandidateShape, EffectSensitivities, is_plausible
+from vinetrack.diagnosis.likelihood_ratio import (
+    LikelihoodRatio,
+    answer_set,
+    likelihood_ratio,
+    log_evidence,
+    posterior_weights,
+    prior_penalty,
+    weights_of,
+)
 from vinetrack.diagnosis.misfit_tests import (
     FALSE_ALARM_LEVEL_FIRST_ROUND,
     FALSE_ALARM_LEVEL_LATER_ROUNDS,
@@ -26,8 +33,10 @@ from vinetrack.diagnosis.misfit_tests import (
     Structure,
     structure_from_scores,
 )
-from vinetrack.diagnosis.score_test import Scores, _marginalisation, _marginalised
+from vinetrack.diagnosis.score_test import Scores, _marginalisation, _marginalised, family_test
+from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
+from vinetrack.inference.mixed_effects import FitState
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)
 
@@ -230,3 +239,157 @@ def test_what_a_refit_is_worth_is_told_in_errors_as_large_as_trials_scatter(
     assert found.delta_chi2 == pytest.approx(100.0)
     assert found.sigma == pytest.approx(10.0 / max(ratio, 1.0))
     assert found.inflation == pytest.approx(inflation)
+
+
+# Equal shares of the false alarms: thresholds of candidates that are tried in one shape, or in many.
+
+SIZES = (1,) * 12 + (30, 6)
+NAMES = [f"effect_{k}" for k, size in enumerate(SIZES) for _ in range(size)]
+SIGNS = [(-1, 0, 1)[k % 3] for k, size in enumerate(SIZES) for _ in range(size)]
+
+
+def alike_within() -> np.ndarray:
+    """Correlations of shapes, those of one effect alike."""
+    draw = np.random.default_rng(20620)
+    own = draw.standard_normal((len(SIZES), 40))[np.repeat(range(len(SIZES)), SIZES)]
+    shapes = own + draw.standard_normal((len(NAMES), 40))
+    shapes /= np.linalg.norm(shapes, axis=1)[:, None]
+    return np.asarray(shapes @ shapes.T)
+
+
+@pytest.mark.parametrize(("sign", "tails"), [(0, 2.0), (1, 1.0)])
+@pytest.mark.parametrize("level", [0.02, 1e-4])
+def test_the_threshold_of_one_candidate_is_the_quantile_of_the_normal(sign: int, tails: float, level: float) -> None:
+    family = family_test(np.eye(1), [sign], ["only"], level)
+    assert family.threshold("only") == pytest.approx(norm.isf(level / tails), abs=0.01)
+
+
+def test_independent_candidates_share_as_sidak_says() -> None:
+    family = family_test(np.eye(20), [0] * 20, [str(k) for k in range(20)], 3e-3)
+    assert family.candidate_level == pytest.approx(1 - (1 - 3e-3) ** (1 / 20), rel=0.02)
+
+
+@pytest.mark.parametrize("shapes", [2, 30])
+def test_shapes_that_are_the_same_curve_count_once(shapes: int) -> None:
+    family = family_test(np.ones((shapes, shapes)), [0] * shapes, ["only"] * shapes, 3e-3)
+    assert family.threshold("only") == pytest.approx(norm.isf(3e-3 / 2), abs=0.02)
+
+
+def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share() -> None:
+    """Against two million draws from another generator."""
+    cosines, level = alike_within(), 3e-3
+    family = family_test(cosines, SIGNS, NAMES, level)
+    limits, signs = np.array([family.threshold(name) for name in NAMES]), np.array(SIGNS)
+    draw, root = np.random.default_rng(20621), np.linalg.cholesky(cosines + 1e-9 * np.eye(len(NAMES)))
+    alarms, total, by_many = 0, 0, 0
+    for _ in range(40):
+        z = draw.standard_normal((50_000, len(NAMES))) @ root.T
+        beyond = np.where(signs == 0, np.abs(z), z * signs) > limits
+        alarms, total = alarms + int(beyond.any(axis=1).sum()), total + len(z)
+        by_many += int(beyond[:, [name == "effect_12" for name in NAMES]].any(axis=1).sum())
+    assert alarms / total == pytest.approx(level, rel=0.05)
+    assert by_many / total == pytest.approx(family.candidate_level, rel=0.25)
+    assert family.threshold("effect_12") > family.threshold("effect_1") + 0.4
+
+
+def test_shapes_that_the_data_say_nothing_of_take_no_share() -> None:
+    cosines = np.eye(3)
+    cosines[2, 2] = 0.0
+    family = family_test(cosines, [0, 0, 0], ["a", "b", "silent"], 3e-3)
+    assert family.threshold("a") == pytest.approx(norm.isf(3e-3 / 4), abs=0.01)
+
+
+# Predicted gains of effects, compared with regressions.
+
+
+@pytest.mark.parametrize(("bound", "adapting"), [(math.nan, [0, 1]), (0.0, [0])])
+def test_a_gain_is_that_of_regressions_in_which_parameters_at_a_bound_do_not_adapt(
+    monkeypatch: pytest.MonkeyPatch, bound: float, adapting: list[int]
+) -> None:
+    draw = np.random.default_rng(5)
+    n = 60
+    columns = draw.standard_normal((n, 4))  # two parameters, the residual, one effect
+    columns[:, 2] += 3 * columns[:, 1] + 0.5 * columns[:, 3]
+    blocks = (columns.T @ columns)[None]
+    monkeypatch.setattr(
+        score_test, "products_without_trial_effects", lambda _fit, _products, state: blocks / state.variance[0]
+    )
+    problem = SimpleNamespace(
+        index=np.array([[0, 1]]),
+        places=np.array([[0, 1]]),
+        prior_mean=np.zeros(2),
+        prior_precision=np.zeros(2),
+        free=np.ones(2, bool),
+        points=np.array([float(n)]),
+    )
+    state = FitState(np.zeros(2), np.zeros((1, 4)), (1e-5, 1e-5), 0.0, np.ones(1))
+    fit: Any = SimpleNamespace(
+        solution=SimpleNamespace(state=state, problem=problem),
+        numbers=[SimpleNamespace(bound=math.nan), SimpleNamespace(bound=bound)],
+    )
+    products: Any = SimpleNamespace(
+        n_keys=2, n_shapes=1, n_tested=1, parts=[np.array([0])], tested_indices=np.array([[0]])
+    )
+    gain, size = score_test.linear_gains(fit, products, 0.0)
+
+    def squares(of: list[int]) -> tuple[float, float]:
+        found = np.linalg.lstsq(columns[:, of], columns[:, 2], rcond=None)
+        return float(found[1][0]), float(found[0][-1])
+
+    without, (with_effect, expected_size) = squares(adapting)[0], squares([*adapting, 3])
+    assert gain[0] == pytest.approx(n * math.log(without / with_effect), rel=1e-6)
+    assert size[0] == pytest.approx(expected_size, rel=1e-6)
+
+
+# Plausible ranges weigh hypotheses: against integrals done by quadrature.
+
+GAUGE = Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))
+
+
+@dataclass
+class KnownFit:
+    """What these functions read of a fit."""
+
+    numbers: tuple[Number, ...]
+    log_likelihood: float = -10.0
+    covariance: Any = field(default_factory=lambda: np.eye(1))
+
+
+def fitted(value: float, sigma: float) -> Any:
+    number = Number("g.delta", "", "δ", "Pa", value, sigma, value - 2 * sigma, value + 2 * sigma, math.inf, "linear")
+    return KnownFit((number,), covariance=np.array([[sigma**2]]))
+
+
+@pytest.mark.parametrize(("value", "sigma"), [(300.0, 200.0), (7.1e3, 1.7e3), (-1.5e3, 30.0)])
+def test_the_marginal_likelihood_is_the_integral_over_the_prior(value: float, sigma: float) -> None:
+    def inside(delta: float) -> float:
+        return math.exp(-10 - 0.5 * ((delta - value) / sigma) ** 2) * norm.pdf(delta, 0.0, 1e3)
+
+    whole, _ = quad(inside, -2e4, 2e4, points=[value - 3 * sigma, value, value + 3 * sigma, 0.0], epsabs=0, limit=300)
+    assert log_evidence(fitted(value, sigma), {"g.delta": GAUGE}) == pytest.approx(math.log(whole), abs=1e-6)
+
+
+def test_a_gauge_seven_kilopascals_off_is_a_surprise_and_one_within_two_is_none() -> None:
+    # z² = 7.1² / (1.7² + 1²) = 12.96 with a prior of 1 kPa; less 4 at the edge of the plausible range.
+    assert prior_penalty(fitted(7.1e3, 1.7e3), {"g.delta": GAUGE}) == pytest.approx(12.96 - 4, abs=0.01)
+    assert prior_penalty(fitted(1.9e3, 100.0), {"g.delta": GAUGE}) == 0
+    assert prior_penalty(fitted(7.1e3, 5e3), {"g.delta": GAUGE}) == 0
+
+
+def test_a_number_of_which_the_data_say_nothing_costs_nothing() -> None:
+    assert log_evidence(fitted(0.0, 1e7), {"g.delta": GAUGE}) == pytest.approx(-10, abs=1e-6)
+
+
+def test_weights_add_up_and_follow_the_evidence() -> None:
+    weights = posterior_weights([-10.0, -10.0 - math.log(3), -800.0])
+    assert weights == pytest.approx([0.75, 0.25, 0.0])
+    assert posterior_weights([]) == []
+
+
+@pytest.mark.parametrize("phase_rad", [-3.67, 6.9, 3.0])
+def test_any_phase_of_a_swing_is_plausible(phase_rad: float) -> None:
+    """A phase of −3.67 rad is one of 2.61."""
+    phase = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "phi")
+    assert is_plausible(phase, phase_rad, 0.0)
+    frequency = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "f")
+    assert not is_plausible(frequency, 480.0, 0.0)

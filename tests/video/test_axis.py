@@ -1,26 +1,95 @@
-"""What stays and stands out is growth; what swings away, passes or was there at first is not. Drawn here, in full."""
+"""The growth axis and the strip along it: what is growth, where pixels belong, flicker and shake."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pictures
 import pytest
-from plain_scene import write_images
+from plain_scene import Plan, plain_scene, write_images
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
-from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.axis import LEAST_FRONT_SHARE, Axis, find_axis, front_share
 from vinetrack.video.curved_axis import find_growth_axis
 from vinetrack.video.edge import initial_front_path
+from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import path_by_change
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import Strip, cut_strip
-from vinetrack.video.survey import measure_recording
-from vinetrack.video.track import track_recording
+from vinetrack.video.strip import Strip, cut_strip, sample
+from vinetrack.video.track import Tracking, track_recording
+
+
+def ramp(gx, gy, shape=(90, 140)):
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return (100 + gx * x + gy * y)[None].astype(np.float32)
+
+
+def test_an_oblique_strip_reads_the_picture_at_its_points():
+    axis = Axis((20.5, 11.25), (100.0, 70.0))
+    strip = sample(ramp(1.0, 2.0), axis, np.arange(-3, 4))
+    points = axis.points(np.arange(strip.shape[2], dtype=float)[None, :], np.arange(-3, 4)[:, None])
+    assert np.abs(strip[0] - (100 + points[..., 0] + 2 * points[..., 1])).max() < 0.2
+
+
+def test_flicker_is_taken_out_by_the_bands():
+    scene = plain_scene(Plan(seed=11, flicker=0.08, end_px=300, width=420, rest_frames=6, end_frames=4))
+    strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
+    phase = np.ptp(scene.frames[:, :40].mean(axis=(1, 2)))
+    assert phase > 5  # it does flicker
+    still = strip.values[:, :, 300:].astype(float).mean(axis=(1, 2)) * strip.scale + strip.offset
+    assert np.ptp(still) < 0.05 * phase
+
+
+def test_shake_is_measured_to_a_twentieth_of_a_pixel():
+    plan = Plan(seed=12, shake=0.8, end_px=300, width=420, rest_frames=6, end_frames=4)
+    scene = plain_scene(plan)
+    strip = cut_strip(scene.frames, Axis((40.0, 120.0), (400.0, 120.0)), 33)
+    assert strip.stabilised
+    phase = np.random.default_rng(plan.seed)
+    del phase
+    n = np.arange(len(scene.frames))
+    # Shake is 0.8 sin(0.55 n + φ): its amplitude and phase by least squares leave the error of the measurement.
+    waves = np.column_stack([np.sin(0.55 * n), np.cos(0.55 * n), np.ones(len(n))])
+    fit, *_ = np.linalg.lstsq(waves, strip.shift_px[:, 0], rcond=None)
+    assert np.hypot(fit[0], fit[1]) == pytest.approx(0.8, abs=0.04)
+    assert np.std(strip.shift_px[:, 0] - waves @ fit) < 0.05
+
+
+@pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0, 25.0])
+def test_axis_is_found_in_any_direction_of_growth(angle):
+    direction = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    start = np.array([200.0, 200.0]) - 170 * direction
+    plan = Plan(
+        seed=14, width=400, height=400, from_px=tuple(start), angle_deg=angle, start_px=40, end_px=280, radius=16,
+        tip_depth=6, rest_frames=4, end_frames=4, door=True,
+    )  # fmt: skip
+    scene = plain_scene(plan)
+    axis = find_axis(scene.frames)
+    assert np.degrees(np.arccos(axis.direction @ direction)) < 1.5
+    assert abs((start - axis.from_px) @ axis.normal) < 4
+    assert front_share(scene.frames, axis) >= LEAST_FRONT_SHARE
+
+
+def test_pictures_without_motion_are_refused():
+    still = np.repeat(plain_scene(Plan(seed=15, width=300, end_px=200, end_frames=1)).frames[:1], 20, axis=0)
+    with pytest.raises(RecordingError):
+        find_axis(still)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_black_background_is_not_used_for_flicker(kind: type) -> None:
+    luma = np.zeros((12, 120, 200), kind)
+    luma[:, 55:65] = 180
+    strip = cut_strip(luma, Axis((5.0, 60.0), (195.0, 60.0)), 8)
+    assert np.ptp(strip.scale) == 0
+    assert not strip.offset.any()
+    assert not strip.stabilised
+
+
+# ---- what stays and stands out is growth ----
 
 MOUTH = (60, 120)
 OPEN_RAD = math.radians(25)
@@ -77,17 +146,6 @@ def test_neither_where_the_door_stood_nor_where_it_passed_is_growth() -> None:
     assert near["film", "grown"] >= 0.9 * near["film", "changed"] > 10
 
 
-def test_the_middle_of_a_dark_tube_far_from_any_ground_counts_as_growth() -> None:
-    rng = np.random.default_rng(46)
-    frames = rng.normal(150, 2, (40, 200, 240))
-    for t in range(40):
-        frames[t, 70:130, : 20 + 5 * t] -= 110
-    small = SmallPictures(np.clip(frames, 0, 255).astype(np.uint8))
-    x, y, *_ = small.grown
-    assert ((np.abs(y - 100) < 5) & (x > 25) & (x < 200)).sum() >= 0.95 * 9 * 174
-    assert abs(slope_deg(find_axis(small))) < 1
-
-
 @pytest.mark.parametrize("brighter", [-80.0, 80.0])
 @pytest.mark.parametrize("tube_px", [40, 100, 150])
 def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
@@ -113,36 +171,12 @@ def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
     np.testing.assert_allclose(off - np.median(off), 0.0, atol=0.4)
 
 
-def test_the_axis_of_a_passing_body_is_found_from_all_change() -> None:
-    rng = np.random.default_rng(43)
-    frames = rng.normal(60, 2, (40, 120, 320))
-    for t in range(40):
-        cv2.circle(frames[t], (20 + 7 * t, 60), 9, 180.0, -1, cv2.LINE_AA)
-    small = SmallPictures(np.clip(frames, 0, 255).astype(np.uint8))
-    assert small.grown is small.changed
-    assert abs(slope_deg(find_axis(small, grows=False))) < 1
-
-
 def test_a_bright_door_beside_the_tube_is_not_flicker() -> None:
     frames = beside_a_door(44, growth_px=140, door_px=100, speed_px=4.0)
     # The door comes to rest, and stood at first, in the bands that tell of flicker; nothing here flickers.
     strip = cut_strip(frames, Axis((5.0, float(MOUTH[1])), (470.0, float(MOUTH[1]))), 12)
     still = strip.scale[:, None] * 70.0 + strip.offset[:, None]
     assert np.ptp(still) < 2.0
-
-
-def test_a_calibration_does_not_widen_a_found_axis(tmp_path: Path) -> None:
-    video = write_images(tmp_path / "clip", beside_a_door(45, growth_px=220, door_px=60, speed_px=4.0))
-    trial = Trial(name="clip", video=video, capture_fps=1000.0, exposure_s=1e-4)
-    settings = ExperimentSettings(calibration=MmPerPx(kind="mm_per_px", mm_per_px=0.5))
-    calibrated = measure_recording(trial, settings, tmp_path)
-    plain = track_recording(replace(trial, m_per_px=5e-4))
-    assert calibrated.tracking.axis == plain.axis
-    np.testing.assert_array_equal(calibrated.tracking.track.edge_px, plain.track.edge_px)
-    np.testing.assert_allclose(
-        calibrated.tracking.track.lead_position_m, plain.track.lead_position_m, rtol=1e-9, equal_nan=True
-    )
-    assert calibrated.m_per_px == pytest.approx(5e-4)
 
 
 def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path() -> None:
@@ -165,3 +199,28 @@ def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path() -> Non
     assert np.abs(path - tip)[18:60].max() <= 6
     assert abs(passed[0] - 40) <= 8
     assert abs(passed[1] - 290) <= 3
+
+
+# ---- a camera that shakes ----
+
+
+def tracked(plan: Plan) -> tuple[Tracking, np.ndarray]:
+    """Tracking of a scene, and its pictures."""
+    luma = plain_scene(plan).frames
+    return pictures.tracked(luma, plan.exposure), luma
+
+
+def test_shake_added_to_a_position_is_where_the_edge_is_seen():
+    """At rest the edge is where each picture has it: seen there, less the tracked one, is the shake, of rms 0.8 px."""
+    found, luma = tracked(Plan(seed=41, shake=1.2, rest_frames=40))
+    resting = slice(0, 38)
+    rows = luma[resting, 115:126, 60:160].astype(float).mean(axis=1)
+    half = (rows[:, :20].mean() + rows[:, -40:].mean()) / 2
+    seen_px = 60 + np.argmax(rows < half, axis=1) - 1
+    before, after = (rows[np.arange(38), seen_px - 60 + k] for k in (0, 1))
+    seen_px = seen_px + (before - half) / (before - after)
+    off_px = seen_px - found.axis.points(found.track.edge_px[resting])[:, 0]
+    off_px -= np.nanmean(off_px)
+    shake_px = found.shake_px[resting] - found.shake_px[resting].mean()
+    assert np.std(off_px) > 0.6
+    assert np.nanstd(off_px - shake_px) < 0.15

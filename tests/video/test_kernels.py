@@ -1,17 +1,26 @@
-"""Compiled loops against plain ones: the same sums, written without tables, vectors or shortcuts."""
+"""Compiled loops against plain ones, NumPy and OpenCV, on any number of threads."""
 
 from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
+from pictures import tracked
+from plain_scene import Plan, plain_scene
 
+from vinetrack.core import threads
 from vinetrack.video import edge_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
-from vinetrack.video.kymograph import median, monotone_path_sums
-from vinetrack.video.strip import _pixels, reference_pixels, sample
+from vinetrack.video.kymograph import (
+    block_means,
+    largest_steps,
+    median,
+    ratio_medians,
+)
+from vinetrack.video.strip import _pixels, reference_pixels, sample, warp_all
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
@@ -61,39 +70,6 @@ def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tup
     return np.clip(values, 0, 255).astype(np.uint8), edge, pictures
 
 
-def test_evidence_of_film_is_the_difference_of_clipped_distances() -> None:
-    strip, _, pictures = stepping()
-    scale, offset = np.linspace(0.9, 1.1, 16), np.linspace(-2, 2, 16)
-    level = strip * scale[:, None, None] + offset[:, None, None]
-    a = np.minimum((level - pictures[0]) ** 2 / (pictures[2] + 25.0), kernels.FILM_CLIP_RATIO * 6.25)
-    b = np.minimum((level - pictures[1]) ** 2 / (pictures[3] + 25.0), 6.25)
-    found = kernels.film_evidence(strip, scale, offset, pictures, 5.0, 2.5)
-    assert np.allclose(found, (a - b - kernels.FILM_BIAS).sum(axis=1), atol=1e-3)
-
-
-def test_what_is_seen_bare_and_covered_is_counted_apart_and_strays_hardly() -> None:
-    strip, edge, pictures = stepping()
-    strip = strip.copy()
-    strip[3, 4, 100] = 255  # a glint on the background, long before the edge comes
-    scale, offset, zeros = np.ones(16), np.zeros(16), np.zeros(16)
-    early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
-    seen = [
-        edge_kernels.gather(
-            strip, scale, offset, edge, zeros, np.zeros(9), 0.5, early, late, 6.0, pictures, clip, NO_SHADING
-        )
-        for clip in (0.0, 10.0)
-    ]
-    frames = np.arange(16)
-    weight = np.where(frames <= early[100], np.exp(-(early[100] - frames) / 6.0), 1.0)[frames <= early[100]]
-    before = strip[: len(weight), 4, 100].astype(float)
-    assert seen[0][5, 4, 100] == pytest.approx(weight.sum(), rel=1e-5)
-    assert seen[0][6, 4, 100] == pytest.approx((weight * before).sum(), rel=1e-5)
-    after = strip[:, 4, 31].astype(float)[frames >= late[31]]
-    assert seen[0][10, 4, 31] / seen[0][8, 4, 31] == pytest.approx(np.mean(after**2), rel=0.05)
-    level = [sums[6, 4, 100] / sums[5, 4, 100] - pictures[1, 4, 100] for sums in seen]
-    assert abs(level[1]) < 2.0 < level[0]
-
-
 def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     strip, edge, pictures = stepping()
     start = edge + 1.4
@@ -122,21 +98,6 @@ def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_l
     )  # fmt: skip
     assert np.abs(known).max() < 0.15
     assert np.abs(ignored).max() > 2 * np.abs(known).max()
-
-
-def test_the_rim_is_no_part_of_what_film_looks_like() -> None:
-    bare, edge, pictures = stepping()
-    strip, *_ = stepping(rim=True)
-    zeros = np.zeros(16)
-    early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
-    clean, freed, ignored = (
-        edge_kernels.gather(seen, np.ones(16), zeros, edge, zeros, LAG, 0.5, early, late, 6.0, pictures, 0.0, shading)
-        for seen, shading in ((bare, NO_SHADING), (strip, RIM), (strip, NO_SHADING))
-    )
-    film = slice(31, 80)  # columns that the rim has crossed
-    level = [sums[9, 4, film] / sums[8, 4, film] for sums in (clean, freed, ignored)]
-    assert np.abs(level[1] - level[0]).max() < 1.0
-    assert np.mean(level[2] - level[0]) > 2.0
 
 
 def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
@@ -178,25 +139,6 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     assert np.allclose(found[3].T, by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 
-def test_paths_across_a_fan_collect_what_a_plain_search_collects() -> None:
-    rng = np.random.default_rng(962)
-    count, bins, length, n_times = 400, 7, 160, 40
-    time = np.sort(rng.integers(0, n_times, count)).astype(float)
-    along = np.clip(4 * time + rng.normal(0, 12, count), 0, length)
-    across, weight = rng.uniform(0, bins, count), rng.uniform(1, 5, count)
-    table = np.zeros((bins, n_times, length // 4 + 1), np.float32)
-    for i in range(count):
-        table[int(across[i]), int(time[i]), int(along[i] / 4)] += weight[i]
-    expected = []
-    for pair in table[:-1] + table[1:]:
-        best = np.zeros(length // 4 + 2)
-        for line in pair:
-            for s in range(1, len(best)):
-                best[s] = max(best[s], best[s - 1] + line[s - 1])
-        expected.append(best[-1])
-    assert np.allclose(monotone_path_sums(along, across, time, weight, bins, length, n_times), expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize("count", [1, 2, 4999, 5000])
 @pytest.mark.parametrize("step", [0.0, 1e-3, 0.5], ids=["free", "fine steps", "coarse steps"])
 def test_a_median_by_histogram_is_the_median(count: int, step: float) -> None:
@@ -208,15 +150,8 @@ def test_a_median_by_histogram_is_the_median(count: int, step: float) -> None:
         assert median(values, kept.astype(float), 16.0) == expected
 
 
-def test_a_median_beyond_the_last_bin_is_the_median() -> None:
-    values = np.linspace(400, 5000, 1001)
-    assert median(values, np.ones(1001), 16.0) == np.median(values)
-
-
 @pytest.mark.parametrize("shake", [None, np.array([[0.6, -0.3], [0.0, 0.2], [-1.2, 0.4]])])
 def test_single_pixels_of_a_strip_are_those_of_the_whole_strip(shake: np.ndarray | None) -> None:
-    import cv2
-
     rng = np.random.default_rng(964)
     luma = cv2.GaussianBlur(rng.uniform(0, 255, (3 * 90, 140)).astype(np.float32), (0, 0), 2.5)
     luma = np.clip((luma - 127) * 6 + 127, 0, 255).astype(np.uint8).reshape(3, 90, 140)
@@ -228,3 +163,76 @@ def test_single_pixels_of_a_strip_are_those_of_the_whole_strip(shake: np.ndarray
     apart = np.abs(_pixels(luma, axis, reference, shake).astype(int) - whole)
     assert apart.max() <= 6
     assert apart.mean() < 0.5
+
+
+# ---- compiled medians, steps and means are those of NumPy and OpenCV ----
+
+
+@pytest.mark.parametrize("side", [1, 3, 4])
+def test_means_of_blocks_are_those_of_opencv(side):
+    luma = np.random.default_rng(1).integers(0, 256, (3, 12 * side, 20 * side), dtype=np.uint8)
+    small = [cv2.resize(frame, (20, 12), interpolation=cv2.INTER_AREA) for frame in luma]
+    np.testing.assert_array_equal(block_means(luma, side), np.stack(small))
+
+
+def test_ratios_have_the_median_of_numpy():
+    rng = np.random.default_rng(2)
+    pictures = rng.uniform(0, 255, (4, 30, 41)).astype(np.float32)
+    reference = rng.uniform(1, 255, (30, 41)).astype(np.float32)
+    expected = np.median((pictures + np.float32(1)) / reference, axis=(1, 2))
+    np.testing.assert_allclose(ratio_medians(pictures, reference), expected, rtol=1e-6)
+
+
+def test_the_largest_step_is_where_means_differ_most():
+    rng = np.random.default_rng(4)
+    pictures = rng.normal(0, 1, (40, 700)).astype(np.float32)
+    begin = rng.integers(10, 30, 700)
+    pictures[np.arange(40)[:, None] >= begin] += 50
+    when, power = largest_steps(pictures, 6)
+    np.testing.assert_array_equal(when, begin)
+    # Of the means of six frames on either side: 6 * 6 / 12 * 50².
+    assert np.median(power) == pytest.approx(3 * 50**2, rel=0.05)
+
+
+# ---- sloped strips cut by compiled loops are OpenCV's but for rounding ----
+
+
+@pytest.mark.parametrize("slope", [0.004, -0.03, 0.7])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_sloped_strip_is_that_of_opencv(slope, dtype):
+    most = np.iinfo(dtype).max
+    luma = np.random.default_rng(5).integers(0, most, (3, 90, 200), dtype=dtype, endpoint=True)
+    along = np.array([np.cos(slope), np.sin(slope)])
+    # From outside the picture, through it, out of it again.
+    matrix = np.array([[along[0], -along[1], -4.3], [along[1], along[0], 30.6]])
+    strips = warp_all(luma, matrix, 40, 230)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    for frame, strip in zip(luma, strips, strict=True):
+        expected = cv2.warpAffine(frame, matrix, (230, 40), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        apart = np.abs(strip.astype(int) - expected)
+        assert apart.max() <= 1
+        assert np.mean(apart > 0) < (0.001 if dtype == np.uint8 else 0.1)
+
+
+# ---- threads of the tracker ----
+
+
+@pytest.mark.parametrize(("stated", "expected"), [("1", 1), ("2", 2), ("64", 4), ("", 4), ("0", 4), ("many", 4)])
+def test_the_usual_variable_limits_the_threads(monkeypatch: pytest.MonkeyPatch, stated: str, expected: int) -> None:
+    monkeypatch.setattr(threads, "available_cores", lambda: 8)
+    monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    assert threads.n_threads() == expected
+
+
+def test_a_track_is_the_same_to_the_last_digit_whatever_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    luma = plain_scene(Plan(seed=13, end_px=300, width=420, rest_frames=20, end_frames=20)).frames
+    found = []
+    for number in (1, 3):
+        monkeypatch.setattr(threads, "n_threads", lambda number=number: number)
+        found.append(tracked(luma, 0.5))
+    one, three = found
+    assert np.isfinite(one.track.edge_px).sum() > 20
+    np.testing.assert_array_equal(one.track.edge_px, three.track.edge_px)
+    np.testing.assert_array_equal(one.track.lead_position_sigma_m, three.track.lead_position_sigma_m)
+    np.testing.assert_array_equal(one.track.lead_position_systematic_m, three.track.lead_position_systematic_m)
+    assert one.track.flag.tolist() == three.track.flag.tolist()

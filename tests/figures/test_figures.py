@@ -1,0 +1,363 @@
+"""Figures of trials, conditions and predictions, from tables written by hand: values drawn, nothing cut off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import matplotlib.colors as mcolors
+import numpy as np
+import pandas as pd
+import pytest
+from figure_frames import assert_nothing_is_cut_off, words
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from vinetrack.dynamics.simulate import effect_motion
+from vinetrack.effects import catalogue
+from vinetrack.figures.damping_figures import (
+    draw_damping_law,
+    draw_exponents,
+    draw_scaling,
+    draw_speed_scaling,
+    log_force_sigma,
+)
+from vinetrack.figures.motion_figures import (
+    MAX_CONDITION_PANELS,
+    draw_model_comparison,
+    draw_model_residuals,
+    draw_overview,
+    draw_trial_motion,
+)
+from vinetrack.figures.prediction_figures import draw_effect
+from vinetrack.figures.style import BLUE, RULE_COLOURS, look, render
+
+# Figures of a whole experiment, from tables written by hand: content, text, and no overlaps.
+
+
+N = 0.4
+
+
+def law(B: float, diameter_mm: float, n_trials: int = 5) -> dict:
+    total = [0.9 * B, 1.1 * B]
+    size = {"diameter_mm": diameter_mm, "thickness_um": 8 * diameter_mm}
+    return {"B": B, "B_95": [0.95 * B, 1.05 * B], "B_95_total": total, "R2": 0.98, "n_trials": n_trials, **size}
+
+
+def fit(vines: dict[str, dict]) -> dict:
+    names = ["n", *(f"ln B {vine}" for vine in vines)]
+    return {
+        "n": N,
+        "n_95": [0.39, 0.41],
+        "n_95_total": [0.38, 0.42],
+        "vines": vines,
+        "covariance": {"parameters": names, "matrix": (1e-4 * np.eye(len(names))).tolist()},
+        "refused": None,
+    }
+
+
+def damping(n_vines: int = 2) -> dict:
+    vines = {f"vine{i}": law(1.0 + i, 6.0 * (i + 1)) for i in range(n_vines)}
+    return {"log_log": fit(vines), "both_axes": fit(vines)}
+
+
+REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
+
+
+def points(n_vines: int = 2) -> pd.DataFrame:
+    rows = [
+        {
+            "trial": f"v{i}_{k}",
+            "vine": f"vine{i}",
+            "x_ss_m_s": 2.0**k,
+            "x_ss_sigma_m_s": 0.02 * 2.0**k,
+            "force_N": (1.0 + i) * 2.0 ** (N * k),
+            "force_sigma_N": 0.01,
+            "used": k < 4,
+        }
+        for i in range(n_vines)
+        for k in range(5)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_both_fits_are_lines_of_slope_n() -> None:
+    lines = [line for line in draw_damping_law(points(1), damping(1)).axes[0].lines if line.get_marker() == "None"]
+    curves = [line for line in lines if len(line.get_xdata()) == 60]
+    assert len(curves) == 2
+    for line in curves:
+        x, force_N = np.log(line.get_xdata()), np.log(line.get_ydata())
+        assert np.polyfit(x, force_N, 1)[0] == pytest.approx(N, abs=1e-9)
+
+
+def test_the_band_is_that_of_the_covariance() -> None:
+    x_ss_m_s = np.array([0.5, 1.0, 4.0])
+    # Var(ln F) = Var(ln B) + ln²x·Var(n), the two being independent here.
+    expected = np.sqrt(1e-4 + np.log(x_ss_m_s) ** 2 * 1e-4)
+    assert log_force_sigma(fit({"v": law(1.0, 6.0)}), "v", x_ss_m_s) == pytest.approx(expected)
+
+
+def family(along: str, sizes: list[float], B: list[float], **changes: object) -> dict:
+    bounds = [[0.9 * b, 1.1 * b] for b in B]
+    statistics = {"slope": 1.8, "slope_95": [1.2, 2.4], "intercept": -3.0, "intercept_95": [-4.0, -2.0], "R2": 0.98}
+    found = {"along": along, "vines": [f"vine{i}" for i in range(len(B))], "sizes": sizes, "B": B, "B_95": bounds}
+    return {**found, "power": statistics, "line": statistics | {"slope": 0.3}, "refused": None, **changes}
+
+
+def scaling(n_vines: int = 4) -> dict:
+    sizes = [6.0 * (i + 1) for i in range(n_vines)]
+    isometric = family("diameter_mm", sizes, [float(np.exp(-3.0) * size**1.8) for size in sizes])
+    return {"method": "both_axes", "isometric": [isometric], "thickness": [], "reason": None}
+
+
+def test_the_power_law_and_the_straight_line_are_drawn_as_fitted() -> None:
+    ax = draw_scaling(scaling()).axes[0]
+    power, line = (
+        next(line for line in ax.lines if line.get_label().startswith(name)) for name in ("power", "straight")
+    )
+    x, B = power.get_data()
+    assert pytest.approx(np.exp(-3.0) * np.asarray(x) ** 1.8) == B
+    x, B = line.get_data()
+    assert pytest.approx(-3.0 + 0.3 * np.asarray(x)) == B
+    assert "slope 1.80 (1.2 to 2.4)" in power.get_label()
+
+
+def campaign(n_conditions: int, replicates: int) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    rows, curves = [], {}
+    time_s = np.linspace(0, 0.1, 40)
+    for i in range(n_conditions):
+        for k in range(replicates):
+            name = f"c{i}_{k}"
+            speed_m_s = (1 + i) * (1 - np.exp(-time_s / 0.01))
+            position_m = (1 + i) * time_s
+            curves[name] = pd.DataFrame(
+                {"time_s": time_s, "lead_position_m": position_m, "lead_velocity_m_s": speed_m_s}
+            )
+            row = {"trial": name, "vine": "v", "condition": f"c{i}", "condition_label": f"12 mm, {i} kPa"}
+            rows.append({**row, "pressure_kPa": i, "status": "ok", "steady_from_s": 0.05, "steady_to_s": 0.08})
+    return pd.DataFrame(rows), curves
+
+
+@pytest.mark.parametrize(("n_conditions", "replicates", "n_panels"), [(1, 1, 1), (12, 2, 12), (40, 4, 40), (500, 1, 1)])
+def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(
+    n_conditions: int, replicates: int, n_panels: int
+) -> None:
+    figure = draw_overview(*campaign(n_conditions, replicates))
+    panels = [ax for ax in figure.axes if ax.get_visible() and ax.get_title(loc="left")]
+    assert len(panels) == n_panels
+    thin = [line for ax in panels for line in ax.lines if line.get_linewidth() < 1]
+    assert len(thin) == n_conditions * replicates
+    if n_conditions > MAX_CONDITION_PANELS:
+        assert "pressure (kPa)" in words(figure)
+
+
+EVERY_FIGURE: dict[str, Callable[[], Figure]] = {
+    "law": lambda: draw_damping_law(points(4), damping(4)),
+    "law of 20 vines": lambda: draw_damping_law(points(20), damping(20)),
+    "exponents": lambda: draw_exponents(damping(4)),
+    "scaling": lambda: draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}),
+    "overview": lambda: draw_overview(*campaign(40, 1)),
+}
+
+
+def test_the_same_figure_gives_the_same_bytes() -> None:
+    first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
+    assert first == second
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_nothing_of_a_campaign_is_cut_off(name: str) -> None:
+    assert_nothing_is_cut_off(EVERY_FIGURE[name]())
+
+
+def test_without_content_there_is_no_figure() -> None:
+    assert draw_damping_law(points().iloc[:0], REFUSED) is None
+    assert draw_exponents(REFUSED) is None
+    assert draw_scaling({"isometric": [], "thickness": []}) is None
+    assert draw_overview(campaign(1, 1)[0], {}) is None
+
+
+# Figures of speed, efficiency and payload, from tables written by hand: content, text, and no overlaps.
+
+
+LINE = {"slope": 0.1, "slope_95": [0.02, 0.18], "intercept": 0.5, "intercept_95": [0, 1], "R2": 0.935, "p": 0.033}
+POWER = {**LINE, "slope": 0.7, "slope_95": [0.1, 1.3], "intercept": math.log(0.3), "p": 0.04}
+NO_LINES = {"power": None, "line": None, "refused": "2 sizes; at least 3"}
+
+
+def speed_family(sizes: list[float], pressure_kPa: float = 24.0) -> dict:
+    speeds = [0.3 * size**0.7 for size in sizes]
+    lines = {"power": POWER, "line": LINE, "refused": None} if len(sizes) > 2 else NO_LINES
+    return {
+        "pressure_kPa": pressure_kPa,
+        "sizes": sizes,
+        "x_ss_m_s": speeds,
+        "x_ss_sigma_m_s": [0.05] * len(sizes),
+        "x_ss_over_diameter_1_s": [1e3 * v / size for v, size in zip(speeds, sizes, strict=True)],
+        "x_ss_over_diameter_sigma_1_s": [None, *([3.0] * (len(sizes) - 1))],
+        "n_steady": [3, *([4] * (len(sizes) - 1))],
+        **lines,
+        "over_diameter": lines,
+    }
+
+
+def test_line_and_power_law_are_drawn_as_fitted() -> None:
+    ax = draw_speed_scaling({"steady_speed": [speed_family([6.0, 12.0, 24.0])]}).axes[0]
+    line, power = (curve for curve in ax.lines if len(curve.get_xdata()) == 100)
+    assert line.get_ydata() == pytest.approx(0.5 + 0.1 * line.get_xdata())
+    assert power.get_ydata() == pytest.approx(0.3 * power.get_xdata() ** 0.7)
+
+
+# The figure of one trial, from tables written by hand.
+
+
+LONG = "still accelerating: the speed rises by 24 % (20 to 28 %) across the window; choose a later start " * 3
+
+
+def tables(n: int = 200) -> tuple[pd.DataFrame, pd.DataFrame]:
+    time_s = np.arange(n) / 1000
+    flag = np.full(n, "", dtype=object)
+    flag[7] = "rejected"
+    track = pd.DataFrame({"time_s": time_s, "lead_position_m": time_s, "flag": flag})
+    kinematics = pd.DataFrame(
+        {
+            "time_s": time_s,
+            "lead_position_m": time_s,
+            "lead_velocity_m_s": np.ones(n),
+            "lead_velocity_sigma_m_s": np.full(n, 0.02),
+        }
+    )
+    return track, kinematics
+
+
+def window(rule: str, accepted: bool, reason: str = "because", x_ss_m_s: float = 2.0) -> dict:
+    span = {"from_s": 0.05, "to_s": 0.15} if np.isfinite(x_ss_m_s) else {"from_s": np.nan, "to_s": np.nan}
+    return {"rule": rule, "accepted": accepted, "reason": reason, "x_ss_m_s": x_ss_m_s, "x_ss_sigma_m_s": 0.01, **span}
+
+
+def figure(*windows: dict, travel_ratio: float = 2.0) -> Figure:
+    columns = list(window("gated", True))
+    return draw_trial_motion("a · 12 mm", *tables(), pd.DataFrame(windows, columns=columns), travel_ratio)
+
+
+def test_x_ss_is_drawn_at_the_speed_of_the_leading_edge() -> None:
+    speed = figure(window("gated", True, x_ss_m_s=2.0)).axes[1]
+    level = next(line for line in speed.lines if to_hex(line.get_color()) == RULE_COLOURS["gated"].lower())
+    assert list(level.get_ydata()) == [1.0, 1.0]
+
+
+def test_long_reasons_and_titles_stay_inside_the_figure() -> None:
+    rows = pd.DataFrame([window(rule, False, LONG) for rule in RULE_COLOURS])
+    drawn = draw_trial_motion("W" * 60 + " · 24 mm × 200 µm × 280 mm · 28 kPa · 35.6 g", *tables(), rows)
+    with look():
+        drawn.draw_without_rendering()
+        inside, edge = drawn.get_tightbbox(), drawn.bbox_inches.padded(0.01)
+    assert edge.x0 <= inside.x0
+    assert inside.x1 <= edge.x1
+    assert edge.y0 <= inside.y0
+    assert inside.y1 <= edge.y1
+
+
+# Figures of model and measurement: one condition, forty, and none.
+
+
+DRAWINGS = [draw_model_comparison, draw_model_residuals]
+
+
+def trajectory(n_trials: int, off_m: float = 5e-3) -> pd.DataFrame:
+    time_s = np.arange(-20, 100) * 1e-3
+    model_m = 2 * np.maximum(time_s, 0)
+    sigma_m = np.full(time_s.size, 1e-3 if n_trials > 1 else np.nan)
+    parts = []
+    for i in range(n_trials):
+        position_m = model_m + off_m * (time_s > 0)
+        columns = {"time_s": time_s, "lead_position_m": position_m, "model_position_m": model_m}
+        columns |= {"replicates_mean_m": position_m, "replicates_sigma_m": sigma_m}
+        parts.append(pd.DataFrame({"trial": f"t{i}", **columns}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def campaign_comparison(n_conditions: int, n_trials: int = 2) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    names = [f"c{i}" for i in range(n_conditions)]
+    table = pd.DataFrame(
+        {
+            "model": "gravity+yield_pressure",
+            "condition": names,
+            "condition_label": [f"12 mm, {i} kPa, 35.6 g" for i in range(n_conditions)],
+            "vine": "v",
+            "rms_position_m": 5e-3,
+            "ratio": 5.0 if n_trials > 1 else np.nan,
+        }
+    )
+    return table, {name: trajectory(n_trials) for name in names}
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+@pytest.mark.parametrize("n_conditions", [1, 12, 40])
+def test_every_condition_has_a_panel_with_its_numbers(draw, n_conditions: int) -> None:  # type: ignore[no-untyped-def]
+    fig = draw(*campaign_comparison(n_conditions))
+    shown = [ax for ax in fig.axes if ax.get_visible()]
+    assert [ax.get_title(loc="left") for ax in shown] == [f"12 mm, {i} kPa, 35.6 g" for i in range(n_conditions)]
+    assert {ax.texts[0].get_text() for ax in shown} == {"rms 5 mm (5×)\nN = 2"}
+    assert len(render(fig, ["svg"])["svg"]) < 1_500_000
+
+
+def test_residuals_are_measurement_minus_model() -> None:
+    (ax,) = draw_model_residuals(*campaign_comparison(1, n_trials=1)).axes
+    assert ax.lines[-1].get_ydata()[-1] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+def test_without_a_fit_there_is_no_figure(draw) -> None:  # type: ignore[no-untyped-def]
+    table, _ = campaign_comparison(1)
+    assert draw(table.iloc[:0], {}) is None
+
+
+# The figure of predictions: complete and labelled, whether vines reach their end or not.
+
+
+# Figures of designs: complete, and labelled with units.
+
+
+# The figure of one effect: its table and its drawing.
+
+
+FASTER = {"fold_inertia", "wall_stretch", "gravity"}
+
+
+def table() -> pd.DataFrame:
+    t = np.linspace(0, 0.2, 50)
+    return pd.DataFrame(
+        {
+            "time_s": t,
+            "without_position_m": t,
+            "with_position_m": 0.9 * t,
+            "without_velocity_m_s": np.ones(50),
+            "with_velocity_m_s": np.full(50, 0.9),
+            "difference_m": -0.1 * t,
+        }
+    )
+
+
+def test_both_curves_are_drawn_in_millimetres_and_milliseconds() -> None:
+    fig = draw_effect("drag", "C = 1", "a vine", table())
+    position, speed, gap = fig.axes
+    drawn = {mcolors.to_hex(line.get_color()).upper(): line for line in position.lines}
+    np.testing.assert_allclose(drawn[BLUE.upper()].get_ydata(), 900 * table()["time_s"])
+    np.testing.assert_allclose(drawn[BLUE.upper()].get_xdata(), 1e3 * table()["time_s"])
+    assert gap.lines[-1].get_ydata()[-1] == pytest.approx(-20.0)
+    assert "m/s" in speed.get_ylabel()
+    assert [text.get_text() for text in position.get_legend().get_texts()] == ["without", "with"]
+    assert "drag: C = 1" in [text.get_text() for text in fig.texts]
+    assert render(fig, ["png"])["png"].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", [name for name, effect in catalogue().items() if effect.parameters])
+def test_every_effect_shows_on_the_reference_vine(name: str) -> None:
+    found = effect_motion(catalogue()[name])
+    assert np.isfinite(found.to_numpy()).all()
+    assert np.max(np.abs(found["difference_m"])) > 1e-6
+    if catalogue()[name].kind == "physical" and name not in ("tail_stretch", "supply_pulsation", *FASTER):
+        assert found["difference_m"].iloc[-1] < 0
+    if name in FASTER:
+        assert found["difference_m"].iloc[-1] > 0
