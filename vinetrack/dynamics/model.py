@@ -361,7 +361,7 @@ def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
 @lru_cache(maxsize=256)
 def shared_host(effects: tuple[Effect, ...]) -> Model | None:
     """Return the host for a model of which none is stated. It is worth 3 s to compile a further model, while a
-    trajectory takes 1.4 times as long by the host (`benchmarks/catalogue_speed.py`): 15 µs more each, less than the 3 s
+    trajectory takes 1.4 times as long by the host: 15 µs more each, less than the 3 s
     for 200 000 of them, which is twenty fits.
     """
     known = all(catalogue().get(effect.name) == effect for effect in effects)
