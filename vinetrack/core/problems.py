@@ -22,10 +22,11 @@ INTERNAL_ERROR = "an internal error of the program; the traceback is in the log 
 class Problem:
     """An error or a warning (`severity`): location, given value, allowed values, and remedy. `file` is relative to the
     experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if they do not apply. `value`
-    is None if there is none, "" for a blank cell.
+    is None if there is none, "" for a blank cell. `code` says for a program what `message` says for a person.
     """
 
     message: str
+    code: str = ""
     severity: str = "error"
     file: str = ""
     trial: str = ""
@@ -40,7 +41,8 @@ class Problem:
     def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
         """Make a problem of an error, with the fields of an InputError."""
         if isinstance(error, InputError):
-            return cls(message=error.message, file=file, remedy=error.remedy, allowed=error.allowed, **details)
+            fields = {"code": error.code, "remedy": error.remedy, "allowed": error.allowed}
+            return cls(message=error.message, file=file, **fields, **details)
         return cls(message=str(error), file=file, **details)
 
     @property
@@ -70,11 +72,11 @@ class UserError(Exception):
 
 
 class InputError(UserError):
-    """An input that cannot be used: what is wrong (`message`), the remedy, and what is allowed."""
+    """An input that cannot be used: what is wrong (`message`, `code`), the remedy, and what is allowed."""
 
-    def __init__(self, message: str, remedy: str = "", allowed: str = "") -> None:
+    def __init__(self, message: str, remedy: str = "", allowed: str = "", code: str = "") -> None:
         super().__init__(f"{message}: {remedy}" if remedy else message)
-        self.message, self.remedy, self.allowed = message, remedy, allowed
+        self.message, self.remedy, self.allowed, self.code = message, remedy, allowed, code
 
 
 class ExperimentError(UserError):

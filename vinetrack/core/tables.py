@@ -203,9 +203,9 @@ def parse_number(text: str, decimal: str = ".") -> float:
     """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else."""
     text = text.strip()
     if text == "":
-        raise TableError("is blank", "write a number")
+        raise TableError("is blank", "write a number", code="blank")
     if not _NUMBER.fullmatch(text):
-        raise TableError("is not a number", "write digits only, without unit or separators")
+        raise TableError("is not a number", "write digits only, without unit or separators", code="not_a_number")
     mark = "," if "," in text else "."
     if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
         joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")

@@ -148,7 +148,9 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     missing = [name for name in CORRECTION_COLUMNS if name not in table.columns]
     if missing:
         remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
-        return {}, [Problem(message="is missing", file=CORRECTIONS_FILE, column=missing[0], remedy=remedy)]
+        return {}, [
+            Problem(message="is missing", code="missing", file=CORRECTIONS_FILE, column=missing[0], remedy=remedy)
+        ]
     by_trial: dict[str, dict[int, Correction]] = {}
     problems: list[Problem] = []
     for i, row in enumerate(table.rows):
@@ -393,7 +395,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED_FOLDER))
         return None
     if not os.path.lexists(folder / SHEET):
-        problems.append(Problem(message="is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
+        problems.append(Problem(message="is missing", code="missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
         return None
     try:
         table = read_table(folder / SHEET)
@@ -438,7 +440,7 @@ def _judge_columns(table: Table) -> list[Problem]:
 
 def _absent_column(name: str) -> Problem:
     remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
-    return Problem(message="is missing", file=SHEET, column=name, remedy=remedy)
+    return Problem(message="is missing", code="missing", file=SHEET, column=name, remedy=remedy)
 
 
 def _name_problems(rows: list[Row]) -> list[Problem]:
@@ -480,7 +482,7 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
     if nominal_kPa < 0:
         remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, below zero"
-        row.add("is blank", "pressure_kPa", value="", remedy=remedy)
+        row.add("is blank", "pressure_kPa", code="blank", value="", remedy=remedy)
         return
     row.values["pressure_kPa"] = nominal_kPa
 

@@ -472,7 +472,7 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
         remedy = did_you_mean(str(location[-1]), names) or "remove it"
         return Problem(message="is not a setting", file=file, line=line, column=key, remedy=remedy)
     if detail["type"] == "missing":
-        return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")
+        return Problem(message="is missing", code="missing", file=file, line=line, column=key, remedy="add it")
     error = detail.get("ctx", {}).get("error")
     if isinstance(error, CellError):
         return Problem.from_error(error, file, line=line, column=key, value=shown)

@@ -140,7 +140,7 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
         if name in columns:
             rate = "write the capture rate; the rate stored in the file is that of playback"
             remedy = rate if name == "capture_fps" else "fill it in"
-            row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
+            row.add("is blank", name, code="blank", value="", allowed=COLUMNS[name].allowed, remedy=remedy)
         else:
             absent.add(name)
     return absent

@@ -426,12 +426,12 @@ def write_templates(folder: Path, say: Callable[[str], None]) -> None:
 def _missing(folder: Path) -> list[Problem]:
     """What is still missing in the files."""
     problems = [problem for problem in check_experiment(folder) if problem.severity == "error"]
-    missing = [problem for problem in problems if problem.message in ("is missing", "is blank")]
+    missing = [problem for problem in problems if problem.code in ("missing", "blank")]
     try:
         from vinetrack.experiment.settings import read_experiment_settings
 
         if read_experiment_settings(folder / SETTINGS).calibration is None:
-            missing.append(Problem(message="is missing", file=SETTINGS, column="calibration"))
+            missing.append(Problem(message="is missing", code="missing", file=SETTINGS, column="calibration"))
     except ExperimentError:
         pass
     return missing

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.problems import InputError
 from vinetrack.core.records import Floats, Track, Trial, join_flags, plain_track
 from vinetrack.core.tables import Table, TableError, file_size, parse_table, read_text
 from vinetrack.core.units import convert, split_unit
@@ -36,8 +37,8 @@ VACUUM_KPA = -101.4  # Least gauge pressure that is accepted; sensors do read a 
 LARGEST_NUMBER = 1e9  # Largest time or position, s or m (chosen)
 
 
-class TrackError(Exception):
-    """A file that cannot be used as a track or a pressure trace: one sentence, with a remedy."""
+class TrackError(InputError):
+    """A file that cannot be used as a track or a pressure trace."""
 
 
 def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
@@ -47,7 +48,7 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
         i = int(wrong[0]) + 1
         place = f"line {lines[i]}, column time_s: " if lines else ""
         raise TrackError(
-            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s): sort or correct the rows"
+            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s)", "sort or correct the rows"
         )
 
 
@@ -59,7 +60,7 @@ def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
         value = float(pressure_kPa[i])
         where = f"line {lines[i]}, column pressure_kPa: {value:g}"
         if value < 0:
-            raise TrackError(f"{where} is below vacuum: gauge pressure in kPa is wanted")
+            raise TrackError(f"{where} is below vacuum", "gauge pressure in kPa is wanted")
         hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * LARGEST_PRESSURE_KPA else ""
         raise TrackError(f"{where} is above {LARGEST_PRESSURE_KPA:g} kPa{hint}")
 
@@ -79,9 +80,9 @@ def new_track(
     known = np.isfinite(lead_position_m)
     if np.sum(known) < FEWEST_POINTS:
         count = int(np.sum(known))
-        raise TrackError(f"has {count} point{'s' * (count != 1)}: at least {FEWEST_POINTS} are needed")
+        raise TrackError(f"has {count} point{'s' * (count != 1)}", f"at least {FEWEST_POINTS} are needed")
     if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
-        raise TrackError("holds a time or position too large to be one: correct it")
+        raise TrackError("holds a time or position too large to be one", "correct it")
     check_times(time_s)
     first, last = lead_position_m[known][[0, -1]]
     backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
@@ -145,7 +146,9 @@ def tdms_columns(path: Path) -> dict[str, Floats]:
     try:
         from nptdms import TdmsFile
     except ModuleNotFoundError:
-        raise TrackError("is a TDMS file, which npTDMS reads: pip install 'vinetrack[cameras]', or use a CSV") from None
+        raise TrackError(
+            "is a TDMS file, which npTDMS reads", "pip install 'vinetrack[cameras]', or use a CSV"
+        ) from None
     _require_whole(path.read_bytes())
     try:
         with warnings.catch_warnings():
@@ -156,12 +159,12 @@ def tdms_columns(path: Path) -> dict[str, Floats]:
                 _with_unit(channel.name, channel.properties): (channel.properties, channel[:]) for channel in channels
             }
     except Exception as error:  # Damaged files end in errors of many kinds.
-        raise TrackError(f"is no whole TDMS file ({error}): export it from LabVIEW again, or as CSV") from None
+        raise TrackError(f"is no whole TDMS file ({error})", "export it from LabVIEW again, or as CSV") from None
     named = {name: (properties, values) for name, (properties, values) in read.items() if values.dtype.kind in "iuf"}
     pressure = next((name for name in named if name.startswith("pressure")), None)
     if pressure is None:
         there = ", ".join(list(named)[:8]) or "none"
-        raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]}): name it so in LabVIEW")
+        raise TrackError(f"lacks a channel pressure_kPa (found: {there[:120]})", "name it so in LabVIEW")
     properties, samples = named[pressure]
     columns = {
         name: np.asarray(values, dtype=float) for name, (_, values) in named.items() if len(values) == len(samples)
@@ -169,7 +172,7 @@ def tdms_columns(path: Path) -> dict[str, Floats]:
     if not any(name.startswith("time") for name in columns):
         step, start = (float(properties.get(f"wf_{key}", 0.0)) for key in ("increment", "start_offset"))
         if not step > 0:
-            raise TrackError("states no times: write a channel time_s, or the waveform's increment (wf_increment)")
+            raise TrackError("states no times", "write a channel time_s, or the waveform's increment (wf_increment)")
         columns["time_s"] = start + step * np.arange(len(samples))
     return dict(_in_own_unit(name, values) for name, values in columns.items())
 
@@ -180,10 +183,10 @@ def _require_whole(data: bytes) -> None:
     while place < len(data):
         length = data[place + 12 : place + 20]
         if data[place : place + 4] != b"TDSm" or len(length) < 8:
-            raise TrackError("is no whole TDMS file: export it from LabVIEW again, or as CSV")
+            raise TrackError("is no whole TDMS file", "export it from LabVIEW again, or as CSV")
         place += 28 + int.from_bytes(length, "big" if data[place + 4] & 1 << 6 else "little")
     if place > len(data):
-        raise TrackError("is cut short: export it from LabVIEW again, or as CSV")
+        raise TrackError("is cut short", "export it from LabVIEW again, or as CSV")
 
 
 def _in_own_unit(name: str, values: Floats) -> tuple[str, Floats]:
@@ -235,7 +238,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     first, last = frames_used or (0, max(marks))
     marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
     if not marks:
-        raise TrackError(f"holds no marks of {name!r} in frames {first} to {last}: widen frames_used")
+        raise TrackError(f"holds no marks of {name!r} in frames {first} to {last}", "widen frames_used")
     frames = np.array(sorted(marks))
     pixels = np.array([marks[frame] for frame in sorted(marks)])
     frame_s, start_s, start_frame = _clock(panel)
@@ -244,7 +247,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
         notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
     unit = (_physics_tracker_text(panel, "length_unit") or "").strip()
     if unit and unit not in METRES:
-        raise TrackError(f"measures lengths in {unit[:20]!r}: set the length unit to m in Tracker")
+        raise TrackError(f"measures lengths in {unit[:20]!r}", "set the length unit to m in Tracker")
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
     world_m = _to_world(frames, pixels, _axes(panel)) * METRES.get(unit, 1.0)
@@ -262,14 +265,14 @@ def _parse_panel(text: str) -> Element:
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise TrackError("defines XML entities, which no Tracker project does: save it anew in Tracker")
+        raise TrackError("defines XML entities, which no Tracker project does", "save it anew in Tracker")
     try:
         root = ElementTree.fromstring(text.lstrip("\ufeff \n"))
     except (ElementTree.ParseError, ValueError, RecursionError):
-        raise TrackError("is not a Tracker project: unpack a .trz, or save as .trk in Tracker") from None
+        raise TrackError("is not a Tracker project", "unpack a .trz, or save as .trk in Tracker") from None
     panels = [node for node in root.iter("object") if node.get("class", "").endswith(".TrackerPanel")]
     if not panels:
-        raise TrackError("holds no Tracker panel: save the project as .trk in Tracker")
+        raise TrackError("holds no Tracker panel", "save the project as .trk in Tracker")
     return panels[0]
 
 
@@ -282,14 +285,14 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
             masses.append((name.strip()[:40], _frame_values(node, "x", "y")))
     marked = [(name, marks) for name, marks in masses if marks]
     if not marked:
-        raise TrackError("holds no point mass with marks: mark the leading edge as a point mass in Tracker")
+        raise TrackError("holds no point mass with marks", "mark the leading edge as a point mass in Tracker")
     best = max(range(len(marked)), key=lambda i: len(marked[i][1]))
     if wanted:
         named = [i for i, (name, _) in enumerate(marked) if name.casefold() == wanted.strip().casefold()]
         if len(named) != 1:
             names = ", ".join(repr(name) for name, _ in marked)
             many = "several point masses" if named else "no point mass"
-            raise TrackError(f"holds {many} named {wanted!r}: point_mass is one of {names}")
+            raise TrackError(f"holds {many} named {wanted!r}", f"point_mass is one of {names}")
         best = named[0]
     name, marks = marked[best]
     return name, marks, [other for i, (other, _) in enumerate(marked) if i != best]
@@ -314,11 +317,11 @@ def _axes(panel: Element) -> list[_Axes]:
     coords = _object(panel, "coords")
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
     if not values:
-        raise TrackError("holds no coordinate system: calibrate it in Tracker")
+        raise TrackError("holds no coordinate system", "calibrate it in Tracker")
     if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in values.values()):
-        raise TrackError("holds a scale that is not positive: calibrate it anew in Tracker")
+        raise TrackError("holds a scale that is not positive", "calibrate it anew in Tracker")
     if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
-        raise TrackError("was never calibrated (1 pixel is 1 m): set a calibration stick or tape in Tracker")
+        raise TrackError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
     return [_Axes(n, (x, y), math.radians(angle), (sx, sy)) for n, (x, y, angle, sx, sy) in sorted(values.items())]
 
 
@@ -340,7 +343,7 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     spacings = [_number(node, "delta_t") for node in (control, video) if node is not None]
     frame_ms = next((spacing for spacing in spacings if math.isfinite(spacing) and spacing > 0), math.nan)
     if math.isnan(frame_ms):
-        raise TrackError("does not say how long a frame lasts: set the frame rate in Tracker's clip settings")
+        raise TrackError("does not say how long a frame lasts", "set the frame rate in Tracker's clip settings")
     start_ms = 0.0 if clip is None else _number(clip, "starttime")
     start_frame = 0.0 if clip is None else _number(clip, "startframe")
     return (
@@ -403,7 +406,7 @@ def read_export(table: Table) -> Track:
         name, unit = _physics_tracker_column(column)
         columns.setdefault(name, (column, unit))
     if "t" not in columns or not {"x", "y"} & columns.keys():
-        raise TrackError("has no columns t and x or y: export them from Tracker with one separator throughout")
+        raise TrackError("has no columns t and x or y", "export them from Tracker with one separator throughout")
     time_s, rounded = unrounded_times(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
     check_times(time_s, table.lines)
     axes = [
@@ -425,7 +428,7 @@ def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
     """Factor that converts a column's unit to SI."""
     name, unit = column
     if unit and unit not in units:
-        raise TrackError(f"column {name[:30]!r} has an unknown unit: use one of {', '.join(units)}")
+        raise TrackError(f"column {name[:30]!r} has an unknown unit", f"use one of {', '.join(units)}")
     return units.get(unit, 1.0)
 
 
@@ -438,7 +441,7 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     if not known.any():
         return np.full(len(points), np.nan), ""
     if np.max(np.abs(points[known])) > LARGEST_NUMBER:
-        raise TrackError("holds a position too large to be one: correct it")
+        raise TrackError("holds a position too large to be one", "correct it")
     if points.shape[1] == 1:
         net = points[known][-1, 0] - points[known][0, 0]
         return (-points[:, 0], "Turned round so that position grows.") if net < 0 else (points[:, 0], "")
@@ -517,7 +520,7 @@ HEADER_WITHIN_LINES = 20
 def load_track(trial: Trial) -> Track:
     """Load the track of a trial whose positions are already measured, with its `pressure_trace` if it has one."""
     if trial.track is None:
-        raise TrackError("is blank: this trial has a video, not a track")
+        raise TrackError("is blank", "this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
     if trial.travel_ratio == 1 and trial.frames_used is None:
         track = flag_end_of_body(track)
@@ -535,13 +538,13 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
     (columns t, x, y or t and one coordinate, with or without a title above).
     """
     if path.suffix.lower() == ".trz":
-        raise TrackError("is a packed Tracker project: unpack it and name the .trk inside")
+        raise TrackError("is a packed Tracker project", "unpack it and name the .trk inside")
     try:
         text = read_text(path)
         if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
             return read_project(text, point_mass, frames_used)
         if point_mass:
-            raise TrackError("has no point masses to choose from: leave point_mass blank, or name a .trk file")
+            raise TrackError("has no point masses to choose from", "leave point_mass blank, or name a .trk file")
         lines = text.split("\n")[:HEADER_WITHIN_LINES]
         skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
         table = parse_table(text, skip or 0)
@@ -549,7 +552,7 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
             return _only_frames(read_export(table), frames_used)
         return _only_frames(_read_positions(table), frames_used)
     except TableError as error:
-        raise TrackError(str(error)) from None
+        raise TrackError(error.message, error.remedy) from None
 
 
 def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
@@ -559,7 +562,7 @@ def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
     rows = np.arange(track.time_s.size)
     before, after = rows < frames_used[0], rows > frames_used[1]
     if np.count_nonzero(~before & ~after) < FEWEST_POINTS:
-        raise TrackError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used: widen it")
+        raise TrackError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used", "widen it")
     flag = track.flag.astype("<U64")
     flag = np.where(before, "rejected", np.where(after, "after_end", flag))
     return replace(track, flag=flag)
@@ -575,7 +578,9 @@ def _read_positions(table: Table) -> Track:
     if "sigma_m" in table.columns:
         sigma_m = table.numbers("sigma_m", blank_is_nan=True)
         if np.any(sigma_m < 0):
-            raise TrackError(f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative: correct it")
+            raise TrackError(
+                f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative", "correct it"
+            )
         if np.any(sigma_m == 0):
             notes.append("A sigma_m of 0 is taken as unknown.")
             sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
@@ -599,9 +604,9 @@ def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
         _require(table, "time_s", "pressure_kPa")
         time_s, pressure_kPa = table.numbers("time_s"), table.numbers("pressure_kPa")
     except TableError as error:
-        raise TrackError(str(error)) from None
+        raise TrackError(error.message, error.remedy) from None
     if len(time_s) == 0:
-        raise TrackError("has no rows: write time_s and pressure_kPa of at least one reading")
+        raise TrackError("has no rows", "write time_s and pressure_kPa of at least one reading")
     check_times(time_s, table.lines)
     check_pressure(pressure_kPa, table.lines)
     return time_s, 1000 * pressure_kPa
@@ -630,10 +635,10 @@ def _as_csv(path: Path) -> str:
     try:
         size = file_size(path)
         if size > LARGEST_TDMS_BYTES:
-            raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB: keep only its pressure channels")
+            raise TrackError(f"is larger than {LARGEST_TDMS_BYTES // 1_000_000} MB", "keep only its pressure channels")
         columns = tdms_columns(path)
     except OSError as error:
-        raise TrackError(f"cannot be read: {error.strerror}") from None
+        raise TrackError("cannot be read", f"{error.strerror}") from None
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows)])
 
@@ -643,5 +648,5 @@ def _require(table: Table, *columns: str) -> None:
     if missing := [column for column in columns if column not in table.columns]:
         present = ", ".join(table.columns[:8]) or "none"
         raise TrackError(
-            f"lacks the column {missing[0]} (found: {present[:120]}): name its columns {', '.join(columns)}"
+            f"lacks the column {missing[0]} (found: {present[:120]})", f"name its columns {', '.join(columns)}"
         )
