@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 CLOSE_NAME_RATIO = 0.6  # Similarity ratio above which an unknown name may be a misspelling of a known one (chosen)
@@ -18,20 +18,21 @@ MAX_QUOTED_LENGTH = 60  # Longest quotation of a value in a message (chosen)
 INTERNAL_ERROR = "an internal error of the program; the traceback is in the log of this stage"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Problem:
     """An error or a warning (`severity`): location, given value, allowed values, and remedy. `file` is relative to the
     experiment; `line` counts from 1 and is 0 if it does not apply; other fields are blank if they do not apply. `value`
     is None if there is none, "" for a blank cell. `code` says for a program what `message` says for a person.
     """
 
-    message: str
     code: str = ""
+    message: str = ""
+    column: str = ""
+    _: KW_ONLY
     severity: str = "error"
     file: str = ""
     trial: str = ""
     line: int = 0
-    column: str = ""
     value: str | None = None
     allowed: str = ""
     remedy: str = ""
@@ -41,7 +42,7 @@ class Problem:
     def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
         """Make a problem of an error, with the fields of an InputError."""
         if isinstance(error, InputError):
-            fields = {"code": error.code, "remedy": error.remedy, "allowed": error.allowed}
+            fields: dict[str, Any] = {"code": error.code, "remedy": error.remedy, "allowed": error.allowed}
             return cls(message=error.message, file=file, **fields, **details)
         return cls(message=str(error), file=file, **details)
 

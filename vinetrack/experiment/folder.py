@@ -1,4 +1,4 @@
-"""Reading and checking an experiment folder: sheet, settings and, on request, every track.
+"""Reading and checking an experiment folder: sheet, settings, corrections and, on request, every track.
 
 All problems are collected before an error is raised. A fault of the sheet or the settings stops the experiment; a fault
 of a single row makes that trial `failed`, unless the experiment is `strict`.
@@ -32,11 +32,7 @@ from vinetrack.core.tables import (
     safe_join,
 )
 from vinetrack.experiment.schema import COLUMNS, SHARED, unusual_value_hint, with_names
-from vinetrack.experiment.settings import (
-    ExperimentSettings,
-    in_sheet_units,
-    read_experiment_settings,
-)
+from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
@@ -48,190 +44,6 @@ from vinetrack.experiment.sheet import (
     unknown_columns,
 )
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
-
-# ------------------------------------------------------------------------------
-# The order in which trials were run, and whether it is confounded with pressure.
-#
-# A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
-# rises with the order, the data cannot distinguish such a drift from an effect of pressure.
-
-CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
-
-FEWEST_TRIALS = 8  # Fewest trials for which the correlation is computed (derived)
-
-REMEDY = "run the trials in random order, or repeat six of them in random order, and number them under order"
-
-
-def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
-    """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
-    Returns ranks, stated: Ranks from 0, shape (n_trials,).
-    """
-    order = np.array([trial.order for trial in trials], dtype=float)
-    stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
-    ranks = np.argsort(np.argsort(order)) if stated else np.arange(order.size)
-    return ranks.astype(float), stated
-
-
-def order_pressure_correlation(trials: Sequence[Trial]) -> float:
-    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines. Returns −1 to
-    1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
-    """
-    from scipy.stats import rankdata
-
-    ranks, _ = trial_order(trials)
-    pairs: list[Floats] = []
-    for vine in dict.fromkeys(trial.vine for trial in trials):
-        members = [i for i, trial in enumerate(trials) if trial.vine == vine and math.isfinite(trial.pressure_Pa)]
-        pressures = np.array([trials[i].pressure_Pa for i in members])
-        if len(members) > 1 and np.ptp(pressures) > 0:
-            both = np.array([rankdata(ranks[members]), rankdata(pressures)])
-            pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
-    if sum(pair.shape[1] for pair in pairs) < FEWEST_TRIALS:
-        return math.nan
-    order, pressure = np.hstack(pairs)
-    return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
-
-
-def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
-    """Warn of confounding: order with pressure, and specimen or day with condition."""
-    correlation = order_pressure_correlation(trials)
-    _, stated = trial_order(trials)
-    if abs(correlation) >= CONFOUNDING_CORRELATION and stated:
-        message = (
-            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
-        )
-        yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
-    elif abs(correlation) >= CONFOUNDING_CORRELATION:
-        message = (
-            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials were "
-            "run in this order, a drift would look like a physical effect"
-        )
-        yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
-    for column in ("specimen", "day"):
-        if _confounded_with_condition(trials, column):
-            message = f"differs for every condition: a difference between {column}s would look like a physical effect"
-            remedy = f"spread every condition over two {column}s"
-            yield Problem(message=message, file=file, column=column, severity="warning", remedy=remedy)
-
-
-def _confounded_with_condition(trials: Sequence[Trial], column: str) -> bool:
-    """Whether every condition has a single value of `specimen` or `day`, while values differ within a vine."""
-    values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
-    if not values or any(not value for _, _, value in values):
-        return False
-    in_condition = Counter(condition for _, condition, _ in values)
-    in_vine = Counter(vine for vine, _ in {(vine, value) for vine, _, value in values})
-    return max(in_condition.values()) == 1 and max(in_vine.values()) > 1
-
-
-# ------------------------------------------------------------------------------
-# Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
-#
-# One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`;
-# the position that it had found itself is kept in the results.
-
-CORRECTIONS_FILE = "corrections.csv"
-CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
-
-
-def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
-    """Read the corrections of an experiment. Returns corrections, problems : by name of trial, and what is wrong with
-    the file; both empty if there is no file.
-    """
-    path = folder / CORRECTIONS_FILE
-    if not os.path.lexists(path):
-        return {}, []
-    try:
-        table = read_table(path)
-    except TableError as error:
-        return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
-    missing = [name for name in CORRECTION_COLUMNS if name not in table.columns]
-    if missing:
-        remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
-        return {}, [
-            Problem(message="is missing", code="missing", file=CORRECTIONS_FILE, column=missing[0], remedy=remedy)
-        ]
-    by_trial: dict[str, dict[int, Correction]] = {}
-    problems: list[Problem] = []
-    for i, row in enumerate(table.rows):
-        correction = _read_line(table, i, problems)
-        by_frame = by_trial.setdefault(row["trial"], {})
-        if correction is None:
-            continue
-        if correction.frame in by_frame:
-            problems.append(_problem(table, i, "frame", "is corrected twice", "keep one of the lines"))
-        by_frame[correction.frame] = correction
-    return {
-        trial: tuple(by_frame[frame] for frame in sorted(by_frame)) for trial, by_frame in by_trial.items()
-    }, problems
-
-
-def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction | None:
-    """Read one line; None if it is faulty, in which case the fault is added to `problems`."""
-    row = table.rows[index]
-    if row["action"] not in CORRECTION_ACTIONS:
-        remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
-        problems.append(_problem(table, index, "action", "is not an action", remedy))
-        return None
-    numbers = {}
-    for column in ("frame", "edge_px"):
-        if column == "edge_px" and row["action"] != "move":
-            continue
-        try:
-            numbers[column] = parse_number(row[column], table.decimal)
-        except TableError as error:
-            problems.append(_problem(table, index, column, error.message, error.remedy))
-            return None
-    if numbers["frame"] < 0 or numbers["frame"] != int(numbers["frame"]):
-        problems.append(_problem(table, index, "frame", "is not a frame number", "frames are counted 0, 1, 2, …"))
-        return None
-    return Correction(int(numbers["frame"]), row["action"], numbers.get("edge_px", math.nan))
-
-
-def _problem(table: Table, index: int, column: str, message: str, remedy: str) -> Problem:
-    row = table.rows[index]
-    return Problem(
-        message=message,
-        file=CORRECTIONS_FILE,
-        line=table.lines[index],
-        trial=row["trial"],
-        column=column,
-        value=row[column],
-        remedy=remedy,
-    )
-
-
-def unmatched_corrections(
-    corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]
-) -> list[Problem]:
-    """Warn of corrections of a trial that is not in the sheet, or is not a recording."""
-    in_sheet, recordings = set(names), set(filmed)
-    return [
-        Problem(
-            message="is not a recording; its corrections are ignored"
-            if trial in in_sheet
-            else "is not in the sheet; its corrections are ignored",
-            file=CORRECTIONS_FILE,
-            column="trial",
-            value=trial,
-            severity="warning",
-        )
-        for trial in corrections
-        if trial not in recordings
-    ]
-
-
-def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
-    """Return the content of `corrections.csv` for these corrections."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(CORRECTION_COLUMNS)
-    for trial, of_trial in corrections.items():
-        for correction in of_trial:
-            edge = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
-            writer.writerow([trial, correction.frame, correction.action, edge])
-    return out.getvalue()
-
 
 SETTINGS = "experiment.yaml"
 EXPECTED_FOLDER = (
@@ -317,10 +129,7 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     problems += _name_problems(rows)
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
     corrections, faults = read_corrections(folder)
-    problems += faults
-    problems += unmatched_corrections(
-        corrections, [row.name for row in rows], [row.name for row in rows if "video" in row.values]
-    )
+    problems += [*faults, *_unmatched(corrections, rows)]
     sheet_is_sound = not any(problem.severity == "error" for problem in problems)
     for row in rows:
         if sheet_is_sound and row.in_use and not row.failed:
@@ -330,21 +139,8 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
         raise ExperimentError(problems)
-    return _assemble(folder, settings, rows, problems, table.columns if table else (), corrections)
-
-
-def _assemble(
-    folder: Path,
-    settings: ExperimentSettings,
-    rows: list[Row],
-    problems: list[Problem],
-    columns: Iterable[str],
-    corrections: Mapping[str, tuple[Correction, ...]],
-) -> Experiment:
-    """Sort the rows into trials to analyse, failed trials, and excluded ones."""
-    good = [row for row in rows if row.in_use and not row.failed]
-    trials = [make_trial(row, folder, settings) for row in good]
-    trials = [replace(trial, corrections=corrections.get(trial.name, ()) if trial.video else ()) for trial in trials]
+    trials = [make_trial(row, folder, settings) for row in rows if row.in_use and not row.failed]
+    trials = [replace(trial, corrections=corrections.get(trial.name, ())) if trial.video else trial for trial in trials]
     errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
     return Experiment(
         name=Path(os.path.normpath(folder.absolute())).name or "experiment",
@@ -356,7 +152,7 @@ def _assemble(
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
         angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
-        columns=tuple(columns),
+        columns=table.columns if table else (),
         recordings=tuple(row.values["video"] for row in rows if "video" in row.values),
     )
 
@@ -368,7 +164,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     except ExperimentError as error:
         problems += error.problems
         return None
-    for key, relative in _settings_paths(settings):
+    for key, relative in settings.paths:
         try:
             safe_join(folder, relative)
         except TableError as error:
@@ -376,26 +172,19 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     for name in SHARED:
         value = getattr(settings, name)
         if COLUMNS[name].kind == "number" and value is not None and (hint := unusual_value_hint(COLUMNS[name], value)):
-            place: dict[str, Any] = {"file": SETTINGS, "column": name, "value": f"{value:g}"}
-            problems.append(Problem(message=f"is unusual: {hint}", severity="warning", **place))
+            place: dict[str, Any] = {"file": SETTINGS, "value": f"{value:g}"}
+            problems.append(Problem("unusual", f"is unusual: {hint}", name, severity="warning", **place))
     return settings
-
-
-def _settings_paths(settings: ExperimentSettings) -> list[tuple[str, str]]:
-    """Return the (key, path) pairs of all paths in the settings."""
-    image = getattr(settings.calibration, "image", None)
-    paths = [("effects", path) for path in settings.effects]
-    return [*paths, ("calibration.image", image)] if image is not None else paths
 
 
 def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
     """Read the sheet as a table and check its columns; None if it cannot be read."""
     if not folder.is_dir():
         message = "is a file, not a folder" if folder.exists() else "does not exist"
-        problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED_FOLDER))
+        problems.append(Problem("no_folder", message, file=str(folder), remedy=EXPECTED_FOLDER))
         return None
     if not os.path.lexists(folder / SHEET):
-        problems.append(Problem(message="is missing", code="missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
+        problems.append(Problem("missing", "is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
         return None
     try:
         table = read_table(folder / SHEET)
@@ -403,7 +192,18 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         problems.append(Problem.from_error(error, SHEET))
         return None
     table, converted = in_sheet_units(table, SHEET)
-    problems += [*converted, *_judge_columns(table)]
+    problems += [*converted, *unknown_columns(table, SHEET)]
+    if table.nameless:
+        message = "has a column without a name, which is ignored"
+        problems.append(Problem("nameless_column", message, file=SHEET, severity="warning"))
+    if "trial" not in table.columns:
+        problems.append(_absent_column("trial"))
+    if not {"video", "track"} & set(table.columns):
+        message, remedy = "has neither a column video nor a column track", "add the one that applies"
+        problems.append(Problem("no_recording", message, file=SHEET, remedy=remedy))
+    if not table.rows:
+        remedy = "write one row per trial below the header"
+        problems.append(Problem("no_rows", "has no rows", file=SHEET, remedy=remedy))
     return table
 
 
@@ -414,33 +214,14 @@ def _missing_sheet_remedy(folder: Path) -> str:
     except OSError:
         return "allow its folder to be read"
     close = difflib.get_close_matches(SHEET, [name for name in names if "tri" in name.lower()], 1, 0.5)
-    if close and not close[0].endswith(".csv"):
-        return f"save {close[0]} as {SHEET}"
     if close:
-        return f"rename {close[0]} to {SHEET}"
+        return f"rename {close[0]} to {SHEET}" if close[0].endswith(".csv") else f"save {close[0]} as {SHEET}"
     return EXPECTED_FOLDER if names else f"the folder is empty; {EXPECTED_FOLDER}"
-
-
-def _judge_columns(table: Table) -> list[Problem]:
-    """Return the problems of the header, and report a sheet without rows."""
-    problems = unknown_columns(table, SHEET)
-    if table.nameless:
-        problems.append(
-            Problem(message="has a column without a name, which is ignored", file=SHEET, severity="warning")
-        )
-    if "trial" not in table.columns:
-        problems.append(_absent_column("trial"))
-    if not {"video", "track"} & set(table.columns):
-        message = "has neither a column video nor a column track"
-        problems.append(Problem(message=message, file=SHEET, remedy="add the one that applies"))
-    if not table.rows:
-        problems.append(Problem(message="has no rows", file=SHEET, remedy="write one row per trial below the header"))
-    return problems
 
 
 def _absent_column(name: str) -> Problem:
     remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
-    return Problem(message="is missing", code="missing", file=SHEET, column=name, remedy=remedy)
+    return Problem("missing", "is missing", name, file=SHEET, remedy=remedy)
 
 
 def _name_problems(rows: list[Row]) -> list[Problem]:
@@ -450,15 +231,13 @@ def _name_problems(rows: list[Row]) -> list[Problem]:
         first = seen.setdefault(row.name.lower(), row)
         if first is row:
             continue
-        place: dict[str, Any] = {"file": SHEET, "trial": row.name, "column": "trial", "value": row.name}
-        if first.name == row.name:
-            message = f"is also the name of line {first.line}"
-            problems.append(
-                Problem(message=message, line=row.line, remedy="give every trial a name of its own", **place)
-            )
-        else:
+        severity, remedy = "error", "give every trial a name of its own"
+        message = f"is also the name of line {first.line}"
+        if first.name != row.name:
+            severity, remedy = "warning", ""
             message = f"differs from {first.name!r} on line {first.line} in case only, which some file systems ignore"
-            problems.append(Problem(message=message, line=row.line, severity="warning", **place))
+        place: dict[str, Any] = {"file": SHEET, "trial": row.name, "line": row.line, "value": row.name}
+        problems.append(Problem("twice", message, "trial", severity=severity, remedy=remedy, **place))
     return problems
 
 
@@ -471,40 +250,163 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
     try:
         pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
     except TrackError as error:
-        row.problems.append(
-            Problem.from_error(error, SHEET, trial=row.name, line=row.line, column=column, value=row.values[column])
-        )
+        place: dict[str, Any] = {"trial": row.name, "line": row.line, "column": column}
+        row.problems.append(Problem.from_error(error, SHEET, value=row.values[column], **place))
         return
     if pressure is None:
         remedy = "fill it in, or give the track a column pressure_kPa"
-        row.add("is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
+        row.add("blank", "is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
         return
     nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
     if nominal_kPa < 0:
         remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, below zero"
-        row.add("is blank", "pressure_kPa", code="blank", value="", remedy=remedy)
+        row.add("blank", "is blank", "pressure_kPa", value="", remedy=remedy)
         return
     row.values["pressure_kPa"] = nominal_kPa
 
 
-def _in_no_row(experiment: Experiment) -> list[Problem]:
-    """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
-    paths = [*experiment.recordings, *(path for _, path in _settings_paths(experiment.settings))]
-    named = {_normal(experiment.folder, path) for path in paths}
-    named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
-    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in (".cih", ".cihx")}
-    found = [name for name in list_recordings(experiment.folder) if _normal(experiment.folder, name) not in named]
-    if not found:
-        return []
-    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-    message = f"names no trial for {', '.join(found[:5])}{more}"
-    remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
-    return [Problem(message=message, file=SHEET, column="video", severity="warning", remedy=remedy)]
+# ------------------------------------------------------------------------------
+# Manual corrections of tracked points: `corrections.csv` beside the trial sheet.
+#
+# One line per point: `trial, frame, action, edge_px`. The tracker applies the action and flags the point `corrected`;
+# the position that it had found itself is kept in the results.
+
+CORRECTIONS_FILE = "corrections.csv"
+CORRECTION_COLUMNS = ("trial", "frame", "action", "edge_px")
+
+Corrections = dict[str, tuple[Correction, ...]]
 
 
-def _normal(folder: Path, name: str) -> Path:
-    return Path(os.path.normpath(folder / name.replace("\\", "/")))
+def read_corrections(folder: Path) -> tuple[Corrections, list[Problem]]:
+    """Read the corrections of an experiment, by name of trial, and what is wrong with their file."""
+    problems: list[Problem] = []
+    if not os.path.lexists(folder / CORRECTIONS_FILE):
+        return {}, []
+    try:
+        table = read_table(folder / CORRECTIONS_FILE)
+    except TableError as error:
+        return {}, [Problem.from_error(error, CORRECTIONS_FILE)]
+    if missing := [name for name in CORRECTION_COLUMNS if name not in table.columns]:
+        remedy = f"its columns are {', '.join(CORRECTION_COLUMNS)}"
+        return {}, [Problem("missing", "is missing", missing[0], file=CORRECTIONS_FILE, remedy=remedy)]
+    by_trial: dict[str, dict[int, Correction]] = {}
+    for row, line in zip(table.rows, table.lines, strict=True):
+        by_frame = by_trial.setdefault(row["trial"], {})
+        column = "action"
+        try:
+            if row["action"] not in CORRECTION_ACTIONS:
+                remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
+                raise TableError("is not an action", remedy, code="not_a_choice")
+            column = "frame"
+            frame = parse_number(row["frame"], table.decimal)
+            column = "edge_px"
+            edge_px = parse_number(row["edge_px"], table.decimal) if row["action"] == "move" else math.nan
+            column = "frame"
+            if frame < 0 or frame != int(frame):
+                raise TableError("is not a frame number", "frames are counted 0, 1, 2, …", code="not_a_frame")
+            repeated = int(frame) in by_frame
+            by_frame[int(frame)] = Correction(int(frame), row["action"], edge_px)
+            if repeated:
+                raise TableError("is corrected twice", "keep one of the lines", code="twice")
+        except TableError as error:
+            place: dict[str, Any] = {"line": line, "trial": row["trial"], "column": column, "value": row[column]}
+            problems.append(Problem.from_error(error, CORRECTIONS_FILE, **place))
+    sorted_by_frame = {
+        name: tuple(by_frame[frame] for frame in sorted(by_frame)) for name, by_frame in by_trial.items()
+    }
+    return sorted_by_frame, problems
 
+
+def _unmatched(corrections: Corrections, rows: list[Row]) -> Iterator[Problem]:
+    """Warn of corrections of a trial that is not in the sheet, or is not a recording."""
+    filmed = {row.name: "video" in row.values for row in rows}
+    for trial in corrections:
+        if not filmed.get(trial):
+            message = f"is not {'a recording' if trial in filmed else 'in the sheet'}; its corrections are ignored"
+            place: dict[str, Any] = {"file": CORRECTIONS_FILE, "value": trial, "severity": "warning"}
+            yield Problem("ignored", message, "trial", **place)
+
+
+def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
+    """Return the content of `corrections.csv` for these corrections."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(CORRECTION_COLUMNS)
+    for trial, of_trial in corrections.items():
+        for correction in of_trial:
+            edge = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
+            writer.writerow([trial, correction.frame, correction.action, edge])
+    return out.getvalue()
+
+
+# ------------------------------------------------------------------------------
+# The order in which trials were run, and whether it is confounded with pressure.
+#
+# A drift (wear of the tube, warming, a moving zero of the gauge) follows the order of the trials. If the pressure
+# rises with the order, the data cannot distinguish such a drift from an effect of pressure.
+
+CONFOUNDING_CORRELATION = 0.7  # Rank correlation above which order and pressure count as confounded (derived)
+
+FEWEST_TRIALS = 8  # Fewest trials for which the correlation is computed (derived)
+
+
+def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
+    """Return the rank of every trial in the order in which they were run, and whether the sheet states that order.
+    Returns ranks, stated: Ranks from 0, shape (n_trials,).
+    """
+    order = np.array([trial.order for trial in trials], dtype=float)
+    stated = bool(order.size and np.isfinite(order).all() and np.unique(order).size == order.size)
+    ranks = np.argsort(np.argsort(order)) if stated else np.arange(order.size)
+    return ranks.astype(float), stated
+
+
+def order_pressure_correlation(trials: Sequence[Trial]) -> float:
+    """Return Spearman's rank correlation of order and set pressure within vines, pooled over all vines. Returns −1 to
+    1; NaN if there are fewer than `FEWEST_TRIALS` trials, or each vine has only one pressure.
+    """
+    from scipy.stats import rankdata
+
+    ranks, _ = trial_order(trials)
+    pairs: list[Floats] = []
+    for vine in dict.fromkeys(trial.vine for trial in trials):
+        members = [i for i, trial in enumerate(trials) if trial.vine == vine and math.isfinite(trial.pressure_Pa)]
+        pressures = np.array([trials[i].pressure_Pa for i in members])
+        if len(members) > 1 and np.ptp(pressures) > 0:
+            both = np.array([rankdata(ranks[members]), rankdata(pressures)])
+            pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
+    if sum(pair.shape[1] for pair in pairs) < FEWEST_TRIALS:
+        return math.nan
+    order, pressure = np.hstack(pairs)
+    return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
+
+
+def _order_problems(trials: Sequence[Trial]) -> Iterator[Problem]:
+    """Warn of confounding: order with pressure, and specimen or day with condition."""
+    correlation = order_pressure_correlation(trials)
+    if abs(correlation) >= CONFOUNDING_CORRELATION:
+        message = (
+            f"follows the pressure (rank correlation {correlation:.2f}): a drift would look like a physical effect"
+            if trial_order(trials)[1]
+            else f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials "
+            "were run in this order, a drift would look like a physical effect"
+        )
+        remedy = "run the trials in random order, or repeat six of them in random order, and number them under order"
+        yield Problem("confounded", message, "order", file=SHEET, severity="warning", remedy=remedy)
+    for column in ("specimen", "day"):
+        # Every condition has a single specimen or day, while they differ within a vine.
+        values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
+        if not values or any(not value for *_, value in values):
+            continue
+        in_condition = Counter(condition for _, condition, _ in values)
+        in_vine = Counter(vine for vine, _ in {(vine, value) for vine, _, value in values})
+        if max(in_condition.values()) == 1 and max(in_vine.values()) > 1:
+            message = f"differs for every condition: a difference between {column}s would look like a physical effect"
+            remedy = f"spread every condition over two {column}s"
+            yield Problem("confounded", message, column, file=SHEET, severity="warning", remedy=remedy)
+
+
+# ------------------------------------------------------------------------------
+# The check of an experiment before any work: tracks are read, recordings handed on to who can open them.
 
 OpenRecordings = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
@@ -516,11 +418,11 @@ def check_experiment(folder: Path | str, open_videos: OpenRecordings | None = No
     except ExperimentError as error:
         return list(error.problems)
     problems = list(experiment.problems)
-    for key, relative in _settings_paths(experiment.settings):
-        if not safe_join(experiment.folder, relative).exists():
-            message, remedy = missing_file_message(safe_join(experiment.folder, relative))
-            problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
-    problems += [*order_problems(experiment.trials, SHEET), *_in_no_row(experiment)]
+    for key, relative in experiment.settings.paths:
+        if not (path := safe_join(experiment.folder, relative)).exists():
+            message, remedy = missing_file_message(path)
+            problems.append(Problem("no_file", message, key, file=SETTINGS, value=relative, remedy=remedy))
+    problems += [*_order_problems(experiment.trials), *_in_no_row(experiment)]
     trial_problems: list[Problem] = []
     readable: list[Trial] = []
     named_videos = {trial.video for trial in experiment.trials if trial.video}
@@ -543,6 +445,24 @@ def _with_location(problem: Problem, experiment: Experiment) -> Problem:
     return replace(problem, file=SHEET, line=experiment.lines[problem.trial])
 
 
+def _in_no_row(experiment: Experiment) -> list[Problem]:
+    """Warn of recordings in the folder that neither a row of the sheet nor the calibration names."""
+
+    def normal(name: str) -> Path:
+        return Path(os.path.normpath(experiment.folder / name.replace("\\", "/")))
+
+    named = {normal(path) for path in (*experiment.recordings, *(path for _, path in experiment.settings.paths))}
+    named |= {path.parent for path in named if path.suffix.lower() in IMAGES}  # the first picture of a burst
+    named |= {path.with_suffix(".mraw") for path in named if path.suffix.lower() in (".cih", ".cihx")}
+    found = [name for name in list_recordings(experiment.folder) if normal(name) not in named]
+    if not found:
+        return []
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    message = f"names no trial for {', '.join(found[:5])}{more}"
+    remedy = "add a row for each, with `use: no` if it is to be left out, or move it elsewhere"
+    return [Problem("in_no_row", message, "video", file=SHEET, severity="warning", remedy=remedy)]
+
+
 def _check_track(trial: Trial) -> list[Problem]:
     """Read a track with its pressure, and warn where it contradicts the sheet."""
     place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
@@ -550,25 +470,23 @@ def _check_track(trial: Trial) -> list[Problem]:
         track = load_track(trial)
     except TrackError as error:
         return [Problem.from_error(error, SHEET, **place)]
-    remarks = []
+    remarks = {}
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
     if abs(frames - 1) > 0.02:
-        remarks.append(f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?")
+        remarks["capture_fps"] = f"has points {frames:.4g} frames apart at this capture_fps: is capture_fps right?"
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
     # A factor of 2 allows for a poor scale or axis, but not for millimetres read as metres.
     if travel_m > 2 * trial.length_m:
-        remarks.append(
+        remarks["longer_than_the_vine"] = (
             f"travels {travel_m:.4g} m, but the vine is {trial.length_m:g} m long: are its positions in metres?"
         )
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
-        remarks.append("runs backwards: position should grow as the vine does")
+        remarks["backwards"] = "runs backwards: position should grow as the vine does"
     if track.pressure_Pa is not None and trial.pressure_Pa > 0:
-        highest_kPa = float(np.max(track.pressure_Pa)) / 1000
-        if not 0.5 < highest_kPa / (trial.pressure_Pa / 1000) < 2:
-            remarks.append(
-                f"has pressures up to {highest_kPa:.4g} kPa, but the sheet says {trial.pressure_Pa / 1000:g} kPa"
-            )
-    return [Problem(message=message, severity="warning", **place) for message in remarks]
+        highest_kPa, stated_kPa = float(np.max(track.pressure_Pa)) / 1000, trial.pressure_Pa / 1000
+        if not 0.5 < highest_kPa / stated_kPa < 2:
+            remarks["pressure"] = f"has pressures up to {highest_kPa:.4g} kPa, but the sheet says {stated_kPa:g} kPa"
+    return [Problem(code, message, severity="warning", **place) for code, message in remarks.items()]
 
 
 def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
@@ -576,20 +494,22 @@ def _check_video(trial: Trial, named_videos: Set[Path]) -> list[Problem]:
     path = trial.video
     if path is None:
         return []
-    place: dict[str, Any] = {"column": "video", "value": path.name}
+    code, remedy = "empty", ""
     try:
         if path.is_dir():
-            empty = not any(path.iterdir())
-            return [Problem(message="is an empty folder", remedy="put the frames in it", **place)] if empty else []
-        if file_size(path) == 0:
-            return [Problem(message="is an empty file", remedy="copy it again", **place)]
+            message, remedy = "is an empty folder", "put the frames in it"
+            if any(path.iterdir()):
+                return []
+        elif file_size(path) == 0:
+            message, remedy = "is an empty file", "copy it again"
+        else:
+            return []
     except (FileNotFoundError, ValueError):
-        message, remedy = missing_file_message(path)
+        code, (message, remedy) = "no_file", missing_file_message(path)
         remedy = remedy if path.is_symlink() else _missing_video_remedy(path, named_videos)
-        return [Problem(message=message, remedy=remedy, **place)]
     except OSError as error:
-        return [Problem(message=f"cannot be read: {error.strerror}", **place)]
-    return []
+        code, message = "unreadable", f"cannot be read: {error.strerror}"
+    return [Problem(code, message, "video", value=path.name, remedy=remedy)]
 
 
 def _missing_video_remedy(path: Path, named_videos: Set[Path]) -> str:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table
-from vinetrack.experiment.schema import COLUMNS, SHARED, option, with_names
+from vinetrack.experiment.schema import SHARED, option, with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
@@ -31,8 +31,6 @@ REQUIRED_FOR_PREDICTION = ("diameter_mm", "thickness_um", "length_mm", "pressure
 
 # Columns about recordings: optional for a planned trial, and ignored
 _RECORDING_COLUMNS = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
-
-Relocate = Callable[[Problem], Problem]
 
 
 @dataclass(frozen=True)
@@ -75,14 +73,11 @@ def planned_trial(
     >>> planned_trial(texts).trials[0].vine
     '24mm-200um-280mm'
     """
-
-    def shown(problem: Problem) -> Problem:
-        return replace(problem, file="", trial="", line=0, column=option(problem.column) if problem.column else "")
-
     settings = settings or ExperimentSettings()
-    cells = {"trial": "planned", **{name: text.strip() for name, text in values.items()}}
-    table = Table(tuple(cells), (cells,), (0,), ((),), ",", ".")
-    return _planned_trials(table, settings, None, needed, shown)
+    table = table_of_texts([{"trial": "planned", **{name: text.strip() for name, text in values.items()}}])
+    rows, problems = _checked_rows(table, settings, needed)
+    problems = [replace(p, file="", trial="", column=option(p.column) if p.column else "") for p in problems]
+    return PlannedTrials(tuple(_trials(rows, settings, problems)), settings, None, tuple(problems))
 
 
 def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
@@ -92,37 +87,43 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     file = path / SHEET if path.is_dir() else path
     if not file.is_file():
         remedy = _nearest(file) or f"give a folder with {SHEET}, or a sheet"
-        raise ExperimentError([Problem(message="does not exist", file=str(file), remedy=remedy)])
+        raise ExperimentError([Problem("no_file", "does not exist", file=str(file), remedy=remedy)])
     try:
         table = read_table(file)
     except TableError as error:
         raise ExperimentError([Problem.from_error(error, file.name)]) from None
-    table, converted = in_sheet_units(table, file.name)
+    table, header = in_sheet_units(table, file.name)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
     if not table.rows:
-        raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
-    header = [*converted, *_check_header(table, settings, file.name)]
+        raise ExperimentError([Problem("no_rows", "has no rows", file=file.name, remedy="write one row a trial")])
+    header += _check_header(table, settings, file.name)
+    rows, problems = _checked_rows(table, settings, REQUIRED_FOR_PREDICTION)
+    problems = [*header, *(replace(problem, file=file.name) for problem in problems)]
+    trials = _trials(rows, settings, problems)
+    first = {trial.condition: trial for trial in reversed(trials)}
+    if not every_row:
+        trials = [first[condition] for condition in dict.fromkeys(trial.condition for trial in trials)]
+    return PlannedTrials(tuple(trials), settings, file.parent, tuple(problems))
 
-    def shown(problem: Problem) -> Problem:
-        return replace(problem, file=file.name)
 
-    return _planned_trials(table, settings, file.parent, REQUIRED_FOR_PREDICTION, shown, header, every_row=every_row)
+def table_of_texts(rows: Sequence[dict[str, str]]) -> Table:
+    """Return a table of rows that stand in no file: their lines are 0."""
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    return Table(columns, tuple(rows), (0,) * len(rows), ((),) * len(rows), ",", ".")
 
 
 def _check_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
-    """Return warnings about unknown columns."""
+    """Return warnings about unknown columns; refuse a sheet that lacks required ones."""
     unknown = unknown_columns(table, file)
-    absent = [
-        name
-        for name in REQUIRED_FOR_PREDICTION
-        if name not in table.columns and not (name in SHARED and getattr(settings, name) is not None)
-    ]
-    if absent:
-        message = f"has no column {', '.join(absent)}"
-        if len(absent) == len(REQUIRED_FOR_PREDICTION):
-            raise ExperimentError([Problem(message=message, file=file, remedy="give a trial sheet, one row a trial")])
-        raise ExperimentError([Problem(message=message, file=file, remedy="add what is missing"), *unknown])
-    return unknown
+    shared = {name for name in SHARED if getattr(settings, name) is not None}
+    absent = [name for name in REQUIRED_FOR_PREDICTION if name not in table.columns and name not in shared]
+    if not absent:
+        return unknown
+    message = f"has no column {', '.join(absent)}"
+    if len(absent) == len(REQUIRED_FOR_PREDICTION):
+        remedy = "give a trial sheet, one row a trial"
+        raise ExperimentError([Problem("missing", message, file=file, remedy=remedy)])
+    raise ExperimentError([Problem("missing", message, file=file, remedy="add what is missing"), *unknown])
 
 
 def _nearest(file: Path) -> str:
@@ -134,58 +135,32 @@ def _nearest(file: Path) -> str:
     return f"did you mean {close[0]}?" if close else ""
 
 
-def _planned_trials(
-    table: Table,
-    settings: ExperimentSettings,
-    folder: Path | None,
-    needed: Sequence[str],
-    shown: Relocate,
-    header: Sequence[Problem] = (),
-    *,
-    every_row: bool = False,
-) -> PlannedTrials:
-    """Read, check and name the rows; raise an ExperimentError if any has an error."""
+def _checked_rows(table: Table, settings: ExperimentSettings, needed: Sequence[str]) -> tuple[list[Row], list[Problem]]:
+    """Read and check the rows in use; return them with their problems, those of recordings left out."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     for row in rows:
-        _check_row(row, needed)
-    of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDING_COLUMNS)
-    problems = [*header, *of_rows]
-    if any(problem.severity == "error" for problem in problems) or not rows:
-        nothing = (
-            []
-            if rows
-            else [shown(Problem(message="has no trial in use", remedy="remove `use: no` from at least one row"))]
-        )
-        raise ExperimentError([*problems, *nothing])
-    trials = with_names([_trial(row, settings) for row in rows])
-    first = {trial.condition: trial for trial in reversed(trials)}
-    kept = trials if every_row else (first[condition] for condition in dict.fromkeys(t.condition for t in trials))
-    return PlannedTrials(tuple(kept), settings, folder, tuple(problems))
+        row.add_blank(needed, "give it")
+        if row.travel_ratio != 2:
+            remedy = "predictions are for everting vines (travel_ratio 2)"
+            row.add("a_body", "is that of a body that moves as a whole", "travel_ratio", remedy=remedy)
+        check_wall(row)
+        check_pressures(row)
+    if not rows:
+        remedy = "remove `use: no` from at least one row"
+        return rows, [Problem("no_rows", "has no trial in use", remedy=remedy)]
+    return rows, [p for row in rows for p in row.problems if p.column not in _RECORDING_COLUMNS]
 
 
-def _check_row(row: Row, needed: Sequence[str]) -> None:
-    broken = {problem.column for problem in row.problems}
-    for name in needed:
-        if name not in row.values and name not in broken:
-            row.add(
-                "is missing" if row.line == 0 else "is blank", name, allowed=COLUMNS[name].allowed, remedy="give it"
-            )
-    if row.travel_ratio != 2:
-        row.add(
-            "is that of a body that moves as a whole",
-            "travel_ratio",
-            remedy="predictions are for everting vines (travel_ratio 2)",
-        )
-    check_wall(row)
-    check_pressures(row)
-
-
-def _trial(row: Row, settings: ExperimentSettings) -> Trial:
-    """Return the trial of a row, without its recording; a yield pressure that is not given is NaN."""
-    values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
-    trial = make_trial(replace(row, values=values), Path(), settings)
-    fps = row.values.get("capture_fps", math.nan)
-    trial = replace(trial, capture_fps=float(fps))
-    if "yield_pressure_kPa" not in row.values:
-        return replace(trial, yield_pressure_Pa=math.nan, yield_pressure_sigma_Pa=math.nan)
-    return trial
+def _trials(rows: Sequence[Row], settings: ExperimentSettings, problems: Sequence[Problem]) -> list[Trial]:
+    """Return named trials without their recordings; a yield pressure that is not given is NaN. Refuse errors."""
+    if any(problem.severity == "error" for problem in problems):
+        raise ExperimentError(problems)
+    trials = []
+    for row in rows:
+        values = {name: value for name, value in row.values.items() if name not in _RECORDING_COLUMNS}
+        trial = make_trial(replace(row, values=values), Path(), settings)
+        trial = replace(trial, capture_fps=row.number("capture_fps"))
+        if "yield_pressure_kPa" not in values:
+            trial = replace(trial, yield_pressure_Pa=math.nan, yield_pressure_sigma_Pa=math.nan)
+        trials.append(trial)
+    return list(with_names(trials))

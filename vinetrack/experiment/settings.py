@@ -1,7 +1,8 @@
 """Settings shared by all trials (`experiment.yaml`) and settings of the analysis (`config/config.yaml`).
 
-The pydantic models below define all keys, defaults and allowed values; a test keeps `config/config.yaml` consistent
-with them. All unknown keys, repeated keys and values that are not allowed are reported together.
+The pydantic models below define all keys, defaults, allowed values and meanings; a string beside a type says how to
+measure the value. A test keeps `config/config.yaml` consistent with them. All unknown keys, repeated keys and values
+that are not allowed are reported together.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -42,97 +44,18 @@ from vinetrack.experiment.schema import (
     read_value,
 )
 
-# ------------------------------------------------------------------------------
-# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning.
-
-
-def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Rename columns in other units to those of the sheet and convert their numbers, with a warning for each. A column
-    of the sheet without any value gives way to the same quantity in another unit.
-    """
-    problems: list[Problem] = []
-    known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
-    filled = {name for name in table.columns if any(row[name] for row in table.rows)}
-    renamed: dict[str, tuple[str, str]] = {}
-    for name in table.columns:
-        if name in COLUMNS or name not in known:
-            continue
-        column, unit = known[name]
-        place: dict[str, Any] = {"file": file, "line": 1, "column": name, "severity": "warning"}
-        if column in filled or column in [target for target, _ in renamed.values()]:
-            problems.append(Problem(message=f"is ignored, because the sheet also has {column}", **place))
-            continue
-        renamed[name] = known[name]
-        problems.append(Problem(message=_conversion(column, unit), **place))
-    if not renamed:
-        return table, problems
-    blank = {column for column, _ in renamed.values()}
-    names = {name: renamed[name][0] if name in renamed else name for name in table.columns if name not in blank}
-    rows = tuple(
-        {
-            column: _converted(row[name], renamed[name][1], column, table.decimal) if name in renamed else row[name]
-            for name, column in names.items()
-        }
-        for row in table.rows
-    )
-    return replace(table, columns=tuple(names.values()), rows=rows), problems
-
-
-def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
-    """Convert the numbers of a cell or key to the unit of its name, to 15 digits; what is no number stays."""
-    if isinstance(value, list):
-        return [_converted(element, unit, name) for element in value]
-    if isinstance(value, str) and ":" in value:
-        return ":".join(_converted(part, unit, name, decimal) for part in value.split(":"))
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return value
-    try:
-        given = parse_number(value, decimal) if isinstance(value, str) else float(value)
-    except TableError:
-        return value
-    text = f"{convert(given, unit, split_unit(name)[1]):.15g}"
-    return text.replace(".", decimal or ".") if isinstance(value, str) else float(text)
-
-
-def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
-    """Rename keys in other units, such as `pressure_psi`, to those of the settings and convert their numbers, with a
-    warning for each. Of two keys for one quantity a blank one gives way.
-    """
-    content, lines = dict(document.content), dict(document.lines)
-    for group, models in _GROUPS.items():
-        keys = content if not group else content.get(group)
-        if not isinstance(keys, dict):
-            continue
-        path, keys = ((group,) if group else ()), dict(keys)
-        for name in [name for model in models for name in model.model_fields]:
-            for other, unit in other_units(name).items():
-                if other not in keys or None not in (keys.get(name), keys[other]):
-                    continue
-                value, line = keys.pop(other), lines.get((*path, other), 0)
-                if value is None:
-                    continue
-                keys[name], lines[*path, name] = _converted(value, unit, name), line
-                place: dict[str, Any] = {"file": file, "line": line, "column": ".".join((*path, other))}
-                problems.append(Problem(message=_conversion(name, unit), severity="warning", **place))
-        content = {**content, group: keys} if group else keys
-    return YamlDocument(content, lines)
-
-
-def _conversion(name: str, unit: str) -> str:
-    own = split_unit(name)[1]
-    return f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
-
 
 def _no_yes_or_no(value: Any) -> Any:
     """Refuse yes and no, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
-        raise CellError("is yes or no where a number belongs", "write the number")
+        raise CellError("is yes or no where a number belongs", "write the number", code="not_a_number")
     return value
 
 
 Number = Annotated[float, BeforeValidator(_no_yes_or_no)]
 Count = Annotated[int, BeforeValidator(_no_yes_or_no)]
 Positive = Annotated[Number, Field(gt=0)]
+Share = Annotated[Number, Field(gt=0, le=1)]
 Pixel = tuple[Number, Number]
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -140,83 +63,103 @@ Model = TypeVar("Model", bound=BaseModel)
 class _Strict(BaseModel):
     """Base of all settings: immutable, without unknown keys, NaN or infinity."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True, use_attribute_docstrings=True
+    )
 
 
-def _optional_fields(types: dict[str, Any]) -> Any:
-    """Return a base class with an optional field of each name and type, None by default."""
-    fields: dict[str, Any] = {name: (kind | None, None) for name, kind in types.items()}
-    return create_model("Columns", __base__=_Strict, **fields)
-
-
-class AxisSettings(_Strict):
-    """The growth axis in the picture, and the width of the strip along it that is tracked."""
-
-    from_px: Pixel
-    to_px: Pixel
-    via_px: tuple[Pixel, ...] | None = None
-    width_mm: Positive | None = None
+class _TwoEnds(_Strict):
+    from_px: Annotated[Pixel, "Any picture viewer shows it."]
+    """First point, x to the right and y down from the upper left corner."""
+    to_px: Annotated[Pixel, "Any picture viewer shows it."]
+    """Second point."""
 
     @model_validator(mode="after")
-    def _has_a_direction(self) -> AxisSettings:
-        through = (self.from_px, *(self.via_px or ()), self.to_px)
-        if self.via_px and any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
+    def _has_a_length(self) -> _TwoEnds:
+        via_px: tuple[Pixel, ...] = getattr(self, "via_px", None) or ()
+        through = (self.from_px, *via_px, self.to_px)
+        if not via_px and self.from_px == self.to_px:
+            raise CellError("from_px and to_px are the same point", "name two", code="too_close")
+        if via_px and any(math.dist(a, b) < SMALLEST_POINT_SPACING_PX for a, b in pairwise(through)):
             message = f"neighbouring points are less than {SMALLEST_POINT_SPACING_PX} pixels apart"
-            raise CellError(message, "leave out the second")
-        if not self.via_px and self.from_px == self.to_px:
-            raise CellError("from_px and to_px are the same point", "name two")
+            raise CellError(message, "leave out the second", code="too_close")
         return self
+
+
+class AxisSettings(_TwoEnds):
+    """The growth axis in the picture, and the width of the strip along it that is tracked."""
+
+    via_px: Annotated[tuple[Pixel, ...] | None, "Like the ends."] = None
+    """Intermediate points of a curved path, in order; a smooth curve passes through all."""
+    width_mm: Annotated[Positive | None, "About the diameter of the vine."] = None
+    """Width of the strip along the axis that is tracked."""
 
 
 class MmPerPx(_Strict):
     """The scale, stated directly."""
 
     kind: Literal["mm_per_px"]
-    mm_per_px: Positive
+    mm_per_px: Annotated[Positive, "Length of a ruler in the plane of growth over its pixels."]
+    """Scale of the picture."""
 
 
-class TwoPoints(_Strict):
+class TwoPoints(_TwoEnds):
     """Two points in the picture and the distance between them."""
 
     kind: Literal["two_points"]
-    from_px: Pixel
-    to_px: Pixel
-    length_mm: Positive
-
-    @model_validator(mode="after")
-    def _has_a_length(self) -> TwoPoints:
-        if self.from_px == self.to_px:
-            raise CellError("from_px and to_px are the same point", "name two")
-        return self
+    length_mm: Annotated[Positive, "Two marks of a ruler in the plane of growth."]
+    """Distance between the two points."""
 
 
-class Checkerboard(_Strict):
+class _Board(_Strict):
+    image: Annotated[str, "Film it with the settings of the trials."]
+    """Picture or clip of the target, in the plane of growth."""
+    squares: Annotated[tuple[Annotated[Count, Field(ge=2)], Annotated[Count, Field(ge=2)]], "Count them."]
+    """Squares across and down."""
+    square_mm: Annotated[Positive, "Calliper over ten printed squares, divided by ten: printers scale."]
+    """Side of a square."""
+
+
+class Checkerboard(_Board):
     """A checkerboard: `squares` across and down."""
 
     kind: Literal["checkerboard"]
-    image: str
-    squares: tuple[Annotated[Count, Field(ge=3)], Annotated[Count, Field(ge=3)]]
-    square_mm: Positive
+    squares: Annotated[tuple[Annotated[Count, Field(ge=3)], Annotated[Count, Field(ge=3)]], "Count them."]
+    """Squares across and down."""
 
 
-class Charuco(_Strict):
+class Charuco(_Board):
     """A ChArUco board: `squares` across and down, and the OpenCV name of its marker dictionary."""
 
     kind: Literal["charuco"]
-    image: str
-    squares: tuple[Annotated[Count, Field(ge=2)], Annotated[Count, Field(ge=2)]]
-    square_mm: Positive
-    marker_mm: Positive
-    dictionary: Annotated[str, Field(pattern=r"^DICT_\w+$")]
+    marker_mm: Annotated[Positive, "Calliper."]
+    """Side of a marker inside its square."""
+    dictionary: Annotated[str, Field(pattern=r"^DICT_\w+$"), "Stated by the program that printed it."]
+    """Marker dictionary of the board, by its OpenCV name."""
 
     @model_validator(mode="after")
     def _markers_fit(self) -> Charuco:
         if self.marker_mm >= self.square_mm:
-            raise CellError("marker_mm is not smaller than square_mm", "markers lie inside their squares")
+            message, remedy = "marker_mm is not smaller than square_mm", "markers lie inside their squares"
+            raise CellError(message, remedy, code="markers")
         return self
 
 
 Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(discriminator="kind")]
+
+# Models of `calibration`, by its kind
+CALIBRATIONS: dict[str, type[BaseModel]] = {
+    "charuco": Charuco,
+    "checkerboard": Checkerboard,
+    "two_points": TwoPoints,
+    "mm_per_px": MmPerPx,
+}
+
+
+def _optional_fields(types: Mapping[str, Any]) -> Any:
+    """Return a base class with an optional field of each name and type, None by default."""
+    fields: dict[str, Any] = {name: (kind | None, None) for name, kind in types.items()}
+    return create_model("Columns", __base__=_Strict, **fields)
 
 
 _LimitedColumns: Any = _optional_fields(
@@ -229,8 +172,6 @@ class Limits(_LimitedColumns):
     Pressure and payload are ranges (`7:40` or two numbers); the others are sets of values to choose from: one value, a
     list, or a range, of which five values are considered.
     """
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     trials: Annotated[Count, Field(ge=1, le=24)] = 4
     """Largest number of further trials."""
@@ -253,7 +194,7 @@ class Limits(_LimitedColumns):
             return tuple(sorted({low, *(float(f"{step:.3g}") for step in interior_values(low, high)), high}))
         if isinstance(value, list | tuple):
             if not value:
-                raise CellError("is empty", "name at least one value, or remove the key")
+                raise CellError("is empty", "name at least one value, or remove the key", code="empty")
             return tuple(sorted({read_limit(column, limit) for limit in value}))
         return value if value is None else (read_limit(column, value),)
 
@@ -276,8 +217,6 @@ class ExperimentSettings(_SharedColumns):
     """Settings shared by all trials of an experiment, in the unit of their name; None where not given. The columns that
     are declared `shared` may be set here for all trials; a cell of the sheet overrides them.
     """
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
     """Absolute ambient pressure; used in the gas law of chambers."""
@@ -309,6 +248,13 @@ class ExperimentSettings(_SharedColumns):
     """Compare with the numbers of the paper: trials simulated from its parameters, or measured; blank: no
     comparison."""
 
+    @property
+    def paths(self) -> list[tuple[str, str]]:
+        """All paths, each with its key."""
+        image = getattr(self.calibration, "image", None)
+        paths = [("effects", path) for path in self.effects]
+        return paths if image is None else [*paths, ("calibration.image", image)]
+
     @field_validator(*SHARED, mode="before")
     @classmethod
     def _as_in_the_sheet(cls, value: Any, info: Any) -> Any:
@@ -317,29 +263,27 @@ class ExperimentSettings(_SharedColumns):
         if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
             return value
         if isinstance(value, bool | list | dict):
-            raise CellError("is not a single value", "write one, as in the sheet")
+            raise CellError("is not a single value", "write one, as in the sheet", code="not_a_value")
         return read_value(column, value)
 
     @field_validator("model", "candidates", "effects")
     @classmethod
     def _named_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if names and (twice := sorted({name for name in names if names.count(name) > 1})):
-            raise CellError(f"names {twice[0]!r} twice", "keep one")
+            raise CellError(f"names {twice[0]!r} twice", "keep one", code="twice")
         return names
 
 
 class SteadySettings(_Strict):
     """When a stretch of motion counts as steady; see `vinetrack.kinematics.steady`."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    drift_limit: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    drift_limit: Share = 0.03
     """Bound on the relative drift of speed across a steady window; must contain its 95 % interval."""
     start_fraction: Annotated[Number, Field(ge=0, lt=1)] = 0.2
     """A window may begin once the speed exceeds this fraction of the trial's largest speed,"""
     start_sigmas: Annotated[Number, Field(ge=0)] = 5.0
     """and this many standard errors of the speed."""
-    paper_cv: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    paper_cv: Share = 0.03
     """The paper's rule: largest coefficient of variation of speed,"""
     paper_points: Annotated[Count, Field(ge=3)] = 3
     """over at least this many consecutive points."""
@@ -347,8 +291,6 @@ class SteadySettings(_Strict):
 
 class VelocitySettings(_Strict):
     """How positions become velocities; see `vinetrack.kinematics.velocity`."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     kappa: Positive = 3.0
     """The smoothing window is the widest that agrees with all narrower ones within this many standard errors."""
@@ -359,8 +301,6 @@ class VelocitySettings(_Strict):
 class DampingSettings(_Strict):
     """How the damping law and its intervals are computed; see `vinetrack.kinematics.damping`."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
     resamples: Annotated[Count, Field(ge=100)] = 2000
     """Resamplings of whole trials behind each 95 % interval."""
     seed: Annotated[Count, Field(ge=0)] = 1
@@ -369,8 +309,6 @@ class DampingSettings(_Strict):
 
 class FigureSettings(_Strict):
     """File formats of the figures."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
     """Formats of every figure; svg is always among them, since the report holds it."""
@@ -381,14 +319,12 @@ class FigureSettings(_Strict):
     @classmethod
     def _with_svg(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
         if not formats:
-            raise CellError("is empty", "name at least one of png, svg, pdf")
+            raise CellError("is empty", "name at least one of png, svg, pdf", code="empty")
         return tuple(dict.fromkeys([*formats, "svg"]))
 
 
 class OverlaySettings(_Strict):
     """Clips of the recordings with tracked and modelled edges; see `vinetrack.figures.overlay`."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
     """Which recordings get a clip."""
@@ -401,8 +337,6 @@ class OverlaySettings(_Strict):
 class RunSettings(_Strict):
     """Everything in `config/config.yaml`; any key may be overridden by `--config key=value`."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
     experiment: str = "data/demo"
     """The experiment's folder."""
     results: str | None = None
@@ -413,7 +347,7 @@ class RunSettings(_Strict):
     """How positions become velocities."""
     damping: DampingSettings = DampingSettings()
     """The damping law."""
-    final_at_fraction: Annotated[Number, Field(gt=0, le=1)] = 0.95
+    final_at_fraction: Share = 0.95
     """Fraction of the length at which final speeds are evaluated."""
     efficiency_at_mm: Positive = 150.0
     """Growth at which the energy efficiency is evaluated, in mm."""
@@ -423,13 +357,8 @@ class RunSettings(_Strict):
     """Clips of the recordings."""
 
 
-# Groups of keys of `experiment.yaml`, and the models of which one validates them; "" for the keys of no group
-_GROUPS: dict[str, tuple[type[BaseModel], ...]] = {
-    "": (ExperimentSettings,),
-    "limits": (Limits,),
-    "axis": (AxisSettings,),
-    "calibration": (Charuco, Checkerboard, TwoPoints, MmPerPx),
-}
+# ------------------------------------------------------------------------------
+# Reading settings, with problems that name the key, its line and what is allowed.
 
 
 def read_experiment_settings(path: Path, warnings: list[Problem] | None = None) -> ExperimentSettings:
@@ -456,43 +385,118 @@ def _validate(model: type[Model], document: YamlDocument, file: str) -> Model:
 
 def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detail: Any) -> Problem:
     """Convert a pydantic error to a problem that names the key, its line and what is allowed."""
+    found = detail["loc"]
     # pydantic inserts the kind of a calibration between "calibration" and the key; the file does not contain it.
-    location = tuple(part for i, part in enumerate(detail["loc"]) if not (i == 1 and detail["loc"][0] == "calibration"))
-    key = ".".join(str(part) for part in location)
-    line = next(
-        (document.lines[location[:n]] for n in range(len(location), 0, -1) if location[:n] in document.lines), 0
-    )
-    value = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
-    shown = None if value is None else str(value)
+    location = (found[0], *found[2:]) if found[0] == "calibration" else found
+    starts = (location[:n] for n in range(len(location), 0, -1))
+    line = next((document.lines[start] for start in starts if start in document.lines), 0)
+    place: dict[str, Any] = {"file": file, "line": line, "column": ".".join(str(part) for part in location)}
     if detail["type"] == "extra_forbidden":
-        names = _valid_keys(model, document.content, location)
+        names = list(_group(model, found).model_fields)
         if same := [name for name in names if location[-1] in other_units(name)]:
-            remedy = "keep one of the two"
-            return Problem(message=f"is {same[0]} again", file=file, line=line, column=key, remedy=remedy)
+            return Problem("twice", f"is {same[0]} again", remedy="keep one of the two", **place)
         remedy = did_you_mean(str(location[-1]), names) or "remove it"
-        return Problem(message="is not a setting", file=file, line=line, column=key, remedy=remedy)
+        return Problem("unknown_key", "is not a setting", remedy=remedy, **place)
     if detail["type"] == "missing":
-        return Problem(message="is missing", code="missing", file=file, line=line, column=key, remedy="add it")
+        return Problem("missing", "is missing", remedy="add it", **place)
+    place["value"] = str(detail["input"]) if isinstance(detail["input"], str | int | float | bool) else None
     error = detail.get("ctx", {}).get("error")
     if isinstance(error, CellError):
-        return Problem.from_error(error, file, line=line, column=key, value=shown)
+        return Problem.from_error(error, **place)
     words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
     words = re.sub(r"a valid dictionary.*", "a group of keys", words)
-    message = f"is not allowed: {words[:1].lower()}{words[1:]}"
-    return Problem(message=message, file=file, line=line, column=key, value=shown)
+    return Problem("not_allowed", f"is not allowed: {words[:1].lower()}{words[1:]}", **place)
 
 
-def _kind(content: Any) -> Any:
-    calibration = content.get("calibration") if isinstance(content, dict) else None
-    return calibration.get("kind") if isinstance(calibration, dict) else None
-
-
-def _valid_keys(model: type[BaseModel], content: Any, location: tuple[Any, ...]) -> list[str]:
-    """Return the keys that are valid at the location of an unknown key."""
+def _group(model: type[BaseModel], location: tuple[Any, ...]) -> type[BaseModel]:
+    """Return the model of the group of keys that holds a location, as pydantic gives it."""
     if len(location) == 1:
-        return list(model.model_fields)
+        return model
     if location[0] == "calibration":
-        models = {get_args(m.model_fields["kind"].annotation)[0]: m for m in _GROUPS["calibration"]}
-        return list(models[_kind(content)].model_fields)
-    inner = type(model.model_fields[location[0]].default) if location[0] != "axis" else AxisSettings
-    return list(getattr(inner, "model_fields", {}))
+        return CALIBRATIONS[location[1]]
+    return AxisSettings if location[0] == "axis" else type(model.model_fields[location[0]].default)
+
+
+# ------------------------------------------------------------------------------
+# Conversion of columns and keys in other units, such as `pressure_psi` or `diameter_in`, each with a warning.
+
+
+def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
+    """Rename columns in other units to those of the sheet and convert their numbers, with a warning for each. A column
+    of the sheet without any value gives way to the same quantity in another unit.
+    """
+    problems: list[Problem] = []
+    known = {other: (name, unit) for name in COLUMNS for other, unit in other_units(name).items()}
+    taken = {name for name in table.columns if any(row[name] for row in table.rows)}
+    renamed: dict[str, tuple[str, str]] = {}
+    for other in table.columns:
+        if other in COLUMNS or other not in known:
+            continue
+        name, unit = known[other]
+        if name in taken:
+            message = f"is ignored, because the sheet also has {name}"
+            problems.append(Problem("twice", message, other, file=file, line=1, severity="warning"))
+            continue
+        taken.add(name)
+        renamed[other] = name, unit
+        problems.append(_conversion(name, unit, column=other, file=file, line=1))
+    rows = [dict(row) for row in table.rows]
+    for row in rows:
+        for other, (name, unit) in renamed.items():
+            row[name] = _converted(row.pop(other), unit, name, table.decimal)
+    columns = tuple(dict.fromkeys(renamed[name][0] if name in renamed else name for name in table.columns))
+    return replace(table, columns=columns, rows=tuple(rows)), problems
+
+
+def _in_key_units(document: YamlDocument, file: str, problems: list[Problem]) -> YamlDocument:
+    """Rename keys in other units, such as `pressure_psi`, to those of the settings and convert their numbers, with a
+    warning for each. Of two keys for one quantity a blank one gives way.
+    """
+    content, lines = dict(document.content), dict(document.lines)
+    groups: dict[str, Iterable[type[BaseModel]]] = {
+        "": [ExperimentSettings],
+        "limits": [Limits],
+        "axis": [AxisSettings],
+        "calibration": CALIBRATIONS.values(),
+    }
+    for group, models in groups.items():
+        given = content.get(group) if group else content
+        if not isinstance(given, dict):
+            continue
+        path = (group,) if group else ()
+        keys = given if given is content else dict(given)
+        names = dict.fromkeys(name for model in models for name in model.model_fields)
+        pairs = [(name, *other) for name in names for other in other_units(name).items()]
+        for name, other, unit in pairs:
+            if other not in keys or None not in (keys.get(name), keys[other]):
+                continue
+            value = keys.pop(other)
+            if value is not None:
+                line = lines[*path, name] = lines.get((*path, other), 0)
+                keys[name] = _converted(value, unit, name)
+                problems.append(_conversion(name, unit, column=".".join((*path, other)), file=file, line=line))
+        if group:
+            content[group] = keys
+    return YamlDocument(content, lines)
+
+
+def _converted(value: Any, unit: str, name: str, decimal: str = ".") -> Any:
+    """Convert the numbers of a cell or key to the unit of its name, to 15 digits; what is no number stays."""
+    if isinstance(value, list):
+        return [_converted(element, unit, name) for element in value]
+    if isinstance(value, str) and ":" in value:
+        return ":".join(_converted(part, unit, name, decimal) for part in value.split(":"))
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return value
+    try:
+        given = parse_number(value, decimal) if isinstance(value, str) else float(value)
+    except TableError:
+        return value
+    text = f"{convert(given, unit, split_unit(name)[1]):.15g}"
+    return text.replace(".", decimal or ".") if isinstance(value, str) else float(text)
+
+
+def _conversion(name: str, unit: str, **place: Any) -> Problem:
+    own = split_unit(name)[1]
+    message = f"is read as {name}: 1 {UNITS[unit].text} is {convert(1.0, unit, own):.6g} {UNITS[own].text}"
+    return Problem("unit", message, severity="warning", **place)

@@ -1,4 +1,4 @@
-"""One row of the trial sheet: reading its cells, checking them, and making a trial of them.
+"""Rows of the trial sheet: reading their cells, checking them, and making trials of them.
 
 This module never opens recordings; `vinetrack.experiment.folder` combines rows, settings and files.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 from vinetrack.core.problems import Problem, did_you_mean
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, read_cell, unusual_value_hint
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, read_cell, unusual_value_hint
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
@@ -52,10 +53,22 @@ class Row:
         """Travel ratio of row or settings; 2 by default."""
         return float(self.values.get("travel_ratio", 2.0))
 
-    def add(self, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
+    def number(self, column: str) -> float:
+        """Return the number of a column; NaN where it is blank."""
+        return float(self.values.get(column, math.nan))
+
+    def add(self, code: str, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
         """Record a problem of this row."""
         place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
-        self.problems.append(Problem(message=message, column=column, severity=severity, **place, **details))
+        self.problems.append(Problem(code, message, column, severity=severity, **place, **details))
+
+    def add_blank(self, columns: Sequence[str], remedy: str = "fill it in") -> None:
+        """Report required columns that have no value, unless another problem already concerns them."""
+        code = "blank" if self.line else "missing"  # a row that stands in no file has no blank cells
+        faulty = {problem.column for problem in self.problems if problem.severity == "error"}
+        for name in columns:
+            if name not in self.values and name not in faulty:
+                self.add(code, f"is {code}", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
 
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
@@ -72,13 +85,13 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
         try:
             row.values[name] = read_cell(column, text, table.decimal)
         except CellError as error:
-            row.add(error.message, name, value=text, allowed=error.allowed, remedy=error.remedy)
+            row.problems.append(Problem.from_error(error, SHEET, trial=row.name, line=line, column=name, value=text))
             continue
         if column.kind == "number" and (hint := unusual_value_hint(column, row.values[name])):
-            row.add(f"is unusual: {hint}", name, "warning", value=text)
+            row.add("unusual", f"is unusual: {hint}", name, "warning", value=text)
     if table.extra[index]:
-        remedy = "put text that contains separators, and decimal commas, in quotes"
-        row.add(f"has more cells than the header ({table.extra[index][0][:40]!r} …)", remedy=remedy)
+        message = f"has more cells than the header ({table.extra[index][0][:40]!r} …)"
+        row.add("more_cells", message, remedy="put text that contains separators, and decimal commas, in quotes")
     if not row.in_use:
         row.problems = [replace(problem, severity="warning") for problem in row.problems]
     return row
@@ -86,45 +99,45 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
 
 def unknown_columns(table: Table, file: str) -> list[Problem]:
     """Warn of every unknown column, with the most similar known names."""
-    problems = []
-    for name in table.columns:
-        if name not in COLUMNS:
-            remedy = did_you_mean(name, [column for column in COLUMNS if column not in table.columns])
-            message = "is not a column of the trial sheet and is ignored"
-            place: dict[str, Any] = {"file": file, "line": 1, "column": name}
-            problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
-    return problems
+    message = "is not a column of the trial sheet and is ignored"
+    left = [column for column in COLUMNS if column not in table.columns]
+    return [
+        Problem("unknown_column", message, name, file=file, line=1, severity="warning", remedy=did_you_mean(name, left))
+        for name in table.columns
+        if name not in COLUMNS
+    ]
 
 
 def _check_name(row: Row) -> None:
     """Report an invalid trial name, and replace it by the number of the line."""
-    allowed = "letters, digits, _ and -"
     given = row.name
-    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII) and len(given) <= MAX_NAME_LENGTH:
+    if not given:
+        code, message = "blank", "is blank"
+    elif given.startswith("-"):
+        code, message = "name", "begins with a hyphen, like a command-line option"
+    elif len(given) > MAX_NAME_LENGTH:
+        code, message = "name", "is too long"
+    elif not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII):
+        code, message = "name", "is not a valid trial name"
+    else:
         return
     row.name = f"line-{row.line}"
-    message = (
-        "is blank" if not given else "is too long" if len(given) > MAX_NAME_LENGTH else "is not a valid trial name"
-    )
-    if given.startswith("-"):
-        message = "begins with a hyphen, like a command-line option"
     remedy = f"at most {MAX_NAME_LENGTH} characters, no spaces or dots: files are named after it"
-    row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
+    row.add(code, message, "trial", value=given, allowed=COLUMNS["trial"].allowed, remedy=remedy)
 
 
 def check_row(row: Row, folder: Path) -> None:
     """Check a row as a whole: its paths, and values that contradict each other."""
     _check_paths(row, folder)
     check_wall(row)
-    fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
+    fps, exposure = row.number("capture_fps"), row.number("exposure_us")
     # An exposure cannot exceed the frame interval. 2 % allows for rounding of both numbers; above 1.5 intervals
     # rounding cannot be the reason.
     if exposure > 1.02e6 / fps:
         intervals = exposure * fps / 1e6
         message = f"is {intervals:.3g} times the frame interval at {fps:g} frames per second ({1e6 / fps:.4g} µs)"
-        severity = "error" if intervals > 1.5 else "warning"
-        remedy = "check its unit and capture_fps" if intervals > 1.5 else ""
-        row.add(message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
+        severity, remedy = ("error", "check its unit and capture_fps") if intervals > 1.5 else ("warning", "")
+        row.add("longer_than_a_frame", message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
@@ -132,28 +145,17 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     latter are a fault of the sheet, which the caller reports once.
     """
     faulty = {problem.column for problem in row.problems if problem.severity == "error"}
-    absent: set[str] = set()
     if "travel_ratio" in faulty:
-        return absent
-    missing = [name for name in _required_columns(row, folder) if name not in row.values and name not in faulty]
-    for name in missing:
-        if name in columns:
-            rate = "write the capture rate; the rate stored in the file is that of playback"
-            remedy = rate if name == "capture_fps" else "fill it in"
-            row.add("is blank", name, code="blank", value="", allowed=COLUMNS[name].allowed, remedy=remedy)
-        else:
-            absent.add(name)
-    return absent
-
-
-def _required_columns(row: Row, folder: Path) -> list[str]:
-    """Columns that a row requires, depending on its travel ratio and on the kind of its recording."""
+        return set()
     required = list(REQUIRED_COLUMNS if row.travel_ratio == 2 else REQUIRED_COLUMNS[:1])
     if "pressure_kPa" in required and ("pressure_trace" in row.values or "track" in row.values):
         required.remove("pressure_kPa")
+    row.add_blank([name for name in required if name in columns])
     if "video" in row.values and "track" not in row.values and not _may_state_rate(folder, row.values["video"]):
         required.append("capture_fps")
-    return required
+        if "capture_fps" in columns:
+            row.add_blank(["capture_fps"], "write the capture rate; the rate stored in the file is that of playback")
+    return set(required) - set(columns) - set(row.values) - faulty
 
 
 def _check_paths(row: Row, folder: Path) -> None:
@@ -163,13 +165,14 @@ def _check_paths(row: Row, folder: Path) -> None:
             try:
                 safe_join(folder, row.values[name])
             except TableError as error:
-                row.add(error.message, name, value=row.values[name], remedy=error.remedy)
+                place: dict[str, Any] = {"trial": row.name, "line": row.line, "column": name}
+                row.problems.append(Problem.from_error(error, SHEET, value=row.values[name], **place))
     if "video" in row.values and "track" in row.values:
-        row.add("has both a video and a track", "track", value=row.values["track"], remedy="keep one of the two")
+        message, remedy = "has both a video and a track", "keep one of the two"
+        row.add("two_recordings", message, "track", value=row.values["track"], remedy=remedy)
     if "video" not in row.values and "track" not in row.values:
-        row.add(
-            "has neither a video nor a track", remedy="name a recording under video, or a file of positions under track"
-        )
+        remedy = "name a recording under video, or a file of positions under track"
+        row.add("no_recording", "has neither a video nor a track", remedy=remedy)
 
 
 def _may_state_rate(folder: Path, video: str) -> bool:
@@ -184,75 +187,64 @@ def _may_state_rate(folder: Path, video: str) -> bool:
 
 def check_wall(row: Row) -> None:
     """Report a wall thickness above a quarter of the diameter, which no tube can have."""
-    diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
+    diameter, thickness = row.number("diameter_mm"), row.number("thickness_um")
     if thickness / 1000 > diameter / 4:
         message = f"is more than a quarter of the diameter ({diameter:g} mm)"
         allowed, remedy = f"at most {250 * diameter:g} µm", "check the units: thickness in µm, diameter in mm"
-        row.add(message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
+        row.add("wall", message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
 
 
 def check_pressures(row: Row) -> None:
     """Warn of pressures that are allowed but implausible."""
-    pressure = row.values.get("pressure_kPa", math.nan)
-    yield_pressure = row.values.get("yield_pressure_kPa", math.nan)
+    pressure, yield_pressure = row.number("pressure_kPa"), row.number("yield_pressure_kPa")
     if row.travel_ratio == 2 and yield_pressure >= pressure:
         message = f"is not below the pressure of {pressure:g} kPa, so the vine would not grow (psi? 1 psi is 6.895 kPa)"
-        row.add(message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
-    if (
-        row.travel_ratio == 2
-        and pressure > 0
-        and yield_pressure == 0
-        and not row.values.get("yield_pressure_sigma_kPa", 0.0) > 0
-    ):
+        row.add("no_growth", message, "yield_pressure_kPa", "warning", value=f"{yield_pressure:g}")
+    stated_sigma = row.values.get("yield_pressure_sigma_kPa", 0.0) > 0
+    if row.travel_ratio == 2 and pressure > 0 and yield_pressure == 0 and not stated_sigma:
         message = "states that the vine grows at any pressure, which no vine does, with an error of 0.2 kPa"
         remedy = "measure it (raise the pressure until the tip moves), or state its error in yield_pressure_sigma_kPa"
-        row.add(message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
+        row.add("no_yield_pressure", message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
     if row.travel_ratio == 1 and pressure > 0:
         message = "is above 0 although the body moves as a whole (travel_ratio 1): is it a vine?"
-        row.add(message, "pressure_kPa", "warning", value=f"{pressure:g}")
+        row.add("pressure_of_a_body", message, "pressure_kPa", "warning", value=f"{pressure:g}")
 
 
 def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
     """Make the trial of a row without errors, in SI units, with the documented defaults."""
-    values: dict[str, Any] = dict(row.values)
-    pressure_kPa = values.setdefault("pressure_kPa", 0.0)
-    values.setdefault("pressure_sigma_kPa", PRESSURE_REL_SIGMA * pressure_kPa)
-    values.setdefault("yield_pressure_kPa", 0.0)
-    values.setdefault("yield_pressure_sigma_kPa", YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0)
-    values["trial"] = row.name
-    fields = {COLUMNS[name].field: _in_si(COLUMNS[name], value, folder) for name, value in values.items()}
+    defaults = {
+        "pressure_kPa": 0.0,
+        "pressure_sigma_kPa": PRESSURE_REL_SIGMA * row.values.get("pressure_kPa", 0.0),
+        "yield_pressure_kPa": 0.0,
+        "yield_pressure_sigma_kPa": YIELD_SIGMA_KPA if row.travel_ratio == 2 else 0.0,
+    }
+    values: dict[str, Any] = {**defaults, **row.values, "trial": row.name}
+    fields: dict[str, Any] = {}
+    for name, value in values.items():
+        column = COLUMNS[name]
+        if column.kind == "path":
+            value = safe_join(folder, value)
+        fields[column.field] = column.to_si(float(value)) if column.kind in ("number", "choice") else value
+    # Without a recording the trial is planned, and what will limit its positions is not known.
+    planned = "track" not in values and "video" not in values and settings.position_systematic_mm is None
+    scaled_elsewhere = "track" in values or "mm_per_px" in values
     return Trial(
         **fields,
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
         tail_store=settings.tail_store,
-        position_systematic_m=_position_systematic_m(settings, values),
+        position_systematic_m=math.nan if planned else expected_systematic_m(settings, scaled_elsewhere),
     )
 
 
-def _in_si(column: Column, value: Any, folder: Path) -> Any:
-    """Convert the value of a cell for a trial: numbers to SI, paths to paths inside the folder."""
-    if column.kind == "path":
-        return safe_join(folder, value)
-    return column.to_si(float(value)) if column.kind in ("number", "choice") else value
-
-
-def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any]) -> float:
+def expected_systematic_m(settings: ExperimentSettings, scaled_elsewhere: bool = False) -> float:
     """Standard deviation of smooth position errors, m: as stated, else by whether lens distortion was corrected. A
     target with many corners reveals the distortion, hence 0. Two points, a scale, a scale of the trial's own and
-    positions measured elsewhere do not show whether it was corrected, hence the default. NaN for a planned trial.
+    positions measured elsewhere (`scaled_elsewhere`) do not show whether it was corrected, hence the default.
     """
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3
-    if "track" not in values and "video" not in values:
-        return math.nan
-    measured = "track" in values or "mm_per_px" in values
-    return POSITION_SYSTEMATIC_M if measured else expected_systematic_m(settings)
-
-
-def expected_systematic_m(settings: ExperimentSettings) -> float:
-    """Standard deviation of smooth position errors, m, of trials that are still to be filmed."""
-    if settings.position_systematic_mm is not None:
-        return settings.position_systematic_mm / 1e3
+    if scaled_elsewhere:
+        return POSITION_SYSTEMATIC_M
     return 0.0 if isinstance(settings.calibration, (Charuco, Checkerboard)) else POSITION_SYSTEMATIC_M

@@ -13,10 +13,10 @@ import pandas as pd
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Kinematics, Track, Trial
-from vinetrack.core.tables import PROVENANCE, Table
+from vinetrack.core.tables import PROVENANCE
 from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION
-from vinetrack.experiment.schema import COLUMNS, with_names
+from vinetrack.experiment.planned import REQUIRED_FOR_PREDICTION, table_of_texts
+from vinetrack.experiment.schema import with_names
 from vinetrack.experiment.settings import ExperimentSettings, in_sheet_units
 from vinetrack.experiment.sheet import check_pressures, check_wall, make_trial, read_row
 from vinetrack.inference.fit_data import Pairs
@@ -87,21 +87,17 @@ def _is_constant(column: pd.Series) -> bool:
 
 
 def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
-    columns = tuple(dict.fromkeys(name for row in rows for name in row))
-    table = Table(columns, tuple(rows), tuple(range(1, len(rows) + 1)), ((),) * len(rows), ",", ".")
-    table, _ = in_sheet_units(table, "the frame")
+    table, _ = in_sheet_units(table_of_texts(rows), "the frame")
     settings = ExperimentSettings()
     problems: list[Problem] = []
     trials = []
     for i in range(len(rows)):
         row = read_row(table, i, settings)
         required = REQUIRED_FOR_PREDICTION if row.travel_ratio == 2 else REQUIRED_FOR_PREDICTION[:1]
-        for name in required:
-            if name not in row.values and all(problem.column != name for problem in row.problems):
-                row.add("is missing", name, allowed=COLUMNS[name].allowed, remedy="give it as a column of the frame")
+        row.add_blank(required, "give it as a column of the frame")
         check_wall(row)
         check_pressures(row)
-        problems += [replace(problem, file="the frame", line=0) for problem in row.problems]
+        problems += [replace(problem, file="the frame") for problem in row.problems]
         if not row.failed:
             # Marks the trial as a track measured elsewhere, which determines the default of its smooth errors.
             row.values["track"] = row.name
