@@ -39,12 +39,9 @@ class Problem:
     of_a_measurement: bool = False
 
     @classmethod
-    def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
-        """Make a problem of an error, with the fields of an InputError."""
-        if isinstance(error, InputError):
-            fields: dict[str, Any] = {"code": error.code, "remedy": error.remedy, "allowed": error.allowed}
-            return cls(message=error.message, file=file, **fields, **details)
-        return cls(message=str(error), file=file, **details)
+    def from_error(cls, error: InputError, file: str, **place: Any) -> Problem:
+        """Make a problem of an error, at a place."""
+        return cls(error.code, error.message, file=file, remedy=error.remedy, allowed=error.allowed, **place)
 
     @property
     def reason(self) -> str:

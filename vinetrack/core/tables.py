@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 # Checks of files before they are opened: only regular files are, since reading a pipe would block.
 #
 # The text of a path in a sheet stays inside the experiment folder, but a link in the folder may lead outside, for
-# example
-# to recordings on another disk. Its target must be a regular file or a folder, like every entry of the folder itself.
+# example to recordings on another disk. Its target must be a regular file or a folder, like every entry of the folder itself.
 
 # Message for a FIFO, a socket, a terminal or a device such as `/dev/zero`
 NOT_A_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
@@ -210,10 +209,12 @@ def parse_number(text: str, decimal: str = ".") -> float:
     if _AMBIGUOUS_NUMBER.fullmatch(text) and mark != decimal:
         joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
         corrected = f"{pointed}0 or {joined}"
-        raise TableError("may be thousands or decimals", f"write {corrected}, whichever is meant")
+        raise TableError(
+            "may be thousands or decimals", f"write {corrected}, whichever is meant", code="ambiguous_number"
+        )
     value = float(text.replace(",", "."))
     if not math.isfinite(value):
-        raise TableError("is too large a number")
+        raise TableError("is too large a number", code="above_bounds")
     return value
 
 

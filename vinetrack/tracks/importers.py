@@ -47,9 +47,8 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
     if len(wrong):
         i = int(wrong[0]) + 1
         place = f"line {lines[i]}, column time_s: " if lines else ""
-        raise TrackError(
-            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s)", "sort or correct the rows"
-        )
+        message = f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s)"
+        raise TrackError(message, "sort or correct the rows")
 
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
@@ -146,9 +145,8 @@ def tdms_columns(path: Path) -> dict[str, Floats]:
     try:
         from nptdms import TdmsFile
     except ModuleNotFoundError:
-        raise TrackError(
-            "is a TDMS file, which npTDMS reads", "pip install 'vinetrack[cameras]', or use a CSV"
-        ) from None
+        remedy = "pip install 'vinetrack[cameras]', or use a CSV"
+        raise TrackError("is a TDMS file, which npTDMS reads", remedy) from None
     _require_whole(path.read_bytes())
     try:
         with warnings.catch_warnings():
@@ -578,9 +576,8 @@ def _read_positions(table: Table) -> Track:
     if "sigma_m" in table.columns:
         sigma_m = table.numbers("sigma_m", blank_is_nan=True)
         if np.any(sigma_m < 0):
-            raise TrackError(
-                f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative", "correct it"
-            )
+            line = table.lines[int(np.argmax(sigma_m < 0))]
+            raise TrackError(f"line {line}, column sigma_m is negative", "correct it")
         if np.any(sigma_m == 0):
             notes.append("A sigma_m of 0 is taken as unknown.")
             sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
@@ -619,10 +616,8 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
     """
     start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
     if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):
-        raise TrackError(
-            f"runs from {time_s[0]:g} to {time_s[-1]:g} s, the track from {start:g} to {end:g} s: "
-            "shift one so that both share a clock"
-        )
+        message = f"runs from {time_s[0]:g} to {time_s[-1]:g} s, the track from {start:g} to {end:g} s"
+        raise TrackError(message, "shift one so that both share a clock")
     outside = int(np.sum((track.time_s < time_s[0]) | (track.time_s > time_s[-1])))
     notes = track.notes
     if outside:
@@ -647,6 +642,5 @@ def _require(table: Table, *columns: str) -> None:
     """Refuse a table that lacks one of these columns."""
     if missing := [column for column in columns if column not in table.columns]:
         present = ", ".join(table.columns[:8]) or "none"
-        raise TrackError(
-            f"lacks the column {missing[0]} (found: {present[:120]})", f"name its columns {', '.join(columns)}"
-        )
+        message = f"lacks the column {missing[0]} (found: {present[:120]})"
+        raise TrackError(message, f"name its columns {', '.join(columns)}")
