@@ -28,7 +28,6 @@ _FORMER_RETIMED_FLAGS = "gap;corrected"  # Former spelling of `gap;retimed`, rea
 # Flags of points that are not measurements of the leading edge
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 
-
 # Suffixes of recordings: films, and pictures of which a folder or a stack is one
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
