@@ -91,16 +91,16 @@ def interval(bounds: Sequence[float | None] | None) -> str:
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
-def with_interval(value: float | None, bounds: Sequence[float | None] | None) -> str:
+def with_interval(value: float | None, bounds: Sequence[float | None] | None, shown: bool = True) -> str:
     """Return `value (95 %: low to high)`, with decimals that suit the width; only the value if the bounds
-    are unknown.
+    are unknown or not to be `shown`.
     """
     if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)
     half = float(f"{(high - low) / 2:.1e}")  # 0.00999 rounds to 0.010
     places = min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 else 3
-    return f"{value:.{places}f} (95 %: {low:.{places}f} to {high:.{places}f})"
+    return f"{value:.{places}f}" + (f" (95 %: {low:.{places}f} to {high:.{places}f})" if shown else "")
 
 
 @dataclass(frozen=True)

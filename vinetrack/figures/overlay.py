@@ -1,8 +1,8 @@
-"""Frames of a clip: the recording, the tracked edge, and the edges predicted by the models before and after.
+"""The recording with its edges: the distribution of edges within a pixel, the strip of a recording, frames of a clip.
 
-The tracked edge crosses the tube and the predicted ones are drawn on both sides of it, that of the earlier model
-farther out, so that all remain visible where they agree. A bar above, clear of the controls of video players, names the
-edges and states the error of each model, the time, and the factor of the slow motion.
+In a clip the tracked edge crosses the tube and the predicted ones are drawn on both sides of it, that of the earlier
+model farther out, so that all remain visible where they agree. A bar above, clear of the controls of video players,
+names the edges and states the error of each model, the time, and the factor of the slow motion.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
+from vinetrack.core.records import UNUSABLE_FLAGS, Floats, hand_corrected
 from vinetrack.core.units import number
 from vinetrack.figures.registry import figure
 from vinetrack.figures.style import (
@@ -32,6 +32,8 @@ from vinetrack.figures.style import (
     look,
     new_figure,
     note_below,
+    small_title,
+    with_minus,
 )
 
 if TYPE_CHECKING:
@@ -47,15 +49,10 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------
-# Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or
-# half pixels.
+# Distribution of edges within a pixel, which shows pixel locking: a bias of the estimate towards whole or half pixels.
 #
 # Without a bias the edges of many frames are distributed uniformly within a pixel. A periodic error ε = −A sin 2πy at
-# the
-# position y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the modulus πA.
-
-MIN_EDGES = 100  # Minimum number of edges for a histogram (chosen)
-BINS = 10  # Bins of a pixel (chosen)
+# the position y makes their density 1 + 2πA cos 2πy, so that the mean of exp 2πiy has the modulus πA.
 
 
 def subpixel_positions(tracks: Mapping[str, pd.DataFrame]) -> Floats:
@@ -81,20 +78,19 @@ def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
     deviations around a uniform distribution. Peaks would indicate pixel locking, a bias of edges towards whole or
     half pixels.
     """
-    count = len(subpixel_px)
-    if count < MIN_EDGES:
+    count, bins = len(subpixel_px), 10
+    if count < 100:
         return None
-    even = count / BINS
-    half_width = 2 * math.sqrt(even * (1 - 1 / BINS))
+    even = count / bins
+    half_width = 2 * math.sqrt(even * (1 - 1 / bins))
     amplitude, chance = periodic_error(subpixel_px)
     comparison = "more than chance" if amplitude > chance else "no more than chance"
     fig = new_figure(6.6, 3.6)
     ax = fig.subplots()
-    ax.hist(subpixel_px, bins=BINS, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
+    ax.hist(subpixel_px, bins=bins, range=(0, 1), color=VINE_COLOURS[0], alpha=0.7, rwidth=0.92)
     ax.axhspan(even - half_width, even + half_width, color=MUTED, alpha=0.25, lw=0)
     ax.axhline(even, color=MUTED, ls=DASHED)
-    ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1))
-    ax.set_title(f"N = {count} frames", loc="left")
+    ax.set(xlabel="position within a pixel (px)", ylabel="edges", xlim=(0, 1), title=f"N = {count} frames")
     note_below(
         fig,
         f"The error that is periodic with one pixel has an amplitude of {number(amplitude, 2)} px, {comparison}: "
@@ -105,12 +101,6 @@ def draw_pixel_places(subpixel_px: Floats) -> Figure | None:
 
 # ------------------------------------------------------------------------------
 # One recording: its strip through time with the tracked edge, and the edge on the first, middle and last frame.
-
-MAX_STRIP_PX = 480  # Pixels per side of the strip
-
-_FRAME_PX = 320  # Pixels per side of a frame; chosen: frames are a third as wide as the strip, 133 pixels per inch
-
-_IGNORED_FLAGS = frozenset({"before_release"})
 
 
 @look()
@@ -123,17 +113,24 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     above.patch.set_alpha(0)
     below.patch.set_alpha(0)
     ax = above.add_subplot()
-    _draw_kymograph(ax, title, tracking, m_per_px)
+    _draw_kymograph(ax, tracking)
+    if np.isfinite(m_per_px):
+        mm_per_px = 1e3 * m_per_px
+        top = ax.secondary_xaxis(-0.21, functions=((lambda px: mm_per_px * px), (lambda mm: mm / mm_per_px)))
+        top.set_xlabel("along the growth axis (mm)")
+    legend_above(ax, 2)
+    small_title(ax, title, loc="right", fontsize=10, color=MUTED)
     frames = below.subplots(1, len(tracking.pictures), squeeze=False)[0]
     for axes, (frame, picture) in zip(frames, tracking.pictures, strict=True):
         _draw_frame(axes, tracking, frame, picture)
     return fig
 
 
-def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -> None:
+def _draw_kymograph(ax: Axes, tracking: Tracking) -> None:
     track, strip = tracking.track, tracking.kymograph
-    small = shrunk(strip, MAX_STRIP_PX)
-    time_ms, down = _time_axis(tracking)
+    small = shrunk(strip, 480)
+    timed = np.isfinite(track.time_s).all()
+    time_ms = 1e3 * track.time_s if timed else np.arange(float(track.time_s.size))  # frames, where they have no time
     dark, light = np.nanpercentile(small, [1, 99])
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     shown_ms = time_ms[tracking.strip_rows]
@@ -152,26 +149,8 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
         ax.plot(before[by_hand], time_ms[by_hand], "+", color=SKY, markersize=5, markeredgewidth=1.0)
         label = f"corrected by hand, N = {int(by_hand.sum())}"
         ax.plot(edge[by_hand], time_ms[by_hand], "o", color=GREEN, markersize=4, fillstyle="none", label=label)
-    ax.set(xlabel="along the growth axis (px)", ylabel=down)
+    ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)" if timed else "frame")
     ax.grid(visible=False)
-
-    def in_mm(px: Any) -> Any:
-        return 1e3 * m_per_px * px
-
-    def in_px(mm: Any) -> Any:
-        return mm / (1e3 * m_per_px)
-
-    if np.isfinite(m_per_px):
-        top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
-        top.set_xlabel("along the growth axis (mm)")
-    legend_above(ax, 2)
-    ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
-
-
-def _time_axis(tracking: Tracking) -> tuple[np.ndarray, str]:
-    """Ordinate of every frame in the strip, in ms or frames, and its label."""
-    time_s = tracking.track.time_s
-    return (1e3 * time_s, "time (ms)") if np.isfinite(time_s).all() else (np.arange(float(time_s.size)), "frame")
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
@@ -193,13 +172,13 @@ def flagged(flag: Any) -> np.ndarray:
     """Return a mask, shape (n_frames,), of the frames with any flag except `before_release`. Shapes: flag (n_frames,) →
     (n_frames,).
     """
-    return np.array([bool(set(str(entry).split(";")) - _IGNORED_FLAGS - {""}) for entry in flag], dtype=bool)
+    return np.array([bool(set(str(entry).split(";")) - {"before_release", ""}) for entry in flag], dtype=bool)
 
 
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
     height, width = picture.shape
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    ax.imshow(shrunk(picture, _FRAME_PX), cmap="gray", extent=whole, interpolation="none")
+    ax.imshow(shrunk(picture, 320), cmap="gray", extent=whole, interpolation="none")
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
     if tracking.axis.bends:
@@ -213,24 +192,17 @@ def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -
         ends = np.array([tracking.axis.points(np.array(edge), across) for across in (-half, half)])
         unusable = bool(UNUSABLE_FLAGS.intersection(str(track.flag[frame]).split(";")))
         ax.plot(ends[:, 0], ends[:, 1], color=SKY if unusable else VERMILLION, linewidth=1.8)
-    ax.set_xlim(-0.5, width - 0.5)
-    ax.set_ylim(height - 0.5, -0.5)
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     at = f", {1e3 * track.time_s[frame]:.1f} ms" if np.isfinite(track.time_s[frame]) else ""
-    ax.set_title(f"frame {frame}{at}", fontsize=9, fontweight="normal", color=INK)
+    small_title(ax, f"frame {frame}{at}", color=INK)
 
 
-Floats = NDArray[np.float64]
+# ------------------------------------------------------------------------------
+# Frames of a clip.
 
 # Okabe and Ito's yellow, vermillion and sky blue: distinguishable by everyone, on any grey
 TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
-
-# Colour of a bent path: grey, so that only edges are coloured
-PATH = "#9aa3b0"
-BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
-_MAX_ZOOM = 2.0  # Pixels of the clip per pixel of the recording; chosen: a larger zoom only shows single pixels
-
-# Distance from the axis to which the edges of the models before and after are drawn, in radii of the tube
-_MODEL_EDGE_REACH = (2.0, 1.4)
+_BAR, _BAR_INK, _GREY = "#16191e", "#f2f4f7", "#9aa3b0"
 
 
 @dataclass(frozen=True)
@@ -263,13 +235,28 @@ class ClipView:
 
     @property
     def zoom(self) -> float:
-        """Pixels of the clip per pixel of the recording."""
-        return min(self.width_px / self.size_px[0], _MAX_ZOOM)
+        """Pixels of the clip per pixel of the recording, at most 2: a larger zoom only shows single pixels."""
+        return min(self.width_px / self.size_px[0], 2.0)
 
     @property
     def picture_px(self) -> tuple[int, int]:
         """Width and height of the picture in the clip, both even."""
         return _even(self.zoom * self.size_px[0]), _even(self.zoom * self.size_px[1])
+
+    @property
+    def line_px(self) -> int:
+        """Height of the letters."""
+        return max(round(self.picture_px[0] / 48), 11)
+
+    def row_y(self, row: int) -> float:
+        """Height of the middle of a line of text in the bar."""
+        return 1.1 * self.line_px + 1.35 * self.line_px * row
+
+    def at(self, along_px: Any, across_px: float = 0.0) -> Any:
+        """Places of the clip along the axis. Pixel centres are at integers in the recording, at half-integers in the
+        clip.
+        """
+        return (self.axis.points(along_px, across_px) + 0.5) * self.zoom - 0.5
 
 
 def _even(value: float) -> int:
@@ -281,21 +268,21 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     from PIL import Image, ImageDraw
 
     width, height = view.picture_px
-    line_px = max(round(width / 48), 11)
-    bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
+    bar_px = _even(1.35 * view.line_px * max(len(edges), 2) + 0.8 * view.line_px)
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
+    if view.axis.bends:  # a straight axis is obvious
+        pen.line([tuple(place) for place in view.at(np.arange(0.0, view.axis.length_px, 3.0))], fill=_GREY, width=1)
     models = [edge for edge in edges[1:] if not edge.by_hand]
     seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
-    if view.axis.bends:
-        _draw_path(pen, view)
-    for edge, reach in (*zip(models, _MODEL_EDGE_REACH, strict=False), *((edge, 0.0) for edge in seen)):
+    # The edges of the models before and after are drawn to other distances from the axis, in radii of the tube.
+    for edge, reach in (*zip(models, (2.0, 1.4), strict=False), *((edge, 0.0) for edge in seen)):
         _draw_edge(pen, view, edge, frame, reach)
-    _scale_bar(pen, view, line_px)
-    whole = Image.new("RGB", (width, height + bar_px), BAR)
-    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px, line_px), (0, 0))
+    _scale_bar(pen, view)
+    whole = Image.new("RGB", (width, height + bar_px), _BAR)
+    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px), (0, 0))
     whole.paste(small, (0, bar_px))
-    _numbers(ImageDraw.Draw(whole), view, edges, frame, time_ms, line_px)
+    _numbers(ImageDraw.Draw(whole), view, edges, frame, time_ms)
     return np.asarray(whole)
 
 
@@ -308,29 +295,20 @@ def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
 
 
-def _draw_path(pen: ImageDraw, view: ClipView) -> None:
-    """Draw a thin line along a bent axis; a straight axis is obvious."""
-    places = view.axis.points(np.arange(0.0, view.axis.length_px, 3.0))
-    pen.line([tuple((place + 0.5) * view.zoom - 0.5) for place in places], fill=PATH, width=1)
-
-
 def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: float) -> None:
     """Draw an edge across the tube if `reach` is 0, else on both sides of it up to `reach` radii."""
     along = float(edge.along_px[frame])
     if not math.isfinite(along):
         return
-    radius = 0.5 * view.tube_px
     spans = ((0.85, reach), (-0.85, -reach)) if reach else ((-1.0, 1.0),)
     thick = max(round(view.picture_px[0] / 320), 3)
-    for low, high in spans:
-        ends = [view.axis.points(np.array(along), across * radius) for across in (low, high)]
-        # Pixel centres are at integers in the recording, at half-integers in the clip.
-        line = [tuple((end + 0.5) * view.zoom - 0.5) for end in ends]
+    for span in spans:
+        line = [tuple(view.at(np.array(along), across * 0.5 * view.tube_px)) for across in span]
         pen.line(line, fill="black", width=thick + 2)
         pen.line(line, fill=edge.colour, width=thick)
 
 
-def _scale_bar(pen: ImageDraw, view: ClipView, line_px: int) -> None:
+def _scale_bar(pen: ImageDraw, view: ClipView) -> None:
     """Draw a scale bar of a round length, about a sixth of the picture, in the lower left corner."""
     width, height = view.picture_px
     wanted_mm = width / 6 / view.zoom * view.mm_per_px
@@ -338,58 +316,51 @@ def _scale_bar(pen: ImageDraw, view: ClipView, line_px: int) -> None:
         return
     decade = 10.0 ** math.floor(math.log10(wanted_mm))
     length_mm = max(step * decade for step in (1, 2, 5) if step * decade <= wanted_mm)
-    left, bottom = line_px, height - line_px
+    left, bottom = view.line_px, height - view.line_px
     right = left + length_mm / view.mm_per_px * view.zoom
-    thick = max(line_px // 6, 2)
+    thick = max(view.line_px // 6, 2)
     pen.rectangle((left - 1, bottom - thick - 1, right + 1, bottom + 1), fill="black")
     pen.rectangle((left, bottom - thick, right, bottom), fill="white")
-    pen.text(
-        (left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(line_px), fill="white", anchor="ls",
-        stroke_width=2, stroke_fill="black",
-    )  # fmt: skip
+    style: dict[str, Any] = {"fill": "white", "anchor": "ls", "stroke_width": 2, "stroke_fill": "black"}
+    pen.text((left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(view.line_px), **style)
 
 
 @lru_cache(maxsize=2)
-def _legend(view: ClipView, names: tuple[tuple[str, str], ...], bar_px: int, line_px: int) -> Image:
+def _legend(view: ClipView, names: tuple[tuple[str, str], ...], bar_px: int) -> Image:
     """The constant part of the bar above; numbers are written over it."""
     from PIL import Image, ImageDraw
 
-    width = view.picture_px[0]
-    bar = Image.new("RGB", (width, bar_px), BAR)
+    width, line_px = view.picture_px[0], view.line_px
+    bar = Image.new("RGB", (width, bar_px), _BAR)
     pen = ImageDraw.Draw(bar)
     for i, (name, colour) in enumerate(names):
-        y = _row_y(i, line_px)
+        y, words = view.row_y(i), _shortened(name, 0.42 * width, _font(line_px))
         pen.line([(line_px, y), (2.6 * line_px, y)], fill=colour, width=max(line_px // 4, 3))
-        pen.text(
-            (3.2 * line_px, y), _shortened(name, 0.42 * width, line_px), font=_font(line_px), fill=BAR_INK, anchor="lm"
-        )
-    title = _shortened(view.title, 0.3 * width, line_px, bold=True)
-    pen.text((width - line_px, _row_y(0, line_px)), title, font=_font(line_px, True), fill=BAR_INK, anchor="rm")
+        pen.text((3.2 * line_px, y), words, font=_font(line_px), fill=_BAR_INK, anchor="lm")
+    title = _shortened(view.title, 0.3 * width, _font(line_px, True))
+    pen.text((width - line_px, view.row_y(0)), title, font=_font(line_px, True), fill=_BAR_INK, anchor="rm")
     return bar
 
 
-def _row_y(row: int, line_px: int) -> float:
-    return 1.1 * line_px + 1.35 * line_px * row
-
-
-def _shortened(text: str, room_px: float, line_px: int, bold: bool = False) -> str:
-    if _font(line_px, bold).getlength(text) <= room_px:
+def _shortened(text: str, room_px: float, font: FreeTypeFont) -> str:
+    if font.getlength(text) <= room_px:
         return text
-    while text and _font(line_px, bold).getlength(text + "…") > room_px:
+    while text and font.getlength(text + "…") > room_px:
         text = text[:-1]
     return text.rstrip() + "…"
 
 
-def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float, line_px: int) -> None:
-    width, font = view.picture_px[0], _font(line_px)
+def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float) -> None:
+    width, font = view.picture_px[0], _font(view.line_px)
     for i, edge in enumerate(edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
-            words = f"{edge.off_mm[frame]:+.1f} mm".replace("-", "−")
-            pen.text((0.6 * width, _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
-    before = " (before release)" if time_ms < 0 else ""
-    words = f"{time_ms:.1f} ms{before}, {view.slowed:.3g} times slower".replace("-", "−")
-    words = words if math.isfinite(time_ms) else f"frame {frame}"
-    pen.text((width - line_px, _row_y(1, line_px)), words, font=font, fill=BAR_MUTED, anchor="rm")
+            words = f"{with_minus(edge.off_mm[frame], '+.1f')} mm"
+            pen.text((0.6 * width, view.row_y(i)), words, font=font, fill=_BAR_INK, anchor="rm")
+    words = f"frame {frame}"
+    if math.isfinite(time_ms):
+        before = " (before release)" if time_ms < 0 else ""
+        words = f"{with_minus(time_ms, '.1f')} ms{before}, {view.slowed:.3g} times slower"
+    pen.text((width - view.line_px, view.row_y(1)), words, font=font, fill=_GREY, anchor="rm")
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Simulated motions: predictions for vines not yet built, and the change by one effect."""
+"""Simulated motions: predictions for vines not yet built, designs of them, one effect, and the power to detect it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ from vinetrack.figures.style import (
     VERMILLION,
     VINE_COLOURS,
     VINE_MARKERS,
+    band,
+    column,
     fitting_size,
     look,
+    names_on_axis,
     new_figure,
     plain_log_ticks,
+    small_title,
 )
 from vinetrack.narrative.power_text import size_text
 from vinetrack.narrative.verdict_text import spaced_name
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
 
     from vinetrack.diagnosis.power import EffectPower, Power
 
+_LOG_RATIO = 6.0  # Chosen: at a larger ratio of slowest to fastest the latter takes less than a sixth of a linear axis
 
 # ------------------------------------------------------------------------------
 # Figures of designs: the fastest vine, and the pressure loss of a chamber.
@@ -53,7 +58,6 @@ class FilmChoice:
 @look()
 def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figure:
     """Draw the films side by side: speed against diameter, and the certainty of the choice."""
-    label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
     fig = new_figure(9.6, 4.4, layout=None)
     curves, bars = fig.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for k, film in enumerate(films):
@@ -62,23 +66,18 @@ def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figu
         curves.plot(*film.best, marker, color=colour, ms=8, clip_on=False)
         bars.plot([k, k], film.band, color=colour, lw=9, alpha=0.35, solid_capstyle="butt")
         bars.plot(k, film.best[1], marker, color=colour, ms=8)
-        bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), textcoords="offset points", ha="center",
-                      fontsize=10)  # fmt: skip
-    curves.set_xlabel("diameter (mm)")
-    curves.set_ylabel(label)
-    curves.set_ylim(0.0, 1.12 * max(film.band[1] for film in films))
-    curves.set_title("best length and pressure at each diameter", fontsize=10, fontweight="normal")
+        style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 10}
+        bars.annotate(f"{film.odds:.0%}", (k, film.band[1]), (0, 5), **style)
+    label = f"{name} (m/s)" if y_over_L == 1 else f"{name}\nat y/L = {y_over_L:g} (m/s)"
+    curves.set(xlabel="diameter (mm)", ylabel=label, ylim=(0.0, 1.12 * max(film.band[1] for film in films)))
+    small_title(curves, "best length and pressure at each diameter", fontsize=10)
     curves.legend(title="film", fontsize=9.5)
-    bars.set_xlim(-0.6, len(films) - 0.4)
+    bars.set(xlabel="film (µm)", xlim=(-0.6, len(films) - 0.4))
     bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
-    bars.set_xlabel("film (µm)")
-    bars.set_title("90 % band; percentage of draws in which it is the fastest", fontsize=10, fontweight="normal")
+    small_title(bars, "90 % band; percentage of draws in which it is the fastest", fontsize=10)
     fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
     fig.text(0.1, 0.02, "line, marker: median of the prediction; bar: 90 % interval", color=MUTED, fontsize=8.8)
     return fig
-
-
-_MIN_LITRE_AXIS = 1e-4  # Chosen: below 0.1 mL an axis is in millilitres, so that its ticks need no exponent
 
 
 @dataclass(frozen=True)
@@ -96,23 +95,22 @@ def draw_reservoir(
     """Draw the gauge pressure that a closed chamber loses while a vine grows, against its volume. Shapes: volumes_m3
     (n_volumes,).
     """
-    factor, unit = (1e3, "L") if volumes_m3[0] >= _MIN_LITRE_AXIS / 10 else (1e6, "mL")
+    # Below 10 mL the axis is in millilitres, so that its ticks need no exponent.
+    factor, unit = (1e3, "L") if volumes_m3[0] >= 1e-5 else (1e6, "mL")
     fig = new_figure(7.2, 4.4)
     ax = fig.subplots()
     for law, colour, style in zip(laws, (BLUE, VERMILLION), ("-", DASHED), strict=False):
         ax.plot(factor * volumes_m3, 100 * law.losses, color=colour, ls=style, label=law.name)
-    slow, fast = (100 * law.losses for law in laws[:2])
-    ax.fill_between(factor * volumes_m3, slow, fast, color=MUTED, alpha=0.12, lw=0)
+    band(ax, factor * volumes_m3, 100 * laws[0].losses, 100 * laws[1].losses, MUTED, 0.12)
+    words: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9.5}
     ax.axhline(100 * loss, color=INK, lw=1.0)
-    ax.annotate(f"allowed: {100 * loss:g} %", (0.99, 100 * loss), (0, 3), ("axes fraction", "data"),
-                textcoords="offset points", ha="right", fontsize=9.5)  # fmt: skip
+    at = (0.99, 100 * loss), (0, 3), ("axes fraction", "data")
+    ax.annotate(f"allowed: {100 * loss:g} %", *at, ha="right", **words)
     if chosen_m3 is not None and volumes_m3[0] < chosen_m3 < volumes_m3[-1]:
         ax.axvline(factor * chosen_m3, color=MUTED, lw=1.2)
-        ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", (factor * chosen_m3, 0.97), (5, 0),
-                    ("data", "axes fraction"), textcoords="offset points", va="top", fontsize=9.5)  # fmt: skip
-    ax.set_xscale("log")
-    ax.set_ylim(0.0, min(8 * 100 * loss, 100.0))
-    ax.set_xlim(factor * volumes_m3[0], factor * volumes_m3[-1])
+        at = (factor * chosen_m3, 0.97), (5, 0), ("data", "axes fraction")
+        ax.annotate(f"chosen: {factor * chosen_m3:.3g} {unit}", *at, va="top", **words)
+    ax.set(xscale="log", xlim=(factor * volumes_m3[0], factor * volumes_m3[-1]), ylim=(0.0, min(800 * loss, 100.0)))
     plain_log_ticks(ax, "x")
     ax.set_xlabel(f"volume of the chamber ({unit}); of the grown vine {factor * swept_m3:.3g} {unit}")
     ax.set_ylabel("gauge pressure lost (%)")
@@ -120,14 +118,8 @@ def draw_reservoir(
     return fig
 
 
-MAX_CURVES = len(VINE_COLOURS)  # Derived: the number of colours
-_PREDICTION_WIDTH_IN = 9.6  # Chosen: two panels of 4 in with their labels
-
-# Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis
-_LOG_AXIS_RATIO = 6.0
-
-# Chosen: compression in the tail below 1 % of the largest tension is rounding of the simulation and gets no note
-_NEGLIGIBLE_COMPRESSION = 0.01
+# ------------------------------------------------------------------------------
+# Predictions, and the motion with and without one effect.
 
 
 @dataclass(frozen=True)
@@ -144,8 +136,9 @@ class PredictionPicture:
 @look()
 def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
     """Draw one condition with the uncertainty budget of its final speed, or several conditions superposed."""
-    drawn = pictures[:MAX_CURVES]
-    fig = new_figure(_PREDICTION_WIDTH_IN, 7.2, layout=None)
+    drawn = pictures[: len(VINE_COLOURS)]
+    width_in = 9.6
+    fig = new_figure(width_in, 7.2, layout=None)
     axes = fig.subplots(2, 2)
     for colour, picture in zip(VINE_COLOURS, drawn, strict=False):
         _draw_curves(axes, picture, colour)
@@ -155,7 +148,7 @@ def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) 
     else:
         _list_conditions(axes[1, 1], pictures)
     title = drawn[0].title if len(drawn) == 1 else f"{len(pictures)} conditions"
-    fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * _PREDICTION_WIDTH_IN, 12))
+    fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * width_in, 12))
     words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
     fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
     fig.align_ylabels(axes[:, 0])
@@ -167,52 +160,40 @@ def _draw_curves(axes: np.ndarray, picture: PredictionPicture, colour: str) -> N
     """Position against time; speed and tension against growth."""
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
     table = picture.curve
-    y_mm, along = 1e3 * table["lead_position_m"].to_numpy(), table["y_over_L"].to_numpy()
-    early, middle, late = (
-        1e3 * table[name].to_numpy(dtype=float) for name in ("time_low_90_s", "time_s", "time_high_90_s")
-    )
-    last = _longest(early, middle, late)
-    ends = [np.where(np.isfinite(t), t, last) for t in (early, late)]
+    y_mm, along = column(table, "lead_position_m", 1e3), column(table, "y_over_L")
+    times_ms = [column(table, name, 1e3) for name in ("time_low_90_s", "time_s", "time_high_90_s")]
+    # The axis ends with the slow limit, but at most at four times the end of the median.
+    early, middle, late = (float(np.max(t[np.isfinite(t)], initial=0.0)) for t in times_ms)
+    last = min(late, 4 * middle) if middle > 0 else early or 1.0
+    ends = [np.where(np.isfinite(t), t, last) for t in (times_ms[0], times_ms[2])]
     position.fill_betweenx(y_mm, *ends, color=colour, alpha=0.18, lw=0)
-    come = np.isfinite(middle)
-    position.plot(middle[come], y_mm[come], color=colour)
+    come = np.isfinite(times_ms[1])
+    position.plot(times_ms[1][come], y_mm[come], color=colour)
     position.set_xlim(0.0, max(last, position.get_xlim()[1] if position.lines[1:] else 0.0))
     for ax, name, unit in ((speed, "lead_velocity", "m_s"), (tension, "tension", "N")):
-        low, high = (table[f"{name}_{side}_90_{unit}"].to_numpy(dtype=float) for side in ("low", "high"))
-        ax.fill_between(along, low, high, color=colour, alpha=0.18, lw=0)
+        low, high = (column(table, f"{name}_{side}_90_{unit}") for side in ("low", "high"))
+        band(ax, along, low, high, colour, 0.18)
         ax.plot(along, table[f"{name}_{unit}"], color=colour)
-
-
-def _longest(*times_ms: np.ndarray) -> float:
-    """End of the time axis: that of the slow limit, but at most four times that of the median."""
-    ends = [float(np.max(t[np.isfinite(t)], initial=0.0)) for t in times_ms]
-    return min(ends[2], 4 * ends[1]) if ends[1] > 0 else ends[0] or 1.0
 
 
 def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_fraction: float) -> None:
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
-    position.set_xlabel("time since release (ms)")
-    position.set_ylabel("leading edge y (mm)")
+    position.set(xlabel="time since release (ms)", ylabel="leading edge y (mm)")
     position.set_ylim(bottom=0.0)
     for ax, label in ((speed, "speed of the leading edge ẏ (m/s)"), (tension, "tension of the tail (N)")):
-        ax.set_xlabel("growth y/L")
-        ax.set_ylabel(label)
-        ax.set_xlim(0.0, 1.0)
-        ax.axvline(at_fraction, color=MUTED, lw=0.9, ls=(0, (4, 2)))
+        ax.set(xlabel="growth y/L", ylabel=label, xlim=(0.0, 1.0))
+        ax.axvline(at_fraction, color=MUTED, lw=0.9, ls=DASHED)
     low, high = speed.get_ylim()
     speed.set_ylim(max(low, 0.0), high)
-    speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", transform=speed.get_xaxis_transform(), ha="right",
-               fontsize=9, color=MUTED)  # fmt: skip
-    lows, highs = zip(
-        *((p.curve["tension_low_90_N"].min(), p.curve["tension_high_90_N"].max()) for p in drawn), strict=True
-    )
-    if min(lows) < -_NEGLIGIBLE_COMPRESSION * max(highs):
+    at: dict[str, Any] = {"transform": speed.get_xaxis_transform(), "ha": "right", "fontsize": 9, "color": MUTED}
+    speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", **at)
+    lowest = min(picture.curve["tension_low_90_N"].min() for picture in drawn)
+    # Compression below 1 % of the largest tension is rounding of the simulation.
+    if lowest < -0.01 * max(picture.curve["tension_high_90_N"].max() for picture in drawn):
         tension.axhline(0.0, color=INK, lw=0.8)
-        tension.set_title(
-            "below 0 the model predicts compression in the tail", fontsize=9.5, fontweight="normal", color=MUTED
-        )
+        small_title(tension, "below 0 the model predicts compression in the tail", fontsize=9.5, color=MUTED)
     ends = [float(picture.curve["time_s"].replace(np.inf, np.nan).max()) for picture in drawn]
-    if max(ends) > _LOG_AXIS_RATIO * min(ends):
+    if max(ends) > _LOG_RATIO * min(ends):
         position.set_xscale("log")
         position.set_xlim(left=10.0 * min(ends))
         plain_log_ticks(position, "x")
@@ -221,15 +202,16 @@ def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_f
 def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
     """Bars of the final speed: with all uncertainties, then with each alone."""
     low, median, high = picture.final
-    rows = [("all inputs", low, high), *picture.shares]
-    for k, (_, start, stop) in enumerate(rows):
+    bars = [("all inputs", low, high), *picture.shares]
+    for k, (_, start, stop) in enumerate(bars):
         ax.barh(k, stop - start, left=start, height=0.55, color=BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
     ax.axvline(median, color=INK, lw=1.0)
-    ax.set_yticks(range(len(rows)), [_folded(name) for name, _, _ in rows], fontsize=8.8)
+    names = [textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15) for name, _, _ in bars]
+    ax.set_yticks(range(len(bars)), names, fontsize=8.8)
     ax.invert_yaxis()
     ax.margins(x=0.06)
     ax.use_sticky_edges = False
-    if low > 0 and high > _LOG_AXIS_RATIO * low:
+    if low > 0 and high > _LOG_RATIO * low:
         ax.set_xscale("log")
         plain_log_ticks(ax, "x")
     ax.grid(visible=False, axis="y")
@@ -237,58 +219,45 @@ def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
     ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
-def _folded(name: str) -> str:
-    """Wrap a name at 15 letters; long names of effects are split at underscores."""
-    return textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15)
-
-
 def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
     """List the condition of each colour, instead of the bars."""
     ax.set_axis_off()
-    lines = [(colour, picture.title) for colour, picture in zip(VINE_COLOURS, pictures, strict=False)]
-    for k, (colour, words) in enumerate(lines):
+    for k, (colour, picture) in enumerate(zip(VINE_COLOURS, pictures, strict=False)):
         y = 0.97 - 0.155 * k
         ax.plot([0.0, 0.07], [y - 0.025] * 2, color=colour, lw=3, transform=ax.transAxes, clip_on=False)
-        ax.text(0.1, y, textwrap.fill(words, 50), transform=ax.transAxes, va="top", fontsize=9.2)
-    if len(pictures) > len(lines):
-        ax.text(0.1, 0.02, f"and {len(pictures) - len(lines)} more, not drawn", transform=ax.transAxes, color=MUTED)
-
-
-_EFFECT_WIDTH_IN = 7.2  # Chosen: one panel that fits a page of A4
+        ax.text(0.1, y, textwrap.fill(picture.title, 50), transform=ax.transAxes, va="top", fontsize=9.2)
+    if (n_more := len(pictures) - len(VINE_COLOURS)) > 0:
+        ax.text(0.1, 0.02, f"and {n_more} more, not drawn", transform=ax.transAxes, color=MUTED)
 
 
 @look()
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     """Draw position and speed of the leading edge with and without one effect, and the difference."""
-    time_ms = 1e3 * table["time_s"].to_numpy()
-    fig = new_figure(_EFFECT_WIDTH_IN, 7.0, layout=None)
+    time_ms = column(table, "time_s", 1e3)
+    width_in = 7.2
+    fig = new_figure(width_in, 7.0, layout=None)
     position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
     for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
-        axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label="without")
-        axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label="with")
-    difference_mm = 1e3 * table["difference_m"].to_numpy()
+        axes.plot(time_ms, column(table, f"without_{key}", factor), color=MUTED, lw=2.4, label="without")
+        axes.plot(time_ms, column(table, f"with_{key}", factor), color=BLUE, label="with")
+    difference_mm = column(table, "difference_m", 1e3)
     gap.axhline(0.0, color=INK, lw=0.8)
     gap.plot(time_ms, difference_mm, color=VERMILLION)
-    gap.fill_between(time_ms, 0.0, difference_mm, color=VERMILLION, alpha=0.15, lw=0)
-    speed.set_ylim(*_bulk_limits(table))
+    band(gap, time_ms, 0.0, difference_mm, VERMILLION, 0.15)
+    # Up to the 99th percentile, since a jump at the start or a divergence would hide the rest
+    speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
+    bottom, top = (1.15 * float(np.quantile(speeds, share)) for share in (0.01, 0.99))
+    speed.set_ylim(min(0.0, bottom), top if top > 0 else 1.0)
     position.set_ylabel("leading edge y (mm)")
     speed.set_ylabel("its speed ẏ (m/s)")
-    gap.set_ylabel("difference (mm)")
-    gap.set_xlabel("time since release (ms)")
+    gap.set(xlabel="time since release (ms)", ylabel="difference (mm)")
     title = name + (f": {size}" if size else "")
-    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * _EFFECT_WIDTH_IN, 11))
+    fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * width_in, 11))
     position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     fig.align_ylabels()
     fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
     fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
     return fig
-
-
-def _bulk_limits(table: pd.DataFrame) -> tuple[float, float]:
-    """Limits from 0 to above the 99th percentile, since a jump at the start or a divergence would hide the rest."""
-    speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
-    top = 1.15 * float(np.quantile(speeds, 0.99))
-    return min(0.0, 1.15 * float(np.quantile(speeds, 0.01))), top if top > 0 else 1.0
 
 
 # ------------------------------------------------------------------------------
@@ -297,34 +266,37 @@ def _bulk_limits(table: pd.DataFrame) -> tuple[float, float]:
 # One row per effect; columns are sizes relative to the largest plausible one. The sizes of 50 and 90 % power are listed
 # at the end of each row in the unit of the effect.
 
-# Range of sizes relative to the largest plausible one, and columns of the map (chosen)
-MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS = 1e-4, 3.0, 108
-
-_TEXT_COLUMN_X = (0.0, 0.35, 0.7)  # Abscissae of the columns of sizes, relative to their width (chosen)
-
-_ROW_IN, _WIDTH_IN = 0.31, 9.6  # Chosen: one line of 10 pt per row; a map of 4 in between names and sizes
-
 
 @look()
 def draw_power(power: Power) -> Figure | None:
-    """Draw the power to detect each effect against its size."""
-    entries = sorted(power.effects, key=_order)
+    """Draw the power to detect each effect against its size; first what is detected at the smallest fraction of its
+    plausible size.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    entries = sorted(power.effects, key=lambda one: abs((one.size_at(0.9) - one.zero) / (one.largest - one.zero)))
     if not entries or power.wary:
         return None
-    parts = np.geomspace(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE, N_COLUMNS)
-    probabilities = np.array(
-        [
-            [entry.probability_at(entry.zero + part * (entry.largest - entry.zero)) for part in parts]
-            for entry in entries
-        ]
-    )
-    fig = new_figure(_WIDTH_IN, _ROW_IN * len(entries) + 1.75)
+    n = len(entries)
+    least, most, n_columns = 1e-4, 3.0, 108  # sizes relative to the largest plausible one
+    parts = np.geomspace(least, most, n_columns)
+    probabilities = np.array([
+        [one.probability_at(one.zero + part * (one.largest - one.zero)) for part in parts] for one in entries
+    ])  # fmt: skip
+    fig = new_figure(9.6, 0.31 * n + 1.75)
     ax, sizes = fig.subplots(1, 2, width_ratios=(1.45, 1.0))
-    edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, N_COLUMNS + 1)
-    mesh = ax.pcolormesh(
-        edges, np.arange(len(entries) + 1) - 0.5, probabilities, cmap=_colours(), vmin=0, vmax=1, rasterized=True
-    )
-    _mark_rows(ax, entries)
+    edges = np.geomspace(parts[0] ** 1.5 / parts[1] ** 0.5, parts[-1] ** 1.5 / parts[-2] ** 0.5, n_columns + 1)
+    shades = LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", BLUE, "#003f66"])
+    mesh = ax.pcolormesh(edges, np.arange(n + 1) - 0.5, probabilities, cmap=shades, vmin=0, vmax=1, rasterized=True)
+    ax.set(xscale="log", xlim=(least, most), ylim=(n - 0.5, -0.5), xlabel="size relative to the largest plausible")
+    ax.grid(visible=False)
+    ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
+    # A white line below the dots keeps them visible on the dark part of the map.
+    ax.axvline(1.0, color="white", linewidth=2.2)
+    ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
+    names_on_axis(ax, "y", [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
+    for row in range(1, n):
+        ax.axhline(row - 0.5, color=GRID, linewidth=0.7)
     _list_sizes(sizes, entries)
     bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
     bar.set_label("power: probability of detection (%)")
@@ -335,42 +307,15 @@ def draw_power(power: Power) -> Figure | None:
     return fig
 
 
-def _order(entry: EffectPower) -> float:
-    """Sort key: effects detected at the smallest fraction of their plausible size first."""
-    return abs((entry.size_at(0.9) - entry.zero) / (entry.largest - entry.zero))
-
-
-def _colours() -> Any:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("power", ["#ffffff", "#d7e6f2", "#7fb2d8", BLUE, "#003f66"])
-
-
-def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
-    """Label the rows, and draw a line at the largest plausible size."""
-    ax.set_xscale("log")
-    ax.set_xlim(MIN_RELATIVE_SIZE, MAX_RELATIVE_SIZE)
-    ax.set_ylim(len(entries) - 0.5, -0.5)
-    ax.grid(visible=False)
-    ax.set_xlabel("size relative to the largest plausible")
-    ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
-    # A white line below the dots keeps them visible on the dark part of the map.
-    ax.axvline(1.0, color="white", linewidth=2.2)
-    ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    ax.set_yticks(range(len(entries)), [f"{spaced_name(entry.effect)}, {entry.symbol}" for entry in entries])
-    ax.tick_params(axis="y", length=0)
-    for row in range(1, len(entries)):
-        ax.axhline(row - 0.5, color=GRID, linewidth=0.7)
-
-
 def _list_sizes(ax: Axes, entries: list[EffectPower]) -> None:
     """Write sizes next to the rows of the map, in the unit of each effect; grey beyond the plausible range."""
     ax.set_axis_off()
-    ax.set_ylim(len(entries) - 0.5, -0.5)
-    ax.set_xlim(0, 1)
-    for row, entry in enumerate(entries):
-        for column, value in zip(_TEXT_COLUMN_X, (entry.size_at(0.5), entry.size_at(0.9), entry.largest), strict=True):
-            beyond = column == _TEXT_COLUMN_X[-1] or abs(value - entry.zero) > abs(entry.largest - entry.zero)
-            ax.text(column, row, size_text(entry, value), va="center", fontsize=9, color=MUTED if beyond else INK)
-    for column, words in zip(_TEXT_COLUMN_X, ("50 %\npower", "90 %\npower", "largest\nplausible"), strict=True):
-        ax.text(column, -0.65, words, va="bottom", fontsize=9, color=INK)
+    ax.set(xlim=(0, 1), ylim=(len(entries) - 0.5, -0.5))
+    for x, words in ((0.0, "50 %\npower"), (0.35, "90 %\npower"), (0.7, "largest\nplausible")):
+        ax.text(x, -0.65, words, va="bottom", fontsize=9, color=INK)
+    for row, one in enumerate(entries):
+        plausible = abs(one.largest - one.zero)
+        for x, value in ((0.0, one.size_at(0.5)), (0.35, one.size_at(0.9))):
+            colour = MUTED if abs(value - one.zero) > plausible else INK
+            ax.text(x, row, size_text(one, value), va="center", fontsize=9, color=colour)
+        ax.text(0.7, row, size_text(one, one.largest), va="center", fontsize=9, color=MUTED)

@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 SHOWS_REFUTED = "It shows the initial model, which the diagnosis refutes."
 DASHED_REFUTED = "The dashed model is the initial one, which the diagnosis refutes."
 
-# Sections of the page with figures of a whole experiment; those of the diagnosis come second
-_EXPERIMENT = ("damping", "model")
-_DIAGNOSIS = ("verdict", "where", "candidates", "tied", "drift")
-
 _Drawing = TypeVar("_Drawing", bound="Callable[..., Figure | None]")
 
 
@@ -88,12 +84,12 @@ def figures_of(*sections: str) -> dict[str, RegisteredFigure]:
 
 def campaign_figures() -> dict[str, RegisteredFigure]:
     """Return the figures of a whole experiment by name, those of its diagnosis last."""
-    return figures_of(*_EXPERIMENT) | diagnosis_figures()
+    return figures_of("damping", "model") | diagnosis_figures()
 
 
 def diagnosis_figures() -> dict[str, RegisteredFigure]:
     """Return the figures that show the diagnosis by name."""
-    return figures_of(*_DIAGNOSIS)
+    return figures_of("verdict", "where", "candidates", "tied", "drift")
 
 
 def draw(name: str, tables: Any) -> Figure | None:

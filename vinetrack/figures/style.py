@@ -1,8 +1,7 @@
 """Common style of all figures: colours that colour-blind readers can distinguish, sizes readable in a talk.
 
 Figures are made without pyplot, so drawing leaves no global state and many can be drawn in parallel. The background is
-transparent and neutral parts are drawn in INK or GRID, so that a page can recolour an inline SVG for a dark scheme; a
-PNG has a white background.
+transparent, that of a PNG white; `figures.mplstyle` holds all else that is common.
 """
 
 from __future__ import annotations
@@ -13,8 +12,9 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,11 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-INK = "#20242a"
-MUTED = "#7b828c"
-GRID = "#d9dde3"
-# Filling of hollow markers; a page may recolour it like INK and GRID
-PAPER = "#fdfdfe"
+INK, MUTED, GRID = "#20242a", "#7b828c", "#d9dde3"
+PAPER = "#fdfdfe"  # Filling of hollow markers; a page may recolour it like INK and GRID
 
 # Okabe and Ito's palette without black and yellow, each of which is invisible on one of the backgrounds
 BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
@@ -38,47 +35,11 @@ BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", 
 VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
 VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-# Colour of each rule for steady windows, the same in every figure
+# Name and colour of each rule for steady windows, the same everywhere
+RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
 RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "user": GREEN}
 
-RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
-
 DASHED: Any = (0, (4, 2))  # Line of the second of two models, methods or laws
-
-METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
-METHOD_LINES = {"log_log": DASHED, "both_axes": "-"}
-
-_RC: Any = {
-    "font.family": ["DejaVu Sans", "sans-serif"],
-    "font.size": 11,
-    "axes.titlesize": 11,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.labelsize": 11,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": INK,
-    "axes.linewidth": 0.8,
-    "axes.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.7,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.labelsize": 10,
-    "ytick.labelsize": 10,
-    "legend.frameon": False,
-    "legend.fontsize": 10,
-    "lines.linewidth": 1.6,
-    "figure.facecolor": "none",
-    "savefig.facecolor": "none",
-    "svg.hashsalt": "vinetrack",
-    "svg.fonttype": "none",
-    "path.simplify": True,
-}
 
 
 @dataclass(frozen=True)
@@ -89,12 +50,19 @@ class VineStyle:
     marker: str
 
 
+@cache
+def _settings() -> Any:
+    from matplotlib import rc_params_from_file
+
+    return rc_params_from_file(Path(__file__).with_name("figures.mplstyle"), use_default_template=False)
+
+
 @contextmanager
 def look() -> Iterator[None]:
     """Context manager that applies the project's matplotlib settings and restores the former ones."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(_settings()):
         yield
 
 
@@ -111,6 +79,16 @@ def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
 def rows(table: pd.DataFrame) -> Iterator[Any]:
     """Iterate over the rows of a table with its columns as attributes, typed as `Any` for convenience."""
     return iter(table.itertuples(index=False))
+
+
+def column(table: pd.DataFrame, name: str, factor: float = 1.0) -> np.ndarray:
+    """Return a column of numbers, times a factor. Shape (n_rows,)."""
+    return factor * table[name].to_numpy(dtype=float)
+
+
+def thinned(table: pd.DataFrame, n_points: int) -> pd.DataFrame:
+    """Return every so many rows of a table: at least `n_points` of them, fewer than twice as many."""
+    return table.iloc[:: max(len(table) // n_points, 1)]
 
 
 def new_figure(width_in: float, height_in: float, layout: Any = "constrained") -> Figure:
@@ -136,29 +114,19 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
         "pdf": {"metadata": {"CreationDate": None}},
     }
     files = {}
-    with look(), _laid_out(fig, dpi):
+    engine, before = fig.get_layout_engine(), fig.dpi
+    with look():
+        if engine is not None:  # once, instead of once per format, each of which would draw the figure again
+            fig.dpi = dpi
+            engine.execute(fig)
+            fig.dpi = before
+            fig.set_layout_engine(None)
         for form in formats:
             file = io.BytesIO()
             fig.savefig(file, format=form, dpi=dpi, **details[form])
             files[form] = file.getvalue()
+    fig.set_layout_engine(engine)
     return files
-
-
-@contextmanager
-def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
-    """Execute the layout engine once, instead of once per format, each of which would draw the figure again."""
-    engine, before = fig.get_layout_engine(), fig.dpi
-    if engine is None:
-        yield
-        return
-    fig.dpi = dpi
-    engine.execute(fig)
-    fig.dpi = before
-    fig.set_layout_engine(None)  # the engine "none" would still draw the figure twice
-    try:
-        yield
-    finally:
-        fig.set_layout_engine(engine)
 
 
 # ------------------------------------------------------------------------------
@@ -166,10 +134,10 @@ def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
 
 # CSS custom property by colour of a figure; purple, sky and orange are visible in either scheme
 TOKENS = {
-    INK.lower(): "--ink",
-    GRID.lower(): "--grid",
-    MUTED.lower(): "--muted",
-    PAPER.lower(): "--paper",
+    INK: "--ink",
+    GRID: "--grid",
+    MUTED: "--muted",
+    PAPER: "--paper",
     BLUE.lower(): "--blue",
     VERMILLION.lower(): "--vermillion",
     GREEN.lower(): "--green",
@@ -195,10 +163,6 @@ def follows_screen(colour: str) -> str:
 # ------------------------------------------------------------------------------
 # Panels, axes and legends common to all figures.
 
-_CHARACTERS_PER_IN = 12.5  # Chosen: the mean character of DejaVu Sans at 10 pt is 4.7 pt wide, 15 per inch
-
-_HEADROOM = 1.08  # Chosen: axes that begin at zero end 8 % above the largest value, so that no marker of 6 pt is cut
-
 
 def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list[Axes]:
     """Divide a figure into rows of panels and hide the surplus ones. Shape (count,)."""
@@ -216,6 +180,37 @@ def page_columns(n_panels: int, most: int) -> int:
 def panel_font(n_columns: int) -> float:
     """Return the font size in panels of a page of 11 inches, smaller for narrower panels."""
     return 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+
+
+def page_labels(fig: Figure, x_label: str, y_label: str, title: str) -> None:
+    """Label the axes that all panels of a page share, and put a line above them."""
+    fig.supxlabel(x_label, fontsize=11)
+    fig.supylabel(y_label, fontsize=11)
+    fig.suptitle(title, fontsize=11, x=0.01, ha="left")
+
+
+def small_title(ax: Axes, title: str, **style: Any) -> None:
+    """Put a remark, rather than a heading, above the axes."""
+    ax.set_title(title, **{"fontsize": 9, "fontweight": "normal", **style})
+
+
+def corner_text(ax: Axes, x: float, y: float, words: str, **style: Any) -> None:
+    """Write muted words at a place in the axes, as fractions of their size."""
+    ax.text(x, y, words, transform=ax.transAxes, **{"color": MUTED, **style})
+
+
+def names_on_axis(ax: Axes, axis: Literal["x", "y"], names: Sequence[str], **style: Any) -> None:
+    """Put names, one per unit, along an axis without marks or grid lines."""
+    ax.tick_params(axis=axis, length=0)
+    ax.grid(axis=axis, visible=False)
+    (ax.set_xticks if axis == "x" else ax.set_yticks)(range(len(names)), names, **style)
+
+
+def band(
+    ax: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, colour: str, alpha: float = 0.22, **style: Any
+) -> None:
+    """Fill between two curves. Shapes (n_points,)."""
+    ax.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, **style)
 
 
 def line_key(label: str, **style: Any) -> Line2D:
@@ -245,59 +240,57 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
     return largest * min(1.0, width_pt / max(taken_pt, 1e-9))
 
 
-def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
+def legend_above(ax: Axes, n_columns: int = 1, **keywords: Any) -> None:
     """Put the legend above the axes, where it covers no data."""
-    handles, labels = ax.get_legend_handles_labels()
-    handles = keywords.pop("handles", handles)
-    if handles:
-        ax.legend(
-            handles=handles,
-            labels=[handle.get_label() for handle in handles] if not labels else None,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.01),
-            borderaxespad=0.0,
-            ncols=n_columns,
-            handlelength=1.8,
-            columnspacing=1.4,
-            **keywords,
-        )
+    if ax.get_legend_handles_labels()[0]:
+        place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.01), "borderaxespad": 0.0}
+        ax.legend(ncols=n_columns, handlelength=1.8, columnspacing=1.4, **place, **keywords)
+
+
+def page_legend(fig: Figure, handles: Sequence[Any] | None, n_columns: int, **keywords: Any) -> None:
+    """Put a legend above all panels; of the labelled parts of the figure if no entries are given."""
+    fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, **keywords)
 
 
 def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence below the figure, wrapped to its width; nothing if it is blank."""
+    """Put a sentence below the figure, wrapped to its width at 12.5 characters per inch; nothing if it is blank."""
     if note:
-        fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * _CHARACTERS_PER_IN)), fontsize=10)
+        fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * 12.5)), fontsize=10)
 
 
 def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end slightly above the largest value. A margin in proportion to the range of the
-    data would vanish for two points of nearly equal value.
+    """Let the axes begin at zero and end 8 % above the largest value. A margin in proportion to the range of the data
+    would vanish for two points of nearly equal value.
     """
-    ax.set_ylim(0, _HEADROOM * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
+    ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
     if x:
-        ax.set_xlim(0, _HEADROOM * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)
+        ax.set_xlim(0, 1.08 * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)
 
 
-def counted(low: int, high: int, noun: str) -> str:
-    """Return a count with its noun, or the range of counts."""
+def counted(counts: Sequence[int], noun: str) -> str:
+    """Return a count with its noun, or the range of several counts."""
+    low, high = min(counts), max(counts)
     return f"{low}–{high} {noun}s" if low != high else f"{low} {noun}" + ("" if low == 1 else "s")
 
 
+def with_minus(value: float, form: str) -> str:
+    """Return a number in a format such as `+.1f`, with a true minus sign."""
+    return format(value, form).replace("-", "−")
+
+
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
-    """Label logarithmic axes with plain numbers, readable even within less than a decade."""
+    """Label logarithmic axes with plain numbers, readable even within less than a decade, and let them span a factor of
+    two at least: a single point must not fill the figure with its error bars.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     for axis in {"x": (ax.xaxis,), "y": (ax.yaxis,), "both": (ax.xaxis, ax.yaxis)}[which]:
-        low, high = _at_least_an_octave(*axis.get_view_interval())
+        low, high = axis.get_view_interval()
+        middle = math.sqrt(low * high)
+        low, high = min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))
         axis.set_view_interval(low, high, ignore=True)
         decades = math.log10(high / low)
         steps: Sequence[int] = (1, 2, 3, 5, 7) if decades < 1 else (1, 2, 5) if decades < 3.2 else (1,)
         axis.set_major_locator(LogLocator(subs=steps))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
-
-
-def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
-    """Widen limits to a factor of two at least: a single point must not fill the figure with its error bars."""
-    middle = math.sqrt(low * high)
-    return min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))
