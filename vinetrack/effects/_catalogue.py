@@ -32,9 +32,8 @@ from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, Worked
 # ------------------------------------------------------------------------------
 # First run of a user's own effects: each is a program, so it is announced before it runs, and remembered by hash.
 
-CATALOGUE = Path(__file__).resolve().parents[1]  # Files below this folder belong to the package and are not announced
-# Environment variable; with the value `known`, own effects that never ran here are refused
-POLICY = "VINETRACK_OWN_EFFECTS"
+PACKAGE = Path(__file__).resolve().parents[1]  # Files below this folder are not announced
+POLICY = "VINETRACK_OWN_EFFECTS"  # Environment variable: if `known`, own effects that never ran here are refused
 
 
 def memory_file() -> Path:
@@ -46,11 +45,10 @@ def memory_file() -> Path:
 def first_run(path: Path) -> str:
     """Announce an own effect that has not run before on standard error, and remember it."""
     path = path.resolve()
-    if path.is_relative_to(CATALOGUE) or not path.is_file():
+    if path.is_relative_to(PACKAGE) or not path.is_file():
         return ""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    known = _known()
-    if digest in known:
+    if digest in _known():
         return ""
     if os.environ.get(POLICY) == "known":
         return f"has never run here (sha256 {digest}), and {POLICY} is `known`: read it, then run it once without that"
@@ -84,17 +82,14 @@ class EffectError(UserError, ValueError):
 # Executed effect files, by path and module name, so that each path keeps its own functions
 _MODULES: dict[tuple[Path, str], ModuleType] = {}
 
-# Modules that an effect may import without depending on the location of its file
-_PLAIN_MODULES = frozenset(("__future__", "math", "numpy", "vinetrack"))
-
 
 def _load_module(path: Path) -> ModuleType:
     """Execute one effect file and return it as a module. It is registered in `sys.modules`, where the compiled form of
     a model looks for it, under a name derived from its text, and from its path where it may depend on that.
     """
-    whole, text, package = path.resolve(), path.read_bytes(), Path(__file__).resolve().parents[1]
-    if whole.is_relative_to(package):
-        place = whole.relative_to(package).as_posix()
+    whole, text = path.resolve(), path.read_bytes()
+    if whole.is_relative_to(PACKAGE):
+        place = whole.relative_to(PACKAGE).as_posix()
     else:
         place = "" if _is_independent_of_path(text) else str(whole)
     digest = hashlib.sha256(place.encode() + text).hexdigest()[:12]
@@ -137,15 +132,18 @@ def _is_independent_of_path(text: bytes) -> bool:
         tree = ast.parse(text)
     except (SyntaxError, ValueError):
         return False
-    plain = {name.split(".")[0] for name in _imported(tree)} <= _PLAIN_MODULES
-    return plain and not any(isinstance(node, ast.Name) and node.id.startswith("__") for node in ast.walk(tree))
+    plain = {"__future__", "math", "numpy", "vinetrack"}
+    imported = {name.split(".")[0] for name in _imported(tree)}
+    return imported <= plain and not any(
+        isinstance(node, ast.Name) and node.id.startswith("__") for node in ast.walk(tree)
+    )
 
 
 def effect_sources(path: Path) -> list[Path]:
     """The file of an effect, and those of the modules that it imports, directly or not, beside the installed ones."""
-    if path.is_relative_to(CATALOGUE):
+    if path.is_relative_to(PACKAGE):
         return [path]
-    installed = [CATALOGUE, *(Path(folder) for folder in sysconfig.get_paths().values())]
+    installed = [PACKAGE, *(Path(folder) for folder in sysconfig.get_paths().values())]
     found, waiting = [path], [(path, "")]
     while waiting:
         file, package = waiting.pop()
@@ -248,25 +246,23 @@ def _faults(effect: Effect) -> Iterable[str]:
         if given != expected:
             yield f"{hook}({', '.join(given)}) must be {hook}({', '.join(expected)})"
     for parameter in effect.parameters:
-        if not (_is_range(parameter.bounds) and _is_range((parameter.default, parameter.zero))):
-            yield f"default and zero of {parameter.name} must be numbers, its bounds two, such as bounds=(0, 1)"
-            continue
-        if parameter.plausible is not None and not _is_range(parameter.plausible):
-            yield f"plausible of {parameter.name} must be two numbers, such as plausible=(0, 1)"
-        if not all(_is_slip(slip) for slip in parameter.slips):
-            yield f"slips of {parameter.name} must be pairs of a size and what was done"
-        low, high = parameter.bounds
-        if not (low <= parameter.default <= high or parameter.default == parameter.zero):
-            yield f"the default of {parameter.name} lies outside its bounds"
+        yield from _parameter_faults(parameter)
 
 
-def _is_slip(pair: Any) -> bool:
-    return isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], Real) and isinstance(pair[1], str)
+def _parameter_faults(parameter: Parameter) -> Iterable[str]:
+    def are_numbers(pair: Any) -> bool:
+        return isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(end, Real) for end in pair)
 
-
-def _is_range(pair: Any) -> bool:
-    """Whether a value is a pair of numbers."""
-    return isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(end, Real) for end in pair)
+    name = parameter.name
+    if not (are_numbers(parameter.bounds) and are_numbers((parameter.default, parameter.zero))):
+        yield f"default and zero of {name} must be numbers, its bounds two, such as bounds=(0, 1)"
+    elif not (parameter.bounds[0] <= parameter.default <= parameter.bounds[1] or parameter.default == parameter.zero):
+        yield f"the default of {name} lies outside its bounds"
+    if parameter.plausible is not None and not are_numbers(parameter.plausible):
+        yield f"plausible of {name} must be two numbers, such as plausible=(0, 1)"
+    for slip in parameter.slips:
+        if not (isinstance(slip, tuple) and len(slip) == 2 and isinstance(slip[0], Real) and isinstance(slip[1], str)):
+            yield f"slips of {name} must be pairs of a size and what was done"
 
 
 @lru_cache(maxsize=1)
@@ -316,22 +312,23 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
     raise EffectError(f"There is no effect named {name!r}.{hint}")
 
 
-_HEAD = ("name", "kind", "parameters")
-
-
 def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None = None) -> list[str]:
     """Return lines with name, kind and parameters of each effect, and its formula below; base effects first."""
-    of_user = set((user_effects or {}).values())
+    own = set((user_effects or {}).values())
     effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
-    entries = []
-    for effect in effects:
-        parameters = ", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–"
-        entries.append(
-            (effect.name, f"{effect.kind}, own" if effect in of_user else effect.kind, parameters, effect.formula)
+    entries = [
+        (
+            effect.name,
+            f"{effect.kind}, own" if effect in own else effect.kind,
+            ", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–",
         )
-    head, *lines = table([entry[:3] for entry in entries], _HEAD)
-    below = [f"    {entry[3]}" for entry in entries]
-    return [head, *(line for pair in zip(lines, below, strict=True) for line in pair)]
+        for effect in effects
+    ]
+    head, *lines = table(entries, ("name", "kind", "parameters"))
+    return [
+        head,
+        *(part for line, effect in zip(lines, effects, strict=True) for part in (line, f"    {effect.formula}")),
+    ]
 
 
 def explanation(effect: Effect) -> list[str]:
@@ -340,7 +337,10 @@ def explanation(effect: Effect) -> list[str]:
     """
     lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
     if effect.parameters:
-        lines += ["Parameters, in files by the name in brackets:", *_parameter_table(effect), ""]
+        head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
+        rows = [_parameter_row(effect, parameter) for parameter in effect.parameters]
+        lines += ["Parameters, in files by the name in brackets:"]
+        lines += [*table(rows, head, indent="  ", align="<" * len(head)), ""]
     slips = [f"{p.symbol} = {size:.3g}, {done}" for p in effect.parameters for size, done in p.slips]
     facts = [
         ("Sizes that result from slips in the sheet", "; ".join(slips)),
@@ -351,6 +351,20 @@ def explanation(effect: Effect) -> list[str]:
         ("File", str(effect.path)),
     ]
     return [*lines, *(f"{what}: {words}" for what, words in facts if words)]
+
+
+def _parameter_row(effect: Effect, p: Parameter) -> tuple[str, ...]:
+    return (
+        p.symbol,
+        p.unit,
+        f"{p.default:g}",
+        f"{p.bounds[0]:g} to {p.bounds[1]:g}",
+        f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–",
+        # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
+        "–" if p.zero == p.default else f"{p.zero:g}",
+        "all" if p.shared == "all" else f"each {p.shared}",
+        f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}",
+    )
 
 
 def remedy(effect: Effect) -> str:
@@ -364,23 +378,5 @@ def told_apart(effect: Effect) -> str:
 
 
 def _paragraph(effect: Effect, begins: tuple[str, ...]) -> str:
-    for paragraph in effect.text.split("\n\n"):
-        if paragraph.startswith(begins):
-            return " ".join(paragraph.split()).replace("`", "")
-    return ""
-
-
-def _parameter_table(effect: Effect) -> list[str]:
-    head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
-    rows = [_cells(effect, parameter) for parameter in effect.parameters]
-    return table(rows, head, indent="  ", align="<" * len(head))
-
-
-def _cells(effect: Effect, p: Parameter) -> tuple[str, ...]:
-    plausible = f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–"
-    # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
-    zero = "–" if p.zero == p.default else f"{p.zero:g}"
-    bounds = f"{p.bounds[0]:g} to {p.bounds[1]:g}"
-    shared = "all" if p.shared == "all" else f"each {p.shared}"
-    meaning = f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}"
-    return p.symbol, p.unit, f"{p.default:g}", bounds, plausible, zero, shared, meaning
+    found = (paragraph for paragraph in effect.text.split("\n\n") if paragraph.startswith(begins))
+    return " ".join(next(found, "").split()).replace("`", "")

@@ -24,7 +24,7 @@ _RIG = TrialInputs(
 )  # fmt: skip
 
 # Values that functions must return in the state above where their effect vanishes
-UNCHANGED = {
+_UNCHANGED = {
     "true_time": _STATE.time,
     "trace_time": _STATE.time,
     "film_gain": 1.0,
@@ -89,22 +89,18 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
     if effect.parameters:
         for hook, function in effect.functions.items():
             value = float(function(_STATE, _RIG, *effect.zero))
-            if not math.isclose(value, UNCHANGED[hook], rel_tol=1e-9, abs_tol=1e-12):
+            if not math.isclose(value, _UNCHANGED[hook], rel_tol=1e-9, abs_tol=1e-12):
                 zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
-                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({UNCHANGED[hook]:g})"
-
-
-def _worked_value(effect: Effect, worked: Worked) -> float:
-    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN."""
-    state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
-    rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
-    arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
-    return float(effect.functions[worked.hook](state, rig, *arguments))
+                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({_UNCHANGED[hook]:g})"
 
 
 def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
+    """Evaluate the effect at the state, rig and parameters of a worked number; all other fields are NaN."""
     try:
-        value = _worked_value(effect, worked)
+        state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
+        rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
+        arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
+        value = float(effect.functions[worked.hook](state, rig, *arguments))
     except (KeyError, ValueError) as error:
         yield f"a worked number of {worked.hook} cannot be tried ({error})"
         return

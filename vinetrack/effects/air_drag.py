@@ -20,7 +20,6 @@ speed and no pulley.
 from vinetrack.core.units import AIR_DENSITY_KG_M3
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 EASILY_TAKEN_FOR = ("inlet_loss", "fold_inertia")
 PARAMETERS = (Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0), meaning="drag coefficient"),)
 
@@ -37,5 +36,4 @@ WORKED = (
         state={"lead_velocity": 60.0, "area": 4.9087e-4},
         parameters={"C_D": 1.0},
     ),
-    Worked("tip_force", 0.0, "of no size", state={"lead_velocity": 60.0, "area": 4.9e-4}, parameters={"C_D": 0.0}),
 )

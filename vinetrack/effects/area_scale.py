@@ -19,7 +19,7 @@ import math
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 2  # convention: see `Effect`, its place among those of one hook
+ORDER = 2
 EASILY_TAKEN_FOR = ("pressure_gain", "wall_stretch")
 PARAMETERS = (
     Parameter(
@@ -50,5 +50,4 @@ def film_gain(s, rig, eps):  # noqa: ARG001, D103
 WORKED = (
     Worked("area", 4.7067e-4, "4.5239e-4 × 1.02²", state={"area": 4.5239e-4}, parameters={"eps": 0.02}),
     Worked("film_gain", 1.02, "1 + 0.02", parameters={"eps": 0.02}),
-    Worked("film_gain", 1.0, "of no size", parameters={"eps": 0.0}),
 )

@@ -23,7 +23,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
@@ -44,16 +43,14 @@ def tail_force(s, rig, C, mu_c, k):  # noqa: D103
     return -C * (np.exp(k * s.lead_position) - 1.0)
 
 
-_SIZE = {"C": 0.1, "mu_c": 0.5, "k": 5.0}
-_BENT = {"as_printed": 0.0, "has_bends": 1.0}
 WORKED = (
     Worked(
         "tail_force",
         -0.11933,
         "a right angle passed: 0.1 × (e^(0.5 × 1.5708) − 1) = 0.1 × (2.19328 − 1)",
         state={"bend_angle": 1.5708, "lead_position": 0.2},
-        rig=_BENT,
-        parameters=_SIZE,
+        rig={"as_printed": 0.0, "has_bends": 1.0},
+        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
     ),
     Worked(
         "tail_force",
@@ -61,7 +58,7 @@ WORKED = (
         "no bends in the sheet: 0.1 × (e^(5 × 0.2) − 1)",
         state={"bend_angle": 0.0, "lead_position": 0.2},
         rig={"as_printed": 0.0, "has_bends": 0.0},
-        parameters=_SIZE,
+        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
     ),
     Worked(
         "tail_force",
@@ -69,6 +66,6 @@ WORKED = (
         "as printed, two right angles: 2 × 0.1 × 2.19328",
         state={"bend_angle": 0.0, "lead_position": 0.0},
         rig={"as_printed": 1.0, "has_bends": 1.0, "bend_count": 2.0, "bend_total": 3.14159},
-        parameters=_SIZE,
+        parameters={"C": 0.1, "mu_c": 0.5, "k": 5.0},
     ),
 )

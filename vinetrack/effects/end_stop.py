@@ -19,15 +19,21 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
     Parameter("k", "k", "N/m", 20.0, bounds=(0.0, 1e6), plausible=(0.0, 1e4), meaning="stiffness at the tail"),
     Parameter(
-        "y_0", "y₀", "m", 0.1, bounds=(1e-3, 1e2), zero=0.1, plausible=(5e-3, 10.0),
-        tried=tuple(float(y) for y in np.geomspace(0.02, 2.0, 20)), meaning="growth at which it begins",
+        "y_0",
+        "y₀",
+        "m",
+        0.1,
+        bounds=(1e-3, 1e2),
+        zero=0.1,
+        plausible=(5e-3, 10.0),
+        tried=tuple(float(y) for y in np.geomspace(0.02, 2.0, 20)),
+        meaning="growth at which it begins",
     ),
-)  # fmt: skip
+)
 
 
 def tail_force(s, rig, k, y_0):  # noqa: ARG001, D103

@@ -23,7 +23,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 FINITE = True
 EASILY_TAKEN_FOR = ("static_yield", "eversion_damping")
@@ -32,14 +31,27 @@ PARAMETERS = (
         "F_s", "F_s", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="friction at rest beyond sliding"
     ),
     Parameter(
-        "v_s", "v_s", "m/s", 0.5, bounds=(1e-2, 30.0), zero=0.5, plausible=(0.05, 3.0), meaning="speed at which it has "
-        "fallen to 1/e"
+        "v_s",
+        "v_s",
+        "m/s",
+        0.5,
+        bounds=(1e-2, 30.0),
+        zero=0.5,
+        plausible=(0.05, 3.0),
+        meaning="speed at which it has fallen to 1/e",
     ),
     Parameter(
-        "k", "k", "1", 1.0, bounds=(1.0, 2.0), zero=1.0, plausible=(1.0, 2.0), tried=(1.0, 2.0),
+        "k",
+        "k",
+        "1",
+        1.0,
+        bounds=(1.0, 2.0),
+        zero=1.0,
+        plausible=(1.0, 2.0),
+        tried=(1.0, 2.0),
         meaning="1: falls from rest on; 2: flat at first",
     ),
-)  # fmt: skip
+)
 
 
 def tail_force(s, rig, F_s, v_s, k):  # noqa: ARG001, D103

@@ -20,7 +20,6 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 NEEDS = ("thickness_um",)
-ORDER = 3  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("time_base", "area_scale", "pressure_gain", "fold_inertia", "reel_inertia")
 PARAMETERS = (
     Parameter(
@@ -45,7 +44,4 @@ def film_gain(s, rig, eps):  # noqa: ARG001, D103
     return 1.0 + eps
 
 
-WORKED = (
-    Worked("film_gain", 1.05, "1 + 0.05", parameters={"eps": 0.05}),
-    Worked("film_gain", 1.0, "of no size", parameters={"eps": 0.0}),
-)
+WORKED = (Worked("film_gain", 1.05, "1 + 0.05", parameters={"eps": 0.05}),)

@@ -20,7 +20,6 @@ of Physics 74, 490–496.
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("thickness_um",)
 EASILY_TAKEN_FOR = ("air_drag", "eversion_damping")
 PARAMETERS = (
@@ -33,22 +32,13 @@ def tail_force(s, rig, eta):  # noqa: D103
     return eta * 0.5 * mass_loss * s.tail_velocity * s.tail_velocity
 
 
-_RIG = {"travel_ratio": 2.0}
 WORKED = (
     Worked(
         "tail_force",
         0.22620,
         "½ × ¼ × 1200 × π × 24 mm × 200 µm × 10² = 0.125 × 0.0180956 × 100",
         state={"linear_density": 0.0180956, "tail_velocity": 10.0},
-        rig=_RIG,
+        rig={"travel_ratio": 2.0},
         parameters={"eta": 0.5},
-    ),
-    Worked(
-        "tail_force",
-        0.0,
-        "of no size",
-        state={"linear_density": 0.018, "tail_velocity": 10.0},
-        rig=_RIG,
-        parameters={"eta": 0.0},
     ),
 )

@@ -21,7 +21,6 @@ White, Fluid Mechanics.
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("air_drag", "inlet_loss")
 PARAMETERS = (
@@ -47,24 +46,21 @@ def added_mass(s, rig, factor):  # noqa: D103
     return factor * gas_density * s.area * s.lead_position / (rig.travel_ratio * rig.travel_ratio)
 
 
-_STATE = {"pressure": 28e3, "lead_velocity": 3.0, "lead_position": 0.2, "area": 4e-4}
-_RIG = {"ambient_pressure": 101_325.0, "travel_ratio": 2.0}
 WORKED = (
     Worked(
         "tip_force",
         -2.7683e-3,
         "ρ = 129325/(287 × 293) = 1.53792; ½ × 1.53792 × 4e-4 × 9",
-        state=_STATE,
-        rig=_RIG,
+        state={"pressure": 28e3, "lead_velocity": 3.0, "lead_position": 0.2, "area": 4e-4},
+        rig={"ambient_pressure": 101_325.0, "travel_ratio": 2.0},
         parameters={"factor": 1.0},
     ),
     Worked(
         "added_mass",
         3.0758e-5,
         "¼ × 1.53792 × 4e-4 × 0.2",
-        state=_STATE,
-        rig=_RIG,
+        state={"pressure": 28e3, "lead_velocity": 3.0, "lead_position": 0.2, "area": 4e-4},
+        rig={"ambient_pressure": 101_325.0, "travel_ratio": 2.0},
         parameters={"factor": 1.0},
     ),
-    Worked("added_mass", 0.0, "of no size", state=_STATE, rig=_RIG, parameters={"factor": 0.0}),
 )

@@ -19,7 +19,6 @@ Source: loss coefficients K as in Idelchik (1986), Handbook of Hydraulic Resista
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("inlet_mm",)
 EASILY_TAKEN_FOR = ("air_drag", "gas_inertia")
 PARAMETERS = (Parameter("K", "K", "1", 1.5, bounds=(0.0, 50.0), plausible=(0.0, 3.0), meaning="loss coefficient"),)
@@ -31,17 +30,14 @@ def pressure(s, rig, K):  # noqa: D103
     return s.pressure - K * 0.5 * gas_density * inlet_speed * inlet_speed
 
 
-_STATE = {"pressure": 28e3, "lead_velocity": 3.0, "area": 4e-4}
-_RIG = {"inlet_area": 1e-4, "ambient_pressure": 101_325.0}
 WORKED = (
     Worked(
         "pressure",
         27833.9,
         "ρ = 129325/(287 × 293) = 1.53792; 28000 − 1.5 × ½ × 1.53792 × (3 × 4)² = 28000 − 166.1",
-        state=_STATE,
-        rig=_RIG,
+        state={"pressure": 28e3, "lead_velocity": 3.0, "area": 4e-4},
+        rig={"inlet_area": 1e-4, "ambient_pressure": 101_325.0},
         parameters={"K": 1.5},
         rel=1e-5,
     ),
-    Worked("pressure", 28e3, "of no size", state=_STATE, rig=_RIG, parameters={"K": 0.0}),
 )

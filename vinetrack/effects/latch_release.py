@@ -18,9 +18,7 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
-EASILY_TAKEN_FOR = ()
 PARAMETERS = (
     Parameter("F", "F_l", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="grip at release"),
     Parameter(

@@ -19,9 +19,8 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 IN_TRACE = True
-ORDER = 2  # convention: see `Effect`, its place among those of one hook
+ORDER = 2
 EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
     Parameter(
@@ -42,5 +41,4 @@ WORKED = (
         state={"pressure": 28e3, "time": 0.2},
         parameters={"rate": 0.5},
     ),
-    Worked("pressure", 28e3, "of no size", state={"pressure": 28e3, "time": 0.2}, parameters={"rate": 0.0}),
 )

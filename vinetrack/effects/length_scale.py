@@ -16,7 +16,7 @@ Source: the geometry of projection; Hartley & Zisserman (2004), Multiple View Ge
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 5  # convention: see `Effect`, its place among those of one hook
+ORDER = 5
 EASILY_TAKEN_FOR = ("eversion_damping", "air_drag", "time_base")
 PARAMETERS = (
     Parameter(
@@ -42,7 +42,4 @@ def observed_position(s, rig, eps):  # noqa: ARG001, D103
     return s.observed * (1.0 + eps)
 
 
-WORKED = (
-    Worked("observed_position", 0.102, "0.1 m × 1.02", state={"observed": 0.1}, parameters={"eps": 0.02}),
-    Worked("observed_position", 0.1, "of no size", state={"observed": 0.1}, parameters={"eps": 0.0}),
-)
+WORKED = (Worked("observed_position", 0.102, "0.1 m × 1.02", state={"observed": 0.1}, parameters={"eps": 0.02}),)

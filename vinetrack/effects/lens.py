@@ -19,7 +19,7 @@ Source: radial distortion to lowest order, Brown (1971), Close-range camera cali
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4  # convention: see `Effect`, its place among those of one hook
+ORDER = 4
 EASILY_TAKEN_FOR = ("latch_release", "perspective")
 PARAMETERS = (
     Parameter("k3", "k₃", "1/m²", 0.3, bounds=(-50.0, 50.0), plausible=(-1.0, 1.0), meaning="radial distortion"),
@@ -50,5 +50,4 @@ WORKED = (
         state={"observed": 0.2},
         parameters={"k3": 0.3, "y_c": 0.12},
     ),
-    Worked("observed_position", 0.2, "of no size", state={"observed": 0.2}, parameters={"k3": 0.0, "y_c": 0.12}),
 )

@@ -15,7 +15,6 @@ depends on speed in one power law.
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 EASILY_TAKEN_FOR = ("eversion_damping",)
 PARAMETERS = (
     Parameter("b", "b", "N·s/m", 0.05, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="linear damping coefficient"),
@@ -26,7 +25,4 @@ def tip_force(s, rig, b):  # noqa: ARG001, D103
     return -b * s.tail_velocity
 
 
-WORKED = (
-    Worked("tip_force", -0.41, "0.1 N·s/m × 4.1 m/s", state={"tail_velocity": 4.1}, parameters={"b": 0.1}),
-    Worked("tip_force", 0.0, "of no size", state={"tail_velocity": 4.1}, parameters={"b": 0.0}),
-)
+WORKED = (Worked("tip_force", -0.41, "0.1 N·s/m × 4.1 m/s", state={"tail_velocity": 4.1}, parameters={"b": 0.1}),)

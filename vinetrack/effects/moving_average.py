@@ -20,7 +20,7 @@ chapter 3.
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 5  # convention: see `Effect`, its place among those of one hook
+ORDER = 5
 EASILY_TAKEN_FOR = ("supply_rise", "latch_release")
 PARAMETERS = (
     Parameter(

@@ -19,7 +19,6 @@ Hydraulic Resistance.
 from vinetrack.core.units import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("payload_g", "length_mm")
 EASILY_TAKEN_FOR = ("air_drag",)
 PARAMETERS = (
@@ -43,13 +42,12 @@ def tail_force(s, rig, drag_area):  # noqa: D103
     return -0.5 * gas_density * drag_area * through_gas * through_gas
 
 
-_STATE = {"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0}
 WORKED = (
     Worked(
         "tail_force",
         -3.4603e-3,
         "ρ = 129325/(287 × 293) = 1.53792; ½ × 1.53792 × 5e-4 × 3²",
-        state=_STATE,
+        state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
         rig={"payload_mass": 35.6e-3, "ambient_pressure": 101_325.0},
         parameters={"drag_area": 5e-4},
     ),
@@ -57,7 +55,7 @@ WORKED = (
         "tail_force",
         0.0,
         "no payload",
-        state=_STATE,
+        state={"pressure": 28e3, "lead_velocity": 3.0, "tail_velocity": 6.0},
         rig={"payload_mass": 0.0, "ambient_pressure": 101_325.0},
         parameters={"drag_area": 5e-4},
     ),

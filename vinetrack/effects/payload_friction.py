@@ -19,7 +19,6 @@ Source: Coulomb's law of friction.
 from vinetrack.core.units import GRAVITY_M_S2
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("payload_g",)
 EASILY_TAKEN_FOR = ("growth_angle",)
 PARAMETERS = (

@@ -47,20 +47,36 @@ def tail_force(s, rig, delta):  # noqa: D103
     return max(delta, -rig.payload_mass) * GRAVITY_M_S2 * rig.cos_angle + 0.0 * s.lead_position
 
 
-_STATE = {"lead_position": 0.1}
 WORKED = (
     Worked(
-        "added_mass", 0.006, "a mount of 6 g", state=_STATE, rig={"payload_mass": 0.02}, parameters={"delta": 0.006}
+        "added_mass",
+        0.006,
+        "a mount of 6 g",
+        state={"lead_position": 0.1},
+        rig={"payload_mass": 0.02},
+        parameters={"delta": 0.006},
     ),
     Worked(
-        "added_mass", -0.02, "no less than none", state=_STATE, rig={"payload_mass": 0.02}, parameters={"delta": -0.1}
+        "added_mass",
+        -0.02,
+        "no less than none",
+        state={"lead_position": 0.1},
+        rig={"payload_mass": 0.02},
+        parameters={"delta": -0.1},
     ),
-    Worked("added_mass", 0.0, "no payload", state=_STATE, rig={"payload_mass": 0.0}, parameters={"delta": 0.006}),
+    Worked(
+        "added_mass",
+        0.0,
+        "no payload",
+        state={"lead_position": 0.1},
+        rig={"payload_mass": 0.0},
+        parameters={"delta": 0.006},
+    ),
     Worked(
         "tail_force",
         0.05886,
         "6 g × 9.81, straight down",
-        state=_STATE,
+        state={"lead_position": 0.1},
         rig={"payload_mass": 0.02, "cos_angle": 1.0},
         parameters={"delta": 0.006},
     ),
@@ -68,7 +84,7 @@ WORKED = (
         "tail_force",
         0.0,
         "no payload",
-        state=_STATE,
+        state={"lead_position": 0.1},
         rig={"payload_mass": 0.0, "cos_angle": 1.0},
         parameters={"delta": 0.006},
     ),

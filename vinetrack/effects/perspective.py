@@ -18,7 +18,7 @@ Hartley & Zisserman (2004), Multiple View Geometry in Computer Vision.
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4  # convention: see `Effect`, its place among those of one hook
+ORDER = 4
 EASILY_TAKEN_FOR = ("tail_friction", "reservoir_depletion")
 PARAMETERS = (
     Parameter("k", "k", "1/m", 0.05, bounds=(-3.0, 3.0), plausible=(-0.3, 0.3), meaning="change of scale along y"),
@@ -29,7 +29,4 @@ def observed_position(s, rig, k):  # noqa: ARG001, D103
     return s.observed * (1.0 + k * s.observed)
 
 
-WORKED = (
-    Worked("observed_position", 0.202, "0.2 + 0.05 × 0.2²", state={"observed": 0.2}, parameters={"k": 0.05}),
-    Worked("observed_position", 0.2, "of no size", state={"observed": 0.2}, parameters={"k": 0.0}),
-)
+WORKED = (Worked("observed_position", 0.202, "0.2 + 0.05 × 0.2²", state={"observed": 0.2}, parameters={"k": 0.05}),)

@@ -18,7 +18,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 EASILY_TAKEN_FOR = ("wall_stretch",)
 PARAMETERS = (
     Parameter(
@@ -45,5 +44,4 @@ WORKED = (
         state={"pressure": 28e3, "damping_gain": 1.0},
         parameters={"beta": 3e-6},
     ),
-    Worked("damping_gain", 1.0, "of no size", state={"pressure": 28e3, "damping_gain": 1.0}, parameters={"beta": 0.0}),
 )

@@ -15,7 +15,7 @@ Source: the linear error of a gauge; Eq. (2) of Alvarez et al. (2025) depends on
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4  # convention: see `Effect`, its place among those of one hook
+ORDER = 4
 EASILY_TAKEN_FOR = ("area_scale", "eversion_damping", "time_base", "length_scale")
 PARAMETERS = (
     Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of P"),
@@ -33,5 +33,4 @@ def yield_gauge(s, rig, eps):  # noqa: ARG001, D103
 WORKED = (
     Worked("gauge", 28.56e3, "28 kPa × 1.02", state={"pressure": 28e3}, parameters={"eps": 0.02}),
     Worked("yield_gauge", 3.06e3, "3 kPa × 1.02", state={"yield_pressure": 3e3}, parameters={"eps": 0.02}),
-    Worked("gauge", 28e3, "of no size", state={"pressure": 28e3}, parameters={"eps": 0.0}),
 )

@@ -17,7 +17,7 @@ Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) depends on P
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 5  # convention: see `Effect`, its place among those of one hook
+ORDER = 5
 EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
     Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="true minus read pressure"),
@@ -28,7 +28,4 @@ def gauge(s, rig, delta):  # noqa: ARG001, D103
     return s.pressure + delta
 
 
-WORKED = (
-    Worked("gauge", 28.5e3, "28 kPa + 0.5 kPa", state={"pressure": 28e3}, parameters={"delta": 500.0}),
-    Worked("gauge", 28e3, "of no size", state={"pressure": 28e3}, parameters={"delta": 0.0}),
-)
+WORKED = (Worked("gauge", 28.5e3, "28 kPa + 0.5 kPa", state={"pressure": 28e3}, parameters={"delta": 500.0}),)

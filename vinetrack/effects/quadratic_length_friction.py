@@ -16,7 +16,6 @@ Source: the capstan equation to second order for a path of even curvature, besid
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("capstan_friction", "tail_friction")
 PARAMETERS = (
@@ -30,7 +29,4 @@ def tail_force(s, rig, q):  # noqa: ARG001, D103
     return -q * s.lead_position * s.lead_position
 
 
-WORKED = (
-    Worked("tail_force", -0.08, "2 N/m² × (0.2 m)²", state={"lead_position": 0.2}, parameters={"q": 2.0}),
-    Worked("tail_force", 0.0, "of no size", state={"lead_position": 0.2}, parameters={"q": 0.0}),
-)
+WORKED = (Worked("tail_force", -0.08, "2 N/m² × (0.2 m)²", state={"lead_position": 0.2}, parameters={"q": 2.0}),)

@@ -19,7 +19,6 @@ the tail on a reel in the base.
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("gas_inertia", "latch_release")
 PARAMETERS = (
@@ -41,5 +40,4 @@ WORKED = (
         state={"lead_position": 0.1},
         parameters={"M": 3.2e-5 / 0.04**2},
     ),
-    Worked("added_mass", 0.0, "of no size", state={"lead_position": 0.1}, parameters={"M": 0.0}),
 )

@@ -20,7 +20,7 @@ rolling-shutter cameras, arXiv cs/0503076.
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4  # convention: see `Effect`, its place among those of one hook
+ORDER = 4
 EASILY_TAKEN_FOR = ("time_base", "length_scale")
 PARAMETERS = (
     Parameter("delay", "s", "s/m", 2e-3, bounds=(-0.1, 0.1), plausible=(-0.01, 0.01), meaning="delay along the growth"),

@@ -18,7 +18,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("yield_pressure_kPa",)
 EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (

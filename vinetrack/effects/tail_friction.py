@@ -22,7 +22,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
