@@ -9,7 +9,7 @@ a reservoir whose pressure changes by more than 5 %, compression in the tail.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,22 +60,20 @@ def evaluate(
     """
     check_needs(model, trial)
     rig = trial_inputs(trial)
-    hooks = _HookCaller(model, trial)
-    motion = [np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s)]
-    state = _initial_state(trial, rig, *motion)
-    hooks.measured = measured_Pa is not None
-    film = np.prod([np.ones_like(motion[0]), *hooks.each("film_gain", state, rig).values()], axis=0)
+    hooks = _HookCaller(model, trial, measured=measured_Pa is not None)
+    state = _initial_state(
+        trial, rig, *(np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s))
+    )
+    ones, nothing = np.ones_like(state.time), np.zeros_like(state.time)
+    film = np.prod([ones, *hooks.each("film_gain", state, rig).values()], axis=0)
     film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
     moving_mass = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     state = state._replace(moving_mass=moving_mass, linear_density=rig.linear_density * film)
     state = _with_pressure(hooks, state, rig, measured_Pa)
-    state = state._replace(damping_gain=hooks("damping_gain", state, rig, state.damping_gain, "damping_gain"))
+    state = hooks.changed("damping_gain", state, rig, "damping_gain")
     tip, tail = hooks.each("tip_force", state, rig), hooks.each("tail_force", state, rig)
-    tip_sum = sum(tip.values(), np.zeros_like(motion[0]))
-    added = sum(hooks.each("added_mass", state, rig).values(), np.zeros_like(motion[0]))
-    inertia = inertia_kg(film_mass, added, rig)
-    tail_sum = sum(tail.values(), np.zeros_like(motion[0]))
-    tension = tip_sum / rig.travel_ratio
+    tension = sum(tip.values(), nothing) / rig.travel_ratio
+    inertia = inertia_kg(film_mass, sum(hooks.each("added_mass", state, rig).values(), nothing), rig)
     return Terms(
         pressure_Pa=np.asarray(state.pressure),
         area_m2=np.asarray(state.area),
@@ -83,8 +81,8 @@ def evaluate(
         tip_N=tip,
         tail_N=tail,
         tension_N=tension,
-        acceleration_m_s2=(tension + tail_sum) / inertia,
-        inertia_kg=np.asarray(inertia),
+        acceleration_m_s2=(tension + sum(tail.values(), nothing)) / inertia,
+        inertia_kg=inertia,
         state=state,
     )
 
@@ -101,42 +99,32 @@ def inertia_kg(film_mass: Floats, added_mass: Floats, rig: TrialInputs) -> Float
 class _HookCaller:
     """Calls the hooks of a model's effects with the parameters of one trial's vine."""
 
-    def __init__(self, model: Model, trial: Trial) -> None:
+    def __init__(self, model: Model, trial: Trial, measured: bool) -> None:
         theta = model.parameters_of(trial)
-        values = iter(theta.tolist())
-        self.arguments = {effect.name: [next(values) for _ in effect.parameters] for effect in model.effects}
-        acting = effects_on(model, theta[None, :])[0]
-        effects = [effect for effect, acts in zip(model.effects, acting, strict=True) if acts]
-        self.effects = sorted(effects, key=lambda effect: effect.order)
-        self.measured = False
-
-    def _functions_of(self, hook: str) -> list[tuple[Effect, Callable[..., Any]]]:
-        return [
-            (effect, effect.functions[hook])
-            for effect in self.effects
-            if hook in effect.functions and not (effect.in_trace and self.measured)
-        ]
+        self.arguments = {effect.name: theta[place].tolist() for effect, place in zip(model, model.places, strict=True)}
+        acting = [e for e, acts in zip(model, effects_on(model, theta[None, :])[0], strict=True) if acts]
+        # A measured pressure includes everything that happens in the chamber.
+        self.effects = sorted((e for e in acting if not (e.in_trace and measured)), key=lambda effect: effect.order)
 
     def has(self, hook: str) -> bool:
-        return bool(self._functions_of(hook))
+        return any(hook in effect.functions for effect in self.effects)
 
-    def __call__(self, hook: str, state: State, rig: TrialInputs, value: Floats | float, name: str) -> Any:
-        """The value after all effects in turn; each gets the previous value in the field `name` of the state."""
-        for effect, function in self._functions_of(hook):
-            value = function(state, rig, *self.arguments[effect.name])
-            if name:
-                changed: dict[str, Any] = {name: value}
-                state = state._replace(**changed)
-        return value
+    def changed(self, hook: str, state: State, rig: TrialInputs, name: str) -> State:
+        """The state after all effects in turn, each of which changes the field `name`."""
+        for effect in self.effects:
+            if hook in effect.functions:
+                value: dict[str, Any] = {name: effect.functions[hook](state, rig, *self.arguments[effect.name])}
+                state = state._replace(**value)
+        return state
 
     def each(self, hook: str, state: State, rig: TrialInputs) -> dict[str, Floats]:
         """The value of each effect by itself."""
-        return {
-            effect.name: np.broadcast_to(
-                np.asarray(function(state, rig, *self.arguments[effect.name]), dtype=float), np.shape(state.time)
-            )
-            for effect, function in self._functions_of(hook)
+        found = {
+            effect.name: np.asarray(effect.functions[hook](state, rig, *self.arguments[effect.name]), dtype=float)
+            for effect in self.effects
+            if hook in effect.functions
         }
+        return {name: np.broadcast_to(value, np.shape(state.time)) for name, value in found.items()}
 
 
 def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Floats, velocity: Floats) -> State:
@@ -166,13 +154,12 @@ def _initial_state(trial: Trial, rig: TrialInputs, time: Floats, position: Float
 
 def _with_pressure(hooks: _HookCaller, state: State, rig: TrialInputs, measured_Pa: Floats | None) -> State:
     """Gauge, chamber, area and losses, in the order of the physics."""
-    set_pressure = hooks("gauge", state, rig, state.pressure, "pressure")
-    state = state._replace(set_pressure=set_pressure, pressure=set_pressure)
-    state = state._replace(yield_pressure=hooks("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
+    state = hooks.changed("gauge", state, rig, "pressure")
+    state = state._replace(set_pressure=state.pressure)
+    state = hooks.changed("yield_gauge", state, rig, "yield_pressure")
     if measured_Pa is not None:
         measured: Any = np.asarray(measured_Pa, dtype=float)
-        state = state._replace(pressure=measured)
-        state = state._replace(pressure=hooks("gauge", state, rig, state.pressure, "pressure"))
+        state = hooks.changed("gauge", state._replace(pressure=measured), rig, "pressure")
     elif hooks.has("chamber_rate"):
         state = state._replace(pressure=_chamber_pressure(hooks, state, rig))
     return _with_consistent_area(hooks, state, rig)
@@ -183,11 +170,10 @@ def _with_consistent_area(hooks: _HookCaller, state: State, rig: TrialInputs) ->
     start, plain = state.pressure, state.area
     area = plain
     for turn in range(30):
-        previous_area, area = area, hooks("area", state._replace(area=plain), rig, plain, "area")
+        previous_area, area = area, hooks.changed("area", state._replace(area=plain), rig, "area").area
         if turn > 0 and np.all(np.abs(area - previous_area) <= 1e-10 * area):
             break
-        state = state._replace(area=area, pressure=start)
-        state = state._replace(pressure=hooks("pressure", state, rig, start, "pressure"))
+        state = hooks.changed("pressure", state._replace(area=area, pressure=start), rig, "pressure")
     return state._replace(area=area)
 
 
@@ -222,27 +208,14 @@ def pressure_along(
     return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa
 
 
-NEGLIGIBLE_BEND_RAD = math.radians(30)
-DRAG_SHARE, PRESSURE_SHARE, NEGLIGIBLE_LENGTH_M = 0.05, 0.05, 0.30  # Published: the rules by which Alvarez et al.
-
-# The rules that a trial may violate, see `RuleViolation`
+# The rules that a trial may violate (`RuleViolation`), with the limits that Alvarez et al. (2025) state
 DRAG_RULE, LENGTH_RULE, BEND_RULE, RESERVOIR_RULE, TENSION_RULE = "drag", "length", "bends", "reservoir", "tension"
+_LARGEST_SHARE, _LENGTH_M, _BEND_DEG = 0.05, 0.30, 30.0  # Of drag and of lost pressure; of a vine; of its bends
 
-TENSION = "tail_tension"
 COLUMNS = (
-    "trial",
-    "condition",
-    "term",
-    "size",
-    "force_N",
-    "share_of_drive",
-    "shift_m",
-    "time_s",
-    "lead_position_m",
-    "y_over_L",
-    "slack_from_s",
-    "note",
-)
+    "trial", "condition", "term", "size", "force_N", "share_of_drive", "shift_m", "time_s", "lead_position_m",
+    "y_over_L", "slack_from_s", "note",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -265,6 +238,27 @@ class AuditedMotion:
             self.trial, self.time_s[every], self.lead_position_m[every], self.lead_velocity_m_s[every], pressure
         )
 
+    def terms(self, model: Model) -> Terms:
+        """Everything that a model computes along it."""
+        motion = self.time_s, self.lead_position_m, self.lead_velocity_m_s
+        return evaluate(model, self.trial, *motion, measured_Pa=self.pressure_Pa)
+
+    def drive_N(self) -> Floats:
+        """The drive on the tail ½PA (PA/r), shape (n,), with the set pressure unless it was measured."""
+        rig = trial_inputs(self.trial)
+        pressure = rig.set_pressure if self.pressure_Pa is None else self.pressure_Pa
+        return np.broadcast_to(np.asarray(pressure * rig.area / rig.travel_ratio, dtype=float), self.time_s.shape)
+
+    def row(self, term: str, i: int | None = None, **values: Any) -> dict[str, Any]:
+        """A row of the table about one term, at the point i of the motion."""
+        row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
+        row |= {"trial": self.trial.name, "condition": self.trial.condition, "term": term, "note": ""}
+        if i is not None:
+            y, length = float(self.lead_position_m[i]), self.trial.length_m
+            share = y / length if math.isfinite(length) and length > 0 else math.nan
+            row |= {"time_s": float(self.time_s[i]), "lead_position_m": y, "y_over_L": share}
+        return row | values
+
 
 @dataclass(frozen=True)
 class RuleViolation:
@@ -273,11 +267,6 @@ class RuleViolation:
     trial: str
     rule: str
     words: str
-
-    @property
-    def sentence(self) -> str:
-        """The violation as a sentence that names the trial."""
-        return f"Trial {self.trial}: {self.words}."
 
 
 @dataclass(frozen=True)
@@ -292,7 +281,7 @@ class Audit:
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each violation."""
-        return tuple(violation.sentence for violation in self.violations)
+        return tuple(f"Trial {violation.trial}: {violation.words}." for violation in self.violations)
 
 
 def measured_motion(
@@ -314,27 +303,14 @@ def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effe
     rows: list[dict[str, Any]] = []
     violations: list[RuleViolation] = []
     for motion in (motion.thinned() for motion in motions):
-        terms = _terms_along(model, motion)
+        terms = motion.terms(model)
         neglected = [e for e in candidates if e.kind != "measurement" and not _in_model(e, model, motion)]
         left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
         rows += [*left_out, tension]
-        violations += [
-            RuleViolation(motion.trial.name, rule, words)
-            for rule, words in _violated_rules(model, motion, left_out, tension)
-        ]
+        violated = _violated_rules(model, motion, {row["term"]: row for row in left_out}, tension)
+        violations += [RuleViolation(motion.trial.name, rule, words) for rule, words in violated]
     return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(violations))
-
-
-def _terms_along(model: Model, motion: AuditedMotion) -> Terms:
-    return evaluate(
-        model,
-        motion.trial,
-        motion.time_s,
-        motion.lead_position_m,
-        motion.lead_velocity_m_s,
-        measured_Pa=motion.pressure_Pa,
-    )
 
 
 def _in_model(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
@@ -344,44 +320,24 @@ def _in_model(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
     return any(effect.name in other.replaces for other in model)
 
 
-def _drive_N(motion: AuditedMotion) -> Floats:
-    """The drive on the tail ½PA (PA/r), shape (n,), with the set pressure unless it was measured."""
-    rig = trial_inputs(motion.trial)
-    pressure = rig.set_pressure if motion.pressure_Pa is None else motion.pressure_Pa
-    return np.broadcast_to(np.asarray(pressure * rig.area / rig.travel_ratio, dtype=float), motion.time_s.shape)
-
-
-def _place_of(motion: AuditedMotion, i: int) -> dict[str, float]:
-    y = float(motion.lead_position_m[i])
-    length = motion.trial.length_m
-    share = y / length if math.isfinite(length) and length > 0 else math.nan
-    return {"time_s": float(motion.time_s[i]), "lead_position_m": y, "y_over_L": share}
-
-
-def _row(motion: AuditedMotion, term: str) -> dict[str, Any]:
-    blank: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
-    return {**blank, "trial": motion.trial.name, "condition": motion.trial.condition, "term": term, "note": ""}
-
-
 def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without: Terms) -> dict[str, Any]:
     """The change by one effect: the sum of forces on the tail, minus the inertia of mass that it adds."""
-    row = _row(motion, effect.name)
-    row["size"] = ", ".join(
-        f"{p.symbol} = {p.default:g}{'' if p.unit == '1' else ' ' + p.unit}" for p in effect.parameters
-    )
+    size = ", ".join(parameter.words(parameter.default) for parameter in effect.parameters)
     try:
-        terms = _terms_along(model + effect, motion)
+        terms = motion.terms(model + effect)
     except EffectError as error:
-        return {**row, "note": str(error)}
+        return motion.row(effect.name, size=size, note=str(error))
     if not set(effect.functions) - {"observed_position", "row_delay", "averaged_over"}:
-        return {**row, **_largest_shift(effect, motion, without)}
+        shift = _shift_m(effect, motion, without)
+        i = int(np.argmax(np.abs(shift)))
+        return motion.row(effect.name, i, size=size, shift_m=float(shift[i]))
     if not set(effect.functions) - {"rest_force"}:
-        return {**row, "note": "acts on a vine at rest only"}
+        return motion.row(effect.name, size=size, note="acts on a vine at rest only")
     force = _total_N(terms) - _total_N(without) - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
-    drive = _drive_N(motion)
+    drive = motion.drive_N()
     share = np.divide(force, drive, out=np.zeros_like(force), where=drive > 0)
     i = int(np.argmax(np.abs(share if np.any(drive > 0) else force)))
-    return {**row, "force_N": float(force[i]), "share_of_drive": float(share[i]), **_place_of(motion, i)}
+    return motion.row(effect.name, i, size=size, force_N=float(force[i]), share_of_drive=float(share[i]))
 
 
 def _total_N(terms: Terms) -> Floats:
@@ -389,21 +345,18 @@ def _total_N(terms: Terms) -> Floats:
     return terms.tension_N + sum(terms.tail_N.values(), np.zeros_like(terms.tension_N))
 
 
-def _largest_shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, float]:
-    """Largest displacement by an effect that only changes the reported position, relative to release."""
+def _shift_m(effect: Effect, motion: AuditedMotion, terms: Terms) -> Floats:
+    """Displacement by an effect that only changes the reported position, relative to release. Shape (n,)."""
     rig = trial_inputs(motion.trial)
     state = terms.state._replace(tail_tension=np.maximum(terms.tension_N, 0.0))  # type: ignore[arg-type]
-    sizes = [parameter.default for parameter in effect.parameters]
-    if "row_delay" in effect.functions:
-        late_s = effect.functions["row_delay"](state, rig, *sizes) * motion.lead_position_m
-        shift = np.interp(motion.time_s + late_s, motion.time_s, motion.lead_position_m) - motion.lead_position_m
-    elif "averaged_over" in effect.functions:
-        shift = _time_average(motion, math.sqrt(effect.functions["averaged_over"](state, rig, *sizes)))
-        shift -= motion.lead_position_m
-    else:
-        shift = np.asarray(effect.functions["observed_position"](state, rig, *sizes), float) - motion.lead_position_m
-    i = int(np.argmax(np.abs(shift)))
-    return {"shift_m": float(shift[i]), **_place_of(motion, i)}
+    hook = next(name for name in ("row_delay", "averaged_over", "observed_position") if name in effect.functions)
+    value = effect.functions[hook](state, rig, *(parameter.default for parameter in effect.parameters))
+    seen = value
+    if hook == "row_delay":
+        seen = np.interp(motion.time_s + value * motion.lead_position_m, motion.time_s, motion.lead_position_m)
+    elif hook == "averaged_over":
+        seen = _time_average(motion, math.sqrt(value))
+    return np.asarray(seen, dtype=float) - motion.lead_position_m
 
 
 def _time_average(motion: AuditedMotion, over_s: float) -> Floats:
@@ -419,44 +372,39 @@ def _time_average(motion: AuditedMotion, over_s: float) -> Floats:
 def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:
     tension = terms.tension_N
     i = int(np.argmin(tension))
-    drive = float(_drive_N(motion)[i])
+    drive = float(motion.drive_N()[i])
+    share = float(tension[i]) / drive if drive > 0 else math.nan
     negative = np.flatnonzero(tension < 0)
-    return {
-        **_row(motion, TENSION),
-        "force_N": float(tension[i]),
-        "share_of_drive": float(tension[i]) / drive if drive > 0 else math.nan,
-        **_place_of(motion, i),
-        "slack_from_s": float(motion.time_s[negative[0]]) if negative.size else math.nan,
-    }
+    slack_from_s = float(motion.time_s[negative[0]]) if negative.size else math.nan
+    return motion.row("tail_tension", i, force_N=float(tension[i]), share_of_drive=share, slack_from_s=slack_from_s)
 
 
 def _violated_rules(
-    model: Model, motion: AuditedMotion, rows: Sequence[dict[str, Any]], tension: dict[str, Any]
+    model: Model, motion: AuditedMotion, neglected: Mapping[str, dict[str, Any]], tension: dict[str, Any]
 ) -> Iterator[tuple[str, str]]:
     """Each rule that the trial violates, and how, in words."""
     trial = motion.trial
-    neglected = {row["term"]: row for row in rows}
     drag = neglected.get("air_drag")
-    if drag and abs(drag["share_of_drive"]) > DRAG_SHARE:
+    if drag and abs(drag["share_of_drive"]) > _LARGEST_SHARE:
         yield (
             DRAG_RULE,
             f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
-            f"({drag['size']}), above {DRAG_SHARE:.0%}; add air_drag to the model",
+            f"({drag['size']}), above {_LARGEST_SHARE:.0%}; add air_drag to the model",
         )
-    if "tail_friction" in neglected and trial.length_m >= NEGLIGIBLE_LENGTH_M:
+    if "tail_friction" in neglected and trial.length_m >= _LENGTH_M:
         yield (
             LENGTH_RULE,
             f"friction along the length is neglected in a vine of {100 * trial.length_m:.0f} cm, which is safe below "
-            f"{100 * NEGLIGIBLE_LENGTH_M:.0f} cm; add tail_friction to the model",
+            f"{100 * _LENGTH_M:.0f} cm; add tail_friction to the model",
         )
-    bent = sum(bend.arc_m / bend.radius_m for bend in trial.bends)
-    if "capstan_friction" in neglected and bent >= NEGLIGIBLE_BEND_RAD:
+    bent_deg = math.degrees(sum(bend.arc_m / bend.radius_m for bend in trial.bends))
+    if "capstan_friction" in neglected and bent_deg >= _BEND_DEG:
         yield (
             BEND_RULE,
-            f"the path bends by {math.degrees(bent):.0f}° in all, which is safe to neglect below "
-            f"{math.degrees(NEGLIGIBLE_BEND_RAD):.0f}°; add capstan_friction to the model",
+            f"the path bends by {bent_deg:.0f}° in all, which is safe to neglect below "
+            f"{_BEND_DEG:.0f}°; add capstan_friction to the model",
         )
-    yield from _reservoir_rule(model, motion, neglected)
+    yield from _reservoir_rule(model, motion, neglected.get("reservoir_depletion"))
     if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
         yield (
             TENSION_RULE,
@@ -465,23 +413,20 @@ def _violated_rules(
         )
 
 
-def _reservoir_rule(
-    model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]
-) -> Iterator[tuple[str, str]]:
+def _reservoir_rule(model: Model, motion: AuditedMotion, row: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     """The reservoir's rule, by the gas law in absolute pressure, for slow and for fast expansion."""
-    row = neglected.get("reservoir_depletion")
     pressure = motion.trial.pressure_Pa
     if row is None or row["note"] or not pressure > 0:
         return
-    effect = catalogue()["reservoir_depletion"]
-    shares = []
-    for gamma in (1.0, 1.4):
-        lowest_Pa = _terms_along((model + effect).with_values({"reservoir_depletion.gamma": gamma}), motion).pressure_Pa
-        shares.append(1 - float(np.min(lowest_Pa)) / pressure)
-    if shares[1] > PRESSURE_SHARE:
+    depleted = model + catalogue()["reservoir_depletion"]
+    pressures = (
+        motion.terms(depleted.with_values({"reservoir_depletion.gamma": gamma})).pressure_Pa for gamma in (1.0, 1.4)
+    )
+    shares = [1 - float(np.min(along_Pa)) / pressure for along_Pa in pressures]
+    if shares[1] > _LARGEST_SHARE:
         yield (
             RESERVOIR_RULE,
             f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
-            f"(fast) of its gauge pressure while the vine grows, above {PRESSURE_SHARE:.0%}, unless a supply refills "
+            f"(fast) of its gauge pressure while the vine grows, above {_LARGEST_SHARE:.0%}, unless a supply refills "
             "it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
         )

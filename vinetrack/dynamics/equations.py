@@ -22,12 +22,12 @@ from numba.extending import infer_getattr, models, register_model, typeof_impl
 
 from vinetrack.core.records import Floats
 
-_UNWRAPPED: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, **_UNWRAPPED}
+# Options with which every function of the integrator is compiled (measured)
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_FLAGS |= {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
 
 compiled: Any = njit(**_FLAGS, forceinline=False)
 inlined: Any = njit(**_FLAGS, forceinline=True)
-# Options with which every function of the integrator is compiled (measured)
 merged: Any = njit(**_FLAGS, inline="always")
 
 
@@ -182,27 +182,23 @@ def angle_passed(y, trial):
 # method, table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error
 # estimate).
 
-SQRT6 = 6.0**0.5  # Derived: √6, which appears in the nodes
-
-C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
-A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
-A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
-A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9  # Nodes c and matrix A of the method; the third node is 1
-
-S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))  # Derivative at the end of a step of the cubic through (0, 0), (C1, z1),
-S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
-S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)  # Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2),
-
-MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)  # source: below
-# The real eigenvalue of A⁻¹ and the weights of the estimate of the local error
-E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
-
-MOST_NEWTON_ITERATIONS = 9  # Newton iterations before a step is given up; chosen near the 7 of RADAU5
-
-NEWTON_TOLERANCE = 1e-2  # Change of the speeds at which the iterations stop, relative to the tolerance of a step
-
-# Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen
-FAST_CONTRACTION = 0.1
+# Nodes c (the third is 1) and matrix A of the method
+_ROOT = 6.0**0.5
+C = ((4 - _ROOT) / 10, (4 + _ROOT) / 10)
+A = (
+    ((88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225),
+    ((296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225),
+    ((16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9),
+)
+# Slope at the end of a step of the cubic through (0, 0), (c1, z1), (c2, z2), (1, z3)
+S = (
+    (1 - C[1]) / (C[0] * (C[0] - C[1]) * (C[0] - 1)),
+    (1 - C[0]) / (C[1] * (C[1] - C[0]) * (C[1] - 1)),
+    1 + 1 / (1 - C[0]) + 1 / (1 - C[1]),
+)
+# Weights of the estimate of the local error, and the real eigenvalue of A⁻¹
+E = ((-13 - 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3)
+MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
 
 
 class Stages(NamedTuple):
@@ -248,22 +244,22 @@ def starting_values(point, h, previous):
     if previous.h > 0:
         r = h / previous.h
         p1, p2, p3 = (
-            _collocation_polynomial(1 + C1 * r, previous),
-            _collocation_polynomial(1 + C2 * r, previous),
+            _collocation_polynomial(1 + C[0] * r, previous),
+            _collocation_polynomial(1 + C[1] * r, previous),
             _collocation_polynomial(1 + r, previous),
         )
         w1, w2, w3 = p1 - previous.z3, p2 - previous.z3, p3 - previous.z3
     else:
-        w1, w2, w3 = C1 * h * point.acceleration, C2 * h * point.acceleration, h * point.acceleration
+        w1, w2, w3 = C[0] * h * point.acceleration, C[1] * h * point.acceleration, h * point.acceleration
     return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
 
 
 @inlined
 def _collocation_polynomial(s, stages):
-    """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
-    l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
-    l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
-    l3 = s * (s - C1) * (s - C2) / ((1 - C1) * (1 - C2))
+    """The cubic through (0, 0), (C[0], z1), (C[1], z2), (1, z3), at s."""
+    l1 = s * (s - C[1]) * (s - 1) / (C[0] * (C[0] - C[1]) * (C[0] - 1))
+    l2 = s * (s - C[0]) * (s - 1) / (C[1] * (C[1] - C[0]) * (C[1] - 1))
+    l3 = s * (s - C[0]) * (s - C[1]) / ((1 - C[0]) * (1 - C[1]))
     return l1 * stages.z1 + l2 * stages.z2 + l3 * stages.z3
 
 
@@ -271,12 +267,12 @@ def _collocation_polynomial(s, stages):
 def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
     """Newton step of the stage speeds: (I − h A J) d = h A f − z, J the derivatives ∂a/∂v."""
     return _solve3(
-        1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
-        -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
-        -h * A31 * j1, -h * A32 * j2, 1 - h * A33 * j3,
-        h * (A11 * f1 + A12 * f2 + A13 * f3) - z1,
-        h * (A21 * f1 + A22 * f2 + A23 * f3) - z2,
-        h * (A31 * f1 + A32 * f2 + A33 * f3) - z3,
+        1 - h * A[0][0] * j1, -h * A[0][1] * j2, -h * A[0][2] * j3,
+        -h * A[1][0] * j1, 1 - h * A[1][1] * j2, -h * A[1][2] * j3,
+        -h * A[2][0] * j1, -h * A[2][1] * j2, 1 - h * A[2][2] * j3,
+        h * (A[0][0] * f1 + A[0][1] * f2 + A[0][2] * f3) - z1,
+        h * (A[1][0] * f1 + A[1][1] * f2 + A[1][2] * f3) - z2,
+        h * (A[2][0] * f1 + A[2][1] * f2 + A[2][2] * f3) - z3,
     )  # fmt: skip
 
 
@@ -284,12 +280,12 @@ def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
 def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
     """Newton step of the chamber pressures at the stages; jc is h times the derivative of the rate."""
     return _solve3(
-        1 - A11 * jc, -A12 * jc, -A13 * jc,
-        -A21 * jc, 1 - A22 * jc, -A23 * jc,
-        -A31 * jc, -A32 * jc, 1 - A33 * jc,
-        h * (A11 * g1 + A12 * g2 + A13 * g3) - (q1 - chamber),
-        h * (A21 * g1 + A22 * g2 + A23 * g3) - (q2 - chamber),
-        h * (A31 * g1 + A32 * g2 + A33 * g3) - (q3 - chamber),
+        1 - A[0][0] * jc, -A[0][1] * jc, -A[0][2] * jc,
+        -A[1][0] * jc, 1 - A[1][1] * jc, -A[1][2] * jc,
+        -A[2][0] * jc, -A[2][1] * jc, 1 - A[2][2] * jc,
+        h * (A[0][0] * g1 + A[0][1] * g2 + A[0][2] * g3) - (q1 - chamber),
+        h * (A[1][0] * g1 + A[1][1] * g2 + A[1][2] * g3) - (q2 - chamber),
+        h * (A[2][0] * g1 + A[2][1] * g2 + A[2][2] * g3) - (q3 - chamber),
     )  # fmt: skip
 
 
@@ -300,19 +296,20 @@ def radau_step(equations, trial, point, stages, scale, rtol):
     h, z1, z2, z3 = stages
     j1 = j2 = j3 = 0.0
     g1 = g2 = g3 = 0.0
-    tolerance = NEWTON_TOLERANCE * rtol * max(scale, abs(v))
+    tolerance = 1e-2 * rtol * max(scale, abs(v))
+    fast = 0.1  # contraction of the changes below which the Jacobian is kept
     previous_size = 1e300
     q1 = q2 = q3 = chamber
     jc = 0.0
     chamber_active = False
     jacobian_current = False
     converged = False
-    for iteration in range(MOST_NEWTON_ITERATIONS):
+    for iteration in range(9):
         v1, v2, v3 = v + z1, v + z2, v + z3
-        x1 = x + h * (C1 * v + A11 * z1 + A12 * z2 + A13 * z3)
-        x2 = x + h * (C2 * v + A21 * z1 + A22 * z2 + A23 * z3)
-        x3 = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
-        t1, t2, t3 = time + C1 * h, time + C2 * h, time + h
+        x1 = x + h * (C[0] * v + A[0][0] * z1 + A[0][1] * z2 + A[0][2] * z3)
+        x2 = x + h * (C[1] * v + A[1][0] * z1 + A[1][1] * z2 + A[1][2] * z3)
+        x3 = x + h * (v + A[2][0] * z1 + A[2][1] * z2 + A[2][2] * z3)
+        t1, t2, t3 = time + C[0] * h, time + C[1] * h, time + h
         f1, g1 = equations.rates(t1, x1, v1, q1, trial)
         f2, g2 = equations.rates(t2, x2, v2, q2, trial)
         f3, g3 = equations.rates(t3, x3, v3, q3, trial)
@@ -339,10 +336,10 @@ def radau_step(equations, trial, point, stages, scale, rtol):
             break
         ratio = size / previous_size
         # The next iteration would change the speeds by about ratio · size.
-        if size <= tolerance or (iteration > 0 and ratio < FAST_CONTRACTION and ratio * size <= 0.1 * tolerance):
+        if size <= tolerance or (iteration > 0 and ratio < fast and ratio * size <= 0.1 * tolerance):
             converged = True
             break
-        if ratio > FAST_CONTRACTION:
+        if ratio > fast:
             jacobian_current = False
         if iteration > 3 and size > previous_size:
             break
@@ -359,7 +356,7 @@ def _local_error(point, stages, scale, rtol):
     This is omitted: the filter hides the error of a long stiff step at its far end.
     """
     h, z1, z2, z3 = stages
-    raw = (h * point.acceleration + E1 * z1 + E2 * z2 + E3 * z3) / MU
+    raw = (h * point.acceleration + E[0] * z1 + E[1] * z2 + E[2] * z3) / MU
     # At least a tenth of the final speed: an error at the start affects the whole growth.
     weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
     return abs(raw) / weight
@@ -369,8 +366,8 @@ def _local_error(point, stages, scale, rtol):
 def _end_of_step(point, stages, chamber):
     """The vine at the end of a step; `chamber` is the pressure at its last stage."""
     h, z1, z2, z3 = stages
-    x_end = point.x + h * (point.v + A31 * z1 + A32 * z2 + A33 * z3)
-    acceleration_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
+    x_end = point.x + h * (point.v + A[2][0] * z1 + A[2][1] * z2 + A[2][2] * z3)
+    acceleration_end = (S[0] * z1 + S[1] * z2 + S[2] * z3) / h
     return Point(point.time + h, x_end, point.v + z3, acceleration_end, chamber)
 
 
@@ -449,12 +446,6 @@ def _without_far_acceleration(near, far, read):
 # A frame stamped t shows the edge at t + s·y, with y its position at that time and s the delay per metre. At the
 # start of growth s·y is negligible, and rows are read at their stamps.
 
-STEEPEST = 0.1  # Least 1 − s·ẏ by which Newton's method divides (chosen)
-
-TURNS = 8  # Maximum number of Newton iterations (derived)
-
-SETTLED_S = 1e-10  # Step that ends the iterations, s (derived)
-
 
 @compiled
 def read_by_rows(times, out, ratio, end, delay):
@@ -465,21 +456,18 @@ def read_by_rows(times, out, ratio, end, delay):
         i = step if delay > 0 else count - 1 - step
         read = times[i] + delay * out[i, 3]
         seen = out[i, 3]
-        for _turn in range(TURNS):
+        for _turn in range(8):
             x, v, offset = motion_at(times, out, ratio, end, i, read)
             seen = x / ratio + offset
-            change = (read - times[i] - delay * seen) / max(1.0 - delay * v / ratio, STEEPEST)
+            change = (read - times[i] - delay * seen) / max(1.0 - delay * v / ratio, 0.1)
             read -= change
-            if abs(change) < SETTLED_S:
+            if abs(change) < 1e-10:
                 break
         out[i, 3] = seen
 
 
 # ------------------------------------------------------------------------------
 # Positions averaged over time: the position reported at t is the mean from t − T/2 to t + T/2.
-
-# Gauss–Legendre quadrature with three nodes, and its weights (derived)
-NODE, WEIGHT, MIDDLE_WEIGHT = math.sqrt(0.6), 5 / 18, 4 / 9
 
 
 @compiled
@@ -512,10 +500,12 @@ def average_over(times, out, means, ratio, end, square):
 
 @compiled
 def _integral(times, out, ratio, end, k, low, high):
-    """Integral of the reported position, m s, over an interval in which the motion is one polynomial."""
-    middle, reach = 0.5 * (low + high), 0.5 * NODE * (high - low)
+    """Integral of the reported position, m s, over an interval in which the motion is one polynomial: Gauss–Legendre
+    quadrature with three nodes.
+    """
+    middle, reach = 0.5 * (low + high), 0.5 * math.sqrt(0.6) * (high - low)
     total = 0.0
     for place in range(3):
         x, _v, offset = motion_at(times, out, ratio, end, k, middle + (place - 1) * reach)
-        total += (MIDDLE_WEIGHT if place == 1 else WEIGHT) * (x / ratio + offset)
+        total += (4 / 9 if place == 1 else 5 / 18) * (x / ratio + offset)
     return total * (high - low)

@@ -9,11 +9,11 @@ exceeds what holds it. An implicit L-stable method with error-controlled steps c
 moving (`_cut_at_breakpoint`, `radau_step`, `_judge_step`, `_next_step_size`) or has a slack tail
 (`vinetrack.dynamics.integrator`). The code uses only numbers, tuples and arrays, so that numba can compile it.
 
-Source of the method: E.
 """
 
 from __future__ import annotations
 
+import inspect
 from typing import NamedTuple
 
 import numpy as np
@@ -39,19 +39,10 @@ from vinetrack.dynamics.equations import (
 )
 from vinetrack.effects import TrialInputs
 
-TRAVEL_RATIO = TrialInputs._fields.index("travel_ratio")  # Convention: index of the travel ratio in a row of inputs
+# Places of two quantities in a row of inputs
+RATIO, FREE = TrialInputs._fields.index("travel_ratio"), TrialInputs._fields.index("tail_free")
 
 MOST_STEPS = 20_000  # Maximum number of steps of a trajectory, chosen: trajectories of the catalogue take 20 to 600
-
-# Error of a step that was cut short, in tolerances, below which the next step takes the size proposed before the cut
-SMALL_ERROR = 0.1
-
-# Arguments of `integrate_trials` after the equations, in order
-BATCH = (
-    "starts", "times", "on", "inputs", "thetas", "trace_starts", "trace_time", "trace_pressure", "bend_starts", "bends",
-    "breakpoints", "stops", "rtol", "out", "ends", "work",
-    "means",
-)  # fmt: skip
 
 MOVING, AT_REST, SLACK = 0, 1, 2  # Phases of a trajectory; a convention of this file
 
@@ -190,15 +181,19 @@ def integrate_trials(
         end = Point(end_time if status == ENDED else np.inf, stops[i], end_speed, 0.0, 0.0)
         row_delay = equations.row_delay(trial)
         if row_delay != 0:
-            read_by_rows(times[rows], out[rows], inputs[i, TRAVEL_RATIO], end, row_delay)
+            read_by_rows(times[rows], out[rows], inputs[i, RATIO], end, row_delay)
         averaging_time_squared = equations.averaged_over(trial)
         if averaging_time_squared > 0:
-            average_over(times[rows], out[rows], means, inputs[i, TRAVEL_RATIO], end, averaging_time_squared)
+            average_over(times[rows], out[rows], means, inputs[i, RATIO], end, averaging_time_squared)
         ends[i, 0] = status
         ends[i, 1] = end_time
         ends[i, 2] = end_speed
         ends[i, 3] = n_steps
         ends[i, 4] = slack_time
+
+
+# Arguments of `integrate_trials` after the equations, in order
+BATCH = tuple(inspect.signature(getattr(integrate_trials, "py_func", integrate_trials)).parameters)[1:]
 
 
 @compiled
@@ -312,7 +307,8 @@ def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale)
 def _next_step_size(h, full_h, error):
     """Size of the step after an accepted one, from its error (Hairer & Wanner IV.8; error estimate of order 3)."""
     new_h = h * min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
-    return max(new_h, full_h) if full_h > h and error < SMALL_ERROR else new_h
+    # After a step that was cut short with a small error, the size proposed before the cut is taken.
+    return max(new_h, full_h) if full_h > h and error < 0.1 else new_h
 
 
 @inlined
@@ -417,10 +413,6 @@ def _resolvable_start(equations, trial, time, until, x, chamber, delay):
 # Solving Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation
 # (6.12).
 
-# Indices in the inputs of a trial: derived from the order of the fields
-FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")
-
-# Source: Dormand & Prince, as below.
 NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
 WEIGHTS = (
     (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -430,9 +422,7 @@ WEIGHTS = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
     (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
-# Source: the same.
 ERROR_WEIGHTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-# The method of Dormand & Prince
 DENSE_WEIGHTS = (
     -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
     701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,

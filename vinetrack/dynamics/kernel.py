@@ -28,11 +28,8 @@ from vinetrack.core import units
 from vinetrack.core.records import Floats
 from vinetrack.core.threads import available_cores, thread_pool
 from vinetrack.dynamics.integrator import BATCH
-from vinetrack.dynamics.model import Model, effects_on, hook_functions, hosted, shared_host
+from vinetrack.dynamics.model import Model, effects_on, hosted, shared_host
 from vinetrack.effects import Effect, State, TrialInputs, effect_sources
-
-# Files of the integrator, which are part of the compiled form of a model
-PARTS = ("equations.py", "integrator.py")
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
@@ -85,19 +82,14 @@ class _Writer:
     """Writes the calls of hooks, in the order of the effects, and collects the functions to be loaded."""
 
     def __init__(self, effects: Sequence[Effect]) -> None:
-        self.effects = effects
+        self.model = Model(tuple(effects))
         self.loads: dict[str, str] = {}
-
-    def has(self, hook: str) -> bool:
-        return any(hook in effect.functions for effect in self.effects)
 
     def calls(self, hook: str, target: str, state: str = _STATE) -> list[str]:
         lines = []
-        offsets = list(itertools.accumulate((len(effect.parameters) for effect in self.effects), initial=0))
-        for i, effect in sorted(enumerate(self.effects), key=lambda pair: pair[1].order):
-            if hook not in effect.functions:
-                continue
-            arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
+        for i, _, place in self.model.hooks[hook]:
+            effect = self.model.effects[i]
+            arguments = "".join(f", theta[{j}]" for j in range(place.start, place.stop))
             name = f"{effect.name}__{hook}"
             self.loads[name] = f"{name} = inlined(EFFECTS[{i}].functions[{hook!r}])"
             # A measured pressure includes everything that happens in the chamber.
@@ -111,7 +103,7 @@ class _Writer:
         lines = [*gauge, "set_pressure = pressure"]
         lines += ["if measured:", "    pressure = trace_at(time, trial)"]
         lines += [f"    {line}" for line in gauge]
-        if self.has("chamber_rate"):
+        if self.model.hooks["chamber_rate"]:
             lines += ["else:", "    pressure = chamber"]
         lines += self.calls("yield_gauge", "yield_pressure = {call}")
         pressures = self.calls("pressure", "pressure = {call}")
@@ -133,7 +125,7 @@ class _Writer:
         return lines
 
     def inertia(self) -> list[str]:
-        """Everything that moves with the tail; see `force_terms.inertia_kg`."""
+        """Everything that moves with the tail; see `vinetrack.dynamics.audit.inertia_kg`."""
         added = self.calls("added_mass", "added += {call}")
         tail = "mass = max(film_mass + max(added, 0.0), rig.least_mass)"
         total = "mass = max(mass + min(added, 0.0) + rig.payload_mass, rig.least_mass)"
@@ -146,7 +138,7 @@ class _Writer:
 
     def camera_shortcut(self) -> list[str]:
         """Return the position at once where no effect changes the position that the camera reports."""
-        acting = [f"on[{i}]" for i, effect in enumerate(self.effects) if "observed_position" in effect.functions]
+        acting = [f"on[{i}]" for i in sorted(i for i, _, _ in self.model.hooks["observed_position"])]
         return [f"if not ({' or '.join(acting)}):", "    return seen"]
 
     def function(self, name: str, arguments: str, motion: str, lines: Sequence[str]) -> str:
@@ -212,7 +204,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             ),
         ]
     names = ", ".join(effect.name for effect in effects)
-    functions += [f"@inlined\ndef has_chamber():\n    return {writer.has('chamber_rate')}\n"]
+    functions += [f"@inlined\ndef has_chamber():\n    return {bool(writer.model.hooks['chamber_rate'])}\n"]
     fields = ["rates", "rest_acceleration", "observed", "first_chamber", "has_chamber", "row_delay", "averaged_over"]
     fields += ["slack_fraction", "slack_at_rest", "follow_slack", "tip_tension", "free_fall"] if tail_free else []
     foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
@@ -247,7 +239,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     import numba
 
     source = sum_source(effects, tail_free)
-    parts = [source, *(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in PARTS)]
+    integrator = (Path(__file__).with_name(name) for name in ("equations.py", "integrator.py"))
+    parts = [source, *(file.read_text(encoding="utf-8") for file in integrator)]
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], units)]
     parts += [numba.__version__, sys.version]
     # The compiled form refers to the modules of the effects by name, so the names are part of the hash.
@@ -414,7 +407,7 @@ def _limits(
     """
     rig = TrialInputs(*inputs.T)
     film = np.ones(len(inputs))
-    for effect, function, place in hook_functions(model, "film_gain"):
+    for effect, function, place in model.hooks["film_gain"]:
         for k in np.flatnonzero(on[:, effect]).tolist():
             film[k] *= function(_NOTHING, TrialInputs(*inputs[k]), *thetas[k, place])
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
@@ -453,7 +446,7 @@ def _true_times(
 ) -> Floats:
     """True times of the camera's stamps, for all trials concatenated, shape (n_times,)."""
     true_times = stamps
-    for effect, function, place in hook_functions(model, "true_time"):
+    for effect, function, place in model.hooks["true_time"]:
         true_times = true_times.copy()
         for i in np.flatnonzero(on[:, effect]):
             of_trial = slice(starts[i], starts[i + 1])
@@ -467,7 +460,7 @@ def _true_traces(
 ) -> list[Trace | None]:
     """Measured pressures of each trial at the true times of their samples."""
     in_time = list(traces)
-    for effect, function, place in hook_functions(model, "trace_time"):
+    for effect, function, place in model.hooks["trace_time"]:
         for i in np.flatnonzero(on[:, effect]).tolist():
             if (trace := in_time[i]) is None:
                 continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -112,16 +113,13 @@ class Model:
         ]
 
     @cached_property
-    def hooks(self) -> dict[str, list[tuple[int, Callable[..., Any], slice]]]:
-        """By hook the result of `hook_functions`."""
-        functions: dict[str, list[tuple[int, int, Callable[..., Any], slice]]] = {}
-        for i, (effect, place) in enumerate(zip(self.effects, self.places, strict=True)):
-            for hook, function in effect.functions.items():
-                functions.setdefault(hook, []).append((effect.order, i, function, place))
-        return {
-            hook: [(i, function, place) for _, i, function, place in sorted(entries, key=lambda entry: entry[0])]
-            for hook, entries in functions.items()
-        }
+    def hooks(self) -> Mapping[str, list[tuple[int, Callable[..., Any], slice]]]:
+        """The functions of each hook in the order in which they are called, with index and parameters of the effect."""
+        functions: dict[str, list[tuple[int, Callable[..., Any], slice]]] = defaultdict(list)
+        for i in sorted(range(len(self.effects)), key=lambda i: self.effects[i].order):
+            for hook, function in self.effects[i].functions.items():
+                functions[hook].append((i, function, self.places[i]))
+        return functions
 
     def __add__(self, other: Effect | str) -> Model:
         effect = find_effect(other, self.user_effects) if isinstance(other, str) else other
@@ -182,11 +180,8 @@ class Model:
         for effect in self.effects:
             for parameter in effect.parameters:
                 value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
-                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                 pairs = sorted(value.items()) if isinstance(value, Mapping) else [("", value)]
-                lines += [
-                    f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs
-                ]
+                lines += [f"  {parameter.words(number, vine)}" for vine, number in pairs]
         return "\n".join(lines)
 
 
@@ -216,11 +211,6 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
     wider = np.tile(host.zeros, (len(parameters), 1))
     wider[:, [host.parameter_names.index(name) for name in model.parameter_names]] = parameters
     return wider
-
-
-def hook_functions(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
-    """The functions of a hook, in the order in which they are called."""
-    return model.hooks.get(hook, [])
 
 
 def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, Effect] | None = None) -> Model:
@@ -343,19 +333,17 @@ def check_needs(model: Model, *trials: Trial) -> None:
 # is the same model, so that fits, designs, diagnoses and the explorer share what is compiled. An effect that is
 # switched off is skipped, so that the trajectories are those of the smaller model to the last bit.
 
-PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
-
 
 @lru_cache(maxsize=1)
 def probe() -> Effect:
     """The probe force of the diagnosis (`probes/probe_force.py`)."""
-    return load_effect(PROBE_FILE)
+    return load_effect(Path(__file__).with_name("probes") / "probe_force.py")
 
 
 def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
     """Return one model of the catalogue, the probe force, a model and further effects."""
     held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
-    return Model(tuple(held[name] for name in held))
+    return Model(tuple(held.values()))
 
 
 @lru_cache(maxsize=256)

@@ -12,12 +12,12 @@ import pandas as pd
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import Bend, Floats, Trial
+from vinetrack.dynamics.equations import TOO_HARD
 from vinetrack.dynamics.kernel import RELATIVE_TOLERANCE, Batch, Trace, lay_out, starts_of
 from vinetrack.dynamics.model import Model, base_model, check_needs, host_for, trial_inputs
 from vinetrack.effects import Effect, TrialInputs, catalogue
 
-STATUS = ("running", "ended", "stalled", "too hard")
-ENDED, TOO_HARD = STATUS.index("ended"), STATUS.index("too hard")
+STATUS = ("running", "ended", "stalled", "too hard")  # In the order of the integrator's codes
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,22 @@ def trajectories(batch: Batch, out: Floats, ends: Floats, ratios: Sequence[float
     edges = batch.starts.tolist()
     motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
     return [
-        _trajectory(ratio, batch.stamps[a:b], motion[:, a:b], out[a:b, 3], end)
-        for ratio, (a, b), end in zip(ratios, itertools.pairwise(edges), ends.tolist(), strict=True)
+        Trajectory(
+            time_s=batch.stamps[a:b],
+            lead_position_m=motion[0, a:b],
+            lead_velocity_m_s=motion[1, a:b],
+            lead_acceleration_m_s2=motion[2, a:b],
+            observed_position_m=out[a:b, 3],
+            travel_ratio=ratio,
+            status=STATUS[int(status)],
+            end_time_s=end_s,
+            end_lead_velocity_m_s=end_speed / ratio,
+            n_steps=int(n_steps),
+            slack_from_s=slack_from_s,
+        )
+        for ratio, (a, b), (status, end_s, end_speed, n_steps, slack_from_s) in zip(
+            ratios, itertools.pairwise(edges), ends.tolist(), strict=True
+        )
     ]
 
 
@@ -134,9 +148,7 @@ def prepare(
 ) -> Batch:
     """Lay out trials for the compiled kernel."""
     check_needs(model, *trials)
-    inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
-        len(trials), len(TrialInputs._fields)
-    )
+    inputs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(-1, len(TrialInputs._fields))
     if parameters is None:
         groups = [(trial.vine, trial.group("day")) for trial in trials]
         of_group = {group: model.parameters_for(*group) for group in set(groups)}
@@ -150,23 +162,6 @@ def prepare(
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
     """The bends of a trial as numbers."""
     return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
-
-
-def _trajectory(r: float, times_s: Floats, motion: Floats, observed_m: Floats, end: Sequence[float]) -> Trajectory:
-    """One trial of a batch; the rows of `motion` are position, velocity and acceleration of the leading edge."""
-    return Trajectory(
-        time_s=times_s,
-        lead_position_m=motion[0],
-        lead_velocity_m_s=motion[1],
-        lead_acceleration_m_s2=motion[2],
-        observed_position_m=observed_m,
-        travel_ratio=r,
-        status=STATUS[int(end[0])],
-        end_time_s=end[1],
-        end_lead_velocity_m_s=end[2] / r,
-        n_steps=int(end[3]),
-        slack_from_s=end[4],
-    )
 
 
 # ------------------------------------------------------------------------------
@@ -185,17 +180,33 @@ REFERENCE = Trial(
     chamber_m3=3.7e-3,
     inlet_m=6e-3,
 )
-
 REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
 
-BENDS = (Bend(0.1, 0.1, 0.1),)  # One radian after 10 cm, for effects of bends
 
-# A pressure that rises and falls through the threshold, for effects that act on a vine at rest
-SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3]))
+def _reference(effect: Effect) -> tuple[Trial, Trace | None, str]:
+    """The trial in which an effect shows, its measured pressure, and both in words."""
+    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
+    still = f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm"
+    if set(effect.functions) == {"rest_force"}:
+        level = replace(REFERENCE, growth_angle_rad=math.pi / 2)
+        trace = np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3])
+        return level, trace, f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
+    if "trace_time" in effect.functions:
+        trace = np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3])
+        return REFERENCE, trace, f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
+    if effect.name == "capstan_friction":
+        return replace(REFERENCE, bends=(Bend(0.1, 0.1, 0.1),)), None, f"{still}, one radian of bend after 100 mm"
+    return REFERENCE, None, still
 
 
-# A pressure that is recorded while a valve opens, for effects on the record of the pressure
-OPENED: Trace = (np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3]))
+def reference_words(effect: Effect) -> str:
+    """Describe the vine and trial of `effect_motion`, for the caption of a picture."""
+    return _reference(effect)[2]
+
+
+def size_words(effect: Effect) -> str:
+    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`."""
+    return ", ".join(p.words(REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default)) for p in effect.parameters)
 
 
 def effect_motion(effect: Effect) -> pd.DataFrame:
@@ -203,47 +214,20 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
     removed from it, any other is added.
     """
     with_it, without = _models(effect)
-    trial = replace(REFERENCE, bends=BENDS) if effect.name == "capstan_friction" else REFERENCE
-    at_rest = _acts_at_rest(effect)
-    trial = replace(trial, growth_angle_rad=math.pi / 2) if at_rest else trial
-    trace = SLOW_PRESSURE if at_rest else OPENED if "trace_time" in effect.functions else None
-    until = _end_s(with_it, without, trial, trace)
-    times = np.linspace(0.0, until, 400)
+    trial, trace, _ = _reference(effect)
+    times = np.linspace(0.0, _end_s(with_it, without, trial, trace), 400)
     a, b = simulate(without, trial, times, trace=trace), simulate(with_it, trial, times, trace=trace)
+    without_m, with_m = a.observed_position_m, b.observed_position_m
     return pd.DataFrame(
         {
             "time_s": times,
-            "without_position_m": a.observed_position_m,
-            "with_position_m": b.observed_position_m,
-            "without_velocity_m_s": _seen_velocity(a),
-            "with_velocity_m_s": _seen_velocity(b),
-            "difference_m": b.observed_position_m - a.observed_position_m,
+            "without_position_m": without_m,
+            "with_position_m": with_m,
+            "without_velocity_m_s": np.gradient(without_m, times),
+            "with_velocity_m_s": np.gradient(with_m, times),
+            "difference_m": with_m - without_m,
         }
     )
-
-
-def reference_words(effect: Effect) -> str:
-    """Describe the vine and trial of `effect_motion`, for the caption of a picture."""
-    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
-    if _acts_at_rest(effect):
-        return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
-    if "trace_time" in effect.functions:
-        return f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
-    bends = ", one radian of bend after 100 mm" if effect.name == "capstan_friction" else ""
-    return f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm{bends}"
-
-
-def size_words(effect: Effect) -> str:
-    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`."""
-    values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
-    return ", ".join(
-        f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
-        for p, value in zip(effect.parameters, values, strict=True)
-    )
-
-
-def _acts_at_rest(effect: Effect) -> bool:
-    return set(effect.functions) == {"rest_force"}
 
 
 def _models(effect: Effect) -> tuple[Model, Model]:
@@ -263,16 +247,9 @@ def _models(effect: Effect) -> tuple[Model, Model]:
 
 
 def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) -> float:
+    """Shortly before the earlier end of growth; that of the pressure if it is measured."""
     if trace is not None:
         return float(trace[0][-1])
-    ends = []
-    for model in (with_it, without):
-        motion = simulate(model, trial, np.linspace(0.0, 2.0, 50))
-        ends.append(motion.end_time_s if motion.status == "ended" else math.inf)
-    end = min(ends)
-    return 0.99 * end if math.isfinite(end) else 0.5
-
-
-def _seen_velocity(motion: Trajectory) -> Floats:
-    """Speed of the reported position of the edge."""
-    return np.gradient(motion.observed_position_m, motion.time_s)
+    motions = [simulate(model, trial, np.linspace(0.0, 2.0, 50)) for model in (with_it, without)]
+    ends = [motion.end_time_s for motion in motions if motion.status == "ended"]
+    return 0.99 * min(ends) if ends else 0.5

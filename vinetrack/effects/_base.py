@@ -117,6 +117,11 @@ class Parameter:
         low, high = self.bounds
         return (1 if low >= self.zero else 0) - (1 if high <= self.zero else 0)
 
+    def words(self, value: float, vine: str = "") -> str:
+        """A value with symbol, vine and unit, such as `k = 0.5 N/m`."""
+        of_vine, unit = f" ({vine})" if vine else "", "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.symbol}{of_vine} = {value:.6g}{unit}"
+
 
 @dataclass(frozen=True)
 class Worked:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.equations import ENDED
 from vinetrack.dynamics.kernel import Batch, Trace, lay_out, starts_of
 from vinetrack.dynamics.model import Model, check_needs, trial_inputs, with_pressures
 from vinetrack.dynamics.simulate import (
-    ENDED,
     SimulationError,
     Trajectory,
     bends_of,

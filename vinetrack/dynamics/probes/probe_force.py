@@ -12,7 +12,6 @@ import numpy as np
 
 from vinetrack.effects import Parameter, Worked
 
-KIND = "physical"
 PARAMETERS = (
     Parameter("size", "a", "N", 0.1, bounds=(-1e3, 1e3), meaning="force at the centre"),
     Parameter("kind", "kind", "1", 0.0, bounds=(0.0, 5.0), meaning="variable it depends on"),
