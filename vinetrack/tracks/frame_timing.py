@@ -29,36 +29,13 @@ DROP_RATIO = 1.6  # Ratio of a step to its neighbours above which frames were dr
 
 JUMP_SIGMAS = 5.5  # Least significance of a jump, in standard errors (derived)
 
-# A copy stands still to within this part of a step, and the step must be this significant (chosen)
-STILL_PART, STILL_SIGMAS = 0.25, 5.0
-
-# Ratio of the step just before an apparent inserted copy to those around it, above which the point before the copy was
-# seen ahead of its time (chosen)
-AHEAD_RATIO = 1.4
-
-COPY_SIGMAS = 3.5  # Least significance of the step back after an inserted copy (chosen)
-
 SIDE_POINTS = (8, 5, 3)  # Points used on either side, fewer where release or the end of growth is near (chosen)
-
-LEAST_SIDE_PART = 0.75  # Least motion of each side, as a part of a clear step (chosen)
-
-LARGEST_SPEED_RATIO = 1.8  # Largest ratio of the speeds just before and just after (chosen)
-
-# Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump (chosen)
-LARGEST_MISFIT_PART = 0.1
-
-# A single outlier must leave this many times the sum of squares that a jump leaves (chosen)
-OUTLIER_RATIO, OUTLIER_SIGMAS = 3.0, 4.0
 
 # Points on either side that must show at least this part of the jump too, where they are conclusive (chosen)
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
 
 # Factor on JUMP_SIGMAS for a jump that points farther away cannot confirm, as near release (measured)
 SURE_FACTOR = 2.0
-
-# Deviation of a spacing from a whole number of frames, as a part of it, below which the spacing is even (chosen)
-UNEVEN_PART = 0.05
-
 
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]  # Frame numbers and positions before and after
 
@@ -93,7 +70,8 @@ def _correct_timing(track: Track) -> Track:
         return track
     step_s = float(np.median(spacing))
     frames = spacing / step_s
-    if np.any(np.abs(frames - np.rint(frames)) > UNEVEN_PART * np.maximum(np.rint(frames), 1.0)):
+    # Spacings must be whole numbers of frames to within 5 %.
+    if np.any(np.abs(frames - np.rint(frames)) > 0.05 * np.maximum(np.rint(frames), 1.0)):
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
     noise_m, rho = _noise(out)
@@ -249,17 +227,19 @@ def _repeated_frame(
     size, sigma, step, _ = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
     short_step = y[i + 1] - y[i]
-    moves = abs(short_step) > min(STILL_PART * step, 4 * step_sigma + 0.02 * step)
-    if moves or step - short_step < STILL_SIGMAS * step_sigma:
+    # A copy stands still to within this part of a step, and the step must be this significant.
+    moves = abs(short_step) > min(0.25 * step, 4 * step_sigma + 0.02 * step)
+    if moves or step - short_step < 5.0 * step_sigma:
         return None
     if 0 < i < y.size - 3 and 2 * step_sigma < sigma:
         # Where the motion is curved, the two steps minus their two neighbours are the better measure.
         size, sigma = float(y[i + 2] - y[i] - (y[i] - y[i - 1]) - (y[i + 3] - y[i + 2])), 2 * step_sigma
     if abs(size) <= max(3 * sigma, 0.3 * step) and abs(size) < 0.5 * step:
         return _Fault("stale", int(rows[i + 1]))
-    if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > COPY_SIGMAS * sigma:
+    # The step back after an inserted copy must be significant.
+    if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > 3.5 * sigma:
         # After a point one step ahead of its time, the next one lies where a copy would.
-        ahead = i >= 2 and y[i] - y[i - 1] > AHEAD_RATIO * max(y[i - 1] - y[i - 2], step)
+        ahead = i >= 2 and y[i] - y[i - 1] > 1.4 * max(y[i - 1] - y[i - 2], step)
         without = np.delete(frame, i + 1), np.delete(y, i + 1)
         if ahead or -_wide_jump(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
             return None
@@ -293,7 +273,8 @@ def _outlier_explains(sides: _Sides, noise_m: float) -> bool:
     smooth = np.column_stack([np.ones(t.size), t, t**2])
     with_jump = _residual_squares(np.column_stack([smooth, t > 0]), y)
     with_outlier = min(_residual_squares(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
-    return with_outlier < max(OUTLIER_RATIO * with_jump, with_jump + (OUTLIER_SIGMAS * noise_m) ** 2)
+    # A single outlier must leave this many times the sum of squares that a jump leaves.
+    return with_outlier < max(3.0 * with_jump, with_jump + (4.0 * noise_m) ** 2)
 
 
 def _wide_jump(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
@@ -323,9 +304,11 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | No
     (t_left, y_left), (t_right, y_right) = sides
     near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
     near_right = (y_right[2] - y_right[0]) / (t_right[2] - t_right[0])
-    if min(near_left, near_right) < LEAST_SIDE_PART * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
+    # Both sides must move by three quarters of a clear step.
+    if min(near_left, near_right) < 0.75 * CLEAR_STEP_SIGMAS * noise_m or min(near_left, near_right) <= 0:
         return None
-    if max(near_left, near_right) > LARGEST_SPEED_RATIO * min(near_left, near_right):
+    # A larger ratio of the speeds before and after may be acceleration.
+    if max(near_left, near_right) > 1.8 * min(near_left, near_right):
         return None
     t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
     t = t - (t_left[-1] + t_right[0]) / 2
@@ -334,7 +317,8 @@ def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> _Jump | No
     fit = weights @ y
     misfit_m = math.sqrt(float(np.sum((y - basis @ fit) ** 2)) / (t.size - 4))
     step = float(fit[1])
-    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > LARGEST_MISFIT_PART * step + 2 * noise_m:
+    # A motion that scatters by a tenth of a step is not smooth enough to show a jump.
+    if step < CLEAR_STEP_SIGMAS * noise_m or step <= 0 or misfit_m > 0.1 * step + 2 * noise_m:
         return None
     lag = np.abs(np.subtract.outer(t, t))
     correlation = np.where(lag == 0, 1.0, rho ** np.maximum(lag, 0.5))
@@ -372,13 +356,8 @@ def _mark(track: Track, row: int, flags: str, note: str) -> Track:
 #
 # The threshold is that of `frame_timing`, which examines tracks of any source and what remains undecided here.
 
-SMALLEST_STEP_PX = 2.0  # Smallest step of a recording that can show a missing frame (chosen)
-
 # Range of the four steps around a long one, as a part of their median, below which the motion is steady (chosen)
 EVEN_STEP_RANGE = 0.35
-
-# A long step this near to a whole number of steps, and no more than so many, is counted in (chosen)
-WHOLE_STEP_TOLERANCE, MOST_MISSING_STEPS = 0.2, 4
 
 
 @dataclass(frozen=True)
@@ -414,7 +393,8 @@ def count_missing(
         if not np.all(np.isfinite(around)) or not np.isfinite(step[i]) or repeated[i - 2 : i + 3].any():
             continue
         median_step = float(np.median(around))
-        least_step = max(SMALLEST_STEP_PX, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
+        # Steps below 2 px cannot show a missing frame.
+        least_step = max(2.0, CLEAR_STEP_SIGMAS * float(np.max(sigma_px[i - 1 : i + 1])))
         if median_step < least_step or np.ptp(around) > EVEN_STEP_RANGE * median_step:
             continue
         ratio = step[i] / float(near.mean())
@@ -422,7 +402,8 @@ def count_missing(
             continue
         gap[i] = True
         whole = round(ratio)
-        retimed[i] = abs(ratio - whole) < WHOLE_STEP_TOLERANCE and whole <= MOST_MISSING_STEPS
+        # A long step this near to a whole number of steps, and no more than so many, is counted in.
+        retimed[i] = abs(ratio - whole) < 0.2 and whole <= 4
         if retimed[i]:
             counted[i:] += whole - 1
             where = f"before frame {number[i]} (the step there is too long)"

@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,27 +96,20 @@ def new_track(
 # m/s, and two of them may share the same time. Where all times of a file lie within half their last digit of an
 # evenly spaced series, that series is used.
 
-FEWEST_TIMES = 8  # Fewest times from which an even series is recognised (measured)
-
-TOLERANCE_DIGITS = 0.75  # Last digits by which a time may deviate from the series (derived)
-
-LEAST_DIGIT_PART = 0.01  # Last digit, as a part of a frame, from which times are restored (chosen)
-
-MOST_DECIMALS = 7  # Decimals from which a time does not count as rounded (chosen)
-
 
 def unrounded_times(time_s: Floats) -> tuple[Floats, str]:
     """Times of evenly spaced frames before they were rounded, and a sentence that says so. Returns time_s (unchanged
     where they are not rounded, or not evenly spaced), note (blank where nothing was done). Shapes: time_s (n,) → (n,).
     """
-    digit_s = _last_digit_s(time_s) if time_s.size >= FEWEST_TIMES else 0.0
+    digit_s = _last_digit_s(time_s) if time_s.size >= 8 else 0.0
     if digit_s == 0:
         return time_s, ""
     place = np.arange(time_s.size, dtype=float)
     step_s, first_s = np.polyfit(place, time_s, 1)
     even_s = first_s + step_s * place
     off_s = float(np.max(np.abs(time_s - even_s)))
-    if not step_s > 0 or off_s > TOLERANCE_DIGITS * digit_s or off_s < 0.5 * LEAST_DIGIT_PART * step_s:
+    # Times must lie within 3/4 of their last digit, which matters from 1 % of a frame on.
+    if not step_s > 0 or off_s > 0.75 * digit_s or off_s < 0.005 * step_s:
         return time_s, ""
     rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
     return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are used instead."
@@ -126,7 +119,8 @@ def _last_digit_s(time_s: Floats) -> float:
     """Decimal to which all times are rounded, s; 0 where they are not, or have more decimals."""
     if not np.isfinite(time_s).all():
         return 0.0
-    for digits in range(MOST_DECIMALS):
+    # Decimals from which a time does not count as rounded.
+    for digits in range(7):
         scaled = time_s * 10.0**digits
         if np.max(np.abs(scaled - np.round(scaled))) < 1e-6 * max(1.0, float(np.max(np.abs(scaled))) * 1e-6):
             return float(10.0**-digits)
@@ -217,16 +211,6 @@ SECONDS = {"s": 1.0, "ms": 0.001, "min": 60.0}
 _HEADER_CELL = re.compile(r"#?\s*(t|time|x|y)\s*(?:[(\[_]\s*([a-zµ]+)\s*[)\]]?)?", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class _Axes:
-    """Tracker's coordinate system from one frame on: origin in px, angle in rad, px per unit of length."""
-
-    from_frame: int
-    origin_px: tuple[float, float]
-    angle_rad: float
-    px_per_unit: tuple[float, float]
-
-
 def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
     """Read the track of a `.trk` project: one point mass, projected on the axis of its motion. It is the one named
     `point_mass`, else the one with the most marks; marks outside `frames_used` are ignored.
@@ -243,7 +227,7 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     notes = []
     if others and not point_mass:
         notes.append(f"Taken from the point mass {name!r}, which has the most points; not used: {', '.join(others)}.")
-    unit = (_physics_tracker_text(panel, "length_unit") or "").strip()
+    unit = _text(panel, "length_unit").strip()
     if unit and unit not in METRES:
         raise TrackError(f"measures lengths in {unit[:20]!r}", "set the length unit to m in Tracker")
     if not unit:
@@ -279,7 +263,7 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
     masses: list[tuple[str, dict[int, tuple[float, ...]]]] = []
     for node in panel.iter("object"):
         if node.get("class", "").endswith(".PointMass"):
-            name = _physics_tracker_text(node, "name") or f"mass {len(masses) + 1}"
+            name = _text(node, "name") or f"mass {len(masses) + 1}"
             masses.append((name.strip()[:40], _frame_values(node, "x", "y")))
     marked = [(name, marks) for name, marks in masses if marks]
     if not marked:
@@ -299,7 +283,7 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
 def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
     """Numbers stored per frame under `framedata`; frames that lack one are left out."""
     values: dict[int, tuple[float, ...]] = {}
-    for entry in _children(_physics_tracker_property(node, "framedata")):
+    for entry in node.findall("property[@name='framedata']/property"):
         index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name", ""), re.ASCII)
         stored = entry.find("object")
         if index is None or stored is None:
@@ -310,8 +294,8 @@ def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
     return values
 
 
-def _axes(panel: Element) -> list[_Axes]:
-    """The coordinate systems of the key frames, in their order."""
+def _axes(panel: Element) -> dict[int, tuple[float, ...]]:
+    """The coordinate systems by the frame from which they are valid: origin in px, angle in degrees, px per unit."""
     coords = _object(panel, "coords")
     values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
     if not values:
@@ -320,17 +304,16 @@ def _axes(panel: Element) -> list[_Axes]:
         raise TrackError("holds a scale that is not positive", "calibrate it anew in Tracker")
     if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
         raise TrackError("was never calibrated (1 pixel is 1 m)", "set a calibration stick or tape in Tracker")
-    return [_Axes(n, (x, y), math.radians(angle), (sx, sy)) for n, (x, y, angle, sx, sy) in sorted(values.items())]
+    return values
 
 
-def _to_world(frames: np.ndarray, pixels: Floats, axes: list[_Axes]) -> Floats:
+def _to_world(frames: np.ndarray, pixels: Floats, axes: dict[int, tuple[float, ...]]) -> Floats:
     """World coordinates, in units of length, of points in px; shape (n, 2)."""
-    starts = np.array([system.from_frame for system in axes])
+    starts = sorted(axes)
     which = np.clip(np.searchsorted(starts, frames, side="right") - 1, 0, None)
-    origin = np.array([system.origin_px for system in axes])[which]
-    scale = np.array([system.px_per_unit for system in axes])[which]
-    angle = np.array([system.angle_rad for system in axes])[which]
-    right, up = ((pixels - origin) / scale).T * np.array([[1.0], [-1.0]])
+    valid = np.array([axes[start] for start in starts])[which]
+    angle = np.array([math.radians(degrees) for degrees in valid[:, 2]])
+    right, up = ((pixels - valid[:, :2]) / valid[:, 3:]).T * np.array([[1.0], [-1.0]])
     return np.column_stack([np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right])
 
 
@@ -351,29 +334,20 @@ def _clock(panel: Element) -> tuple[float, float, int]:
     )
 
 
-def _children(node: Element | None) -> list[Element]:
-    return [] if node is None else node.findall("property")
-
-
-def _physics_tracker_property(node: Element, name: str) -> Element | None:
-    return next((child for child in _children(node) if child.get("name") == name), None)
-
-
 def _object(node: Element, name: str) -> Element | None:
     """The object stored in a property."""
-    node_of_name = _physics_tracker_property(node, name)
-    return None if node_of_name is None else node_of_name.find("object")
+    return node.find(f"property[@name='{name}']/object")
 
 
-def _physics_tracker_text(node: Element, name: str) -> str | None:
-    node_of_name = _physics_tracker_property(node, name)
-    return None if node_of_name is None else node_of_name.text
+def _text(node: Element, name: str) -> str:
+    """The text of a property, blank where there is none."""
+    return node.findtext(f"property[@name='{name}']") or ""
 
 
 def _number(node: Element, name: str) -> float:
     """A stored number; NaN where it is missing, is none or is beyond LARGEST_NUMBER."""
     try:
-        value = float(_physics_tracker_text(node, name) or "nan")
+        value = float(_text(node, name) or "nan")
     except ValueError:
         return math.nan
     return value if abs(value) <= LARGEST_NUMBER else math.nan
@@ -460,27 +434,21 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
 # ------------------------------------------------------------------------------
 # Find where the motion of a body in an imported track ends: it turns back (a bounce) or stops abruptly.
 
-# Distance behind its furthest place, in standard deviations of a position and as a part of its travel, at which a body
-# has turned back (chosen)
-BACK_SIGMAS, BACK_TRAVEL_PART = 8.0, 0.02
 # Tolerance of standstill at the end, in standard deviations, and the fewest points that show a stop (chosen)
 STILL_SIGMAS, FEWEST_STILL = 5.0, 3
-# Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt (chosen)
-ABRUPT_STEP_PART = 0.5
-FEWEST_LEFT = 5  # Fewest points that must be left (derived)
 
 
 def flag_end_of_body(track: Track) -> Track:
     """Flag points after the end of the body's motion `after_end`, and report the end in the notes."""
     rows = np.flatnonzero(track.usable)
     y = track.lead_position_m[rows]
-    if rows.size <= FEWEST_LEFT:
+    if rows.size <= FEWEST_POINTS:
         return track
     noise_m = rough_noise(y)
     end, what = _turns_back(y, noise_m), "turns back"
     if end is None:
         end, what = _stops_dead(y, noise_m), "stops"
-    if end is None or end + 1 < FEWEST_LEFT:
+    if end is None or end + 1 < FEWEST_POINTS:
         return track
     flag = track.flag.astype("<U80")
     for row in rows[end + 1 :]:
@@ -491,7 +459,8 @@ def flag_end_of_body(track: Track) -> Track:
 
 def _turns_back(y: Floats, noise_m: float) -> int | None:
     """Furthest point before the body comes back; None where it does not."""
-    is_back = np.maximum.accumulate(y) - y > max(BACK_SIGMAS * noise_m, BACK_TRAVEL_PART * float(np.ptp(y)))
+    # A body has turned back when it is 8 standard deviations, and 2 % of its travel, behind its furthest place.
+    is_back = np.maximum.accumulate(y) - y > max(8.0 * noise_m, 0.02 * float(np.ptp(y)))
     turned = np.flatnonzero(is_back[:-1] & is_back[1:])
     return int(np.argmax(y[: turned[0] + 1])) if turned.size else None
 
@@ -500,12 +469,13 @@ def _stops_dead(y: Floats, noise_m: float) -> int | None:
     """First point of a standstill that lasts to the end and begins within a frame; None where there is none."""
     tolerance_m = max(STILL_SIGMAS * noise_m, 1e-9)
     moving = np.flatnonzero(np.abs(y - np.median(y[-FEWEST_STILL:])) > tolerance_m)
-    if not moving.size or y.size - moving[-1] - 1 < FEWEST_STILL or moving[-1] < FEWEST_LEFT:
+    if not moving.size or y.size - moving[-1] - 1 < FEWEST_STILL or moving[-1] < FEWEST_POINTS:
         return None
     last = int(moving[-1])
-    median_step = float(np.median(np.diff(y[last - FEWEST_LEFT : last + 1])))
+    median_step = float(np.median(np.diff(y[last - FEWEST_POINTS : last + 1])))
     last_step = float(y[last] - y[last - 1])
-    return last + 1 if median_step > tolerance_m and last_step > ABRUPT_STEP_PART * median_step else None
+    # Last step before an abrupt stop, as a part of the median step, above which the stop is abrupt.
+    return last + 1 if median_step > tolerance_m and last_step > 0.5 * median_step else None
 
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]

@@ -17,23 +17,11 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, hand_corrected, join_flags
 
-ENOUGH_REST_FRAMES = 60  # Frames at rest from which their noise alone counts as that of the track (chosen)
-
-REST_MARGIN_FRAMES = 3  # Frames left out before the corner between rest and motion (chosen)
-
-LONG_TRACK_POINTS = 90  # Moving points from which stretches are twice as long (chosen)
-
-REST_STRETCH, REST_ORDER = 32, 1  # Points in a stretch at rest and degree of its polynomial (chosen)
-
-MOVING_STRETCH, MOVING_ORDER = 12, 3  # The same in motion (chosen)
+MOVING_STRETCH, MOVING_ORDER = 12, 3  # Points of a stretch in motion, and degree of its polynomial (chosen)
 
 RHO_GRID = np.linspace(0.0, 0.95, 20)
-PRIOR_RHO_SD = 0.5  # Standard deviation of the normal prior of ρ about 0
 
 SHORTEST_MOTION = 12  # Points in motion below which the whole track is used (chosen)
-
-# Correlation above which the noise may be motion that a cubic does not follow (chosen)
-SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
 
 THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences of white noise of unit variance
 
@@ -41,9 +29,6 @@ THIRD_DIFFERENCE_SD = math.sqrt(20.0)  # Standard deviation of third differences
 THIRD_DIFFERENCE_ALLOWANCE = 1.84
 
 SAME_STEP_TOLERANCE = 0.01  # Relative difference within which two rounding steps are the same (chosen)
-
-# Noise of a track, in errors of rounding, below which most of it is rounding (derived)
-ROUNDING_DOMINATES = math.sqrt(2.0)
 
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
@@ -62,14 +47,18 @@ def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, floa
     groups = []
     n_rest = _frames_at_rest(position_m)
     if n_rest:
-        groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], REST_STRETCH, REST_ORDER))
+        # At rest, straight lines through 32 points.
+        groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], 32, 1))
     n_moving = position_m.size - n_rest
-    if n_rest < ENOUGH_REST_FRAMES or n_moving > n_rest:
-        length = MOVING_STRETCH if n_moving < LONG_TRACK_POINTS else 2 * MOVING_STRETCH
+    # From 60 frames at rest on, their noise alone counts as that of the track.
+    if n_rest < 60 or n_moving > n_rest:
+        # From 90 moving points on, stretches are twice as long.
+        length = MOVING_STRETCH if n_moving < 90 else 2 * MOVING_STRETCH
         groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
     noise_m, correlation = _restricted_likelihood(groups)
-    if correlation > SUSPECT_RHO:
-        short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
+    # Such noise may be motion that a cubic does not follow.
+    if correlation > 0.85:
+        short = [_stretches(time_s, position_m, 7, MOVING_ORDER)]
         noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
     return noise_m, correlation, rounding_noise(position_m)
 
@@ -87,7 +76,8 @@ def robust_position_noise(time_s: Floats, position_m: Floats) -> tuple[float, fl
 
 def _frames_at_rest(position_m: Floats) -> int:
     """Points at rest, if they are enough for stretches of their own, else 0."""
-    n_rest = max(rest_points(position_m) - REST_MARGIN_FRAMES, 0)
+    # Three frames before the corner between rest and motion are left out.
+    n_rest = max(rest_points(position_m) - 3, 0)
     return n_rest if n_rest >= 2 * MOVING_STRETCH else 0
 
 
@@ -107,7 +97,8 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     """Return the `rounding_noise` of most of a campaign's tracks where it dominates their noise; it then holds for all.
     Returns 0 where most are not rounded, or to different steps, or are noisier than that. Shapes: tracks (n_points,).
     """
-    limit = ROUNDING_DOMINATES / math.sqrt(12)
+    # Below √2 errors of rounding, most of the noise is rounding.
+    limit = math.sqrt(2) / math.sqrt(12)
     noises = sorted(
         rounding_noise(position_m) if rough_noise(position_m) < limit * _rounding_step(position_m) else 0.0
         for position_m in tracks
@@ -228,7 +219,8 @@ def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, 
         pooled, n = rss[:, used].sum(axis=1), float(dof[used].sum())
         if pooled.min() <= n * (1e-13 * scale) ** 2:
             return 0.0, 0.0
-        score = -0.5 * (n * np.log(pooled) + log_det[:, used].sum(axis=1)) - 0.5 * (RHO_GRID / PRIOR_RHO_SD) ** 2
+        # ρ has a normal prior about 0 with a standard deviation of 0.5.
+        score = -0.5 * (n * np.log(pooled) + log_det[:, used].sum(axis=1)) - 0.5 * (RHO_GRID / 0.5) ** 2
         best = int(np.argmax(score))
     rho = _parabola_vertex(RHO_GRID, score, best)
     innovation = math.exp(np.interp(rho, RHO_GRID, np.log(pooled / n)))
@@ -293,23 +285,7 @@ def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generat
 
 HALF_WIDTH = 6  # Neighbours on either side (chosen)
 
-NOISE_HALF_WIDTH = 20  # Points on either side from whose residuals the local noise is estimated (chosen)
-
-NOISE_DEGREES_OF_FREEDOM = 15.0  # Degrees of freedom of that local noise: 0.37 × 41 (derived)
-
-FALSE_ALARM_RATE = 1e-3  # Probability that normal noise costs a track a single point (chosen)
-
 LEAST_SHARE = 0.75  # Least share of the neighbours that must lie on the cubic (chosen)
-
-NEAREST, FEWEST_NEAR = 4, 3  # Of this many nearest neighbours, so many must lie on the cubic too
-
-BIWEIGHT_CUTOFF = 6.0  # Residual, in standard deviations of the noise, from which a neighbour has no weight (chosen)
-
-# Within this many points of an end the motion may have stopped or begun between two frames (chosen)
-END_POINTS, END_STEPS = 2, 1.5
-
-# Distance to the point before, in steps of the motion, below which a point may be a repeated frame (chosen)
-COPY_STEPS = 0.3
 
 MOST_ROUNDS = 4  # Most rounds of rejection (measured)
 
@@ -358,13 +334,15 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
         else:  # Tukey's biweight; the median of 12 residuals about 4 fitted numbers is 0.55 of their sd
             median = np.sort(residuals, axis=1)[:, HALF_WIDTH - 1 : HALF_WIDTH + 1].mean(axis=1)
             scale = np.maximum(median / 0.55, smallest_scale)
-            weight = np.maximum(1 - (residuals / (BIWEIGHT_CUTOFF * scale[:, None])) ** 2, 0.0) ** 2 + 1e-9
+            # From 6 standard deviations of the noise on, a neighbour has no weight.
+            weight = np.maximum(1 - (residuals / (6.0 * scale[:, None])) ** 2, 0.0) ** 2 + 1e-9
     on_cubic = weight > 0.1
     used = np.maximum(on_cubic.sum(axis=1), 5)
     # The point itself lies at 0, where the cubic is its first coefficient.
     first_coefficient = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     leverage = weight * _cubic(relative_time, _normal_solution(_moments(powers, weight), first_coefficient))
-    nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :NEAREST]
+    # Of the 4 nearest neighbours, 3 must lie on the cubic too (`_outlying`).
+    nearest = np.argsort(np.abs(time_from_point), axis=1, kind="stable")[:, :4]
     return LocalFit(
         residual_m=-coefficients[:, 0],
         gain=np.sqrt(1 + np.sum(leverage**2, axis=1)),
@@ -375,9 +353,9 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     )
 
 
-def local_noise(distance_m: Floats, half_width: int = NOISE_HALF_WIDTH) -> Floats:
-    """Estimate the standard deviation around each point by a running median, which is 0.6745 of it for normal noise.
-    Shapes: distance_m (n_points,) → (n_points,).
+def local_noise(distance_m: Floats, half_width: int = 20) -> Floats:
+    """Estimate the standard deviation around each point, from so many on either side, by a running median, which is
+    0.6745 of it for normal noise. Shapes: distance_m (n_points,) → (n_points,).
     """
     width = min(2 * half_width + 1, distance_m.size)
     view = np.median(np.lib.stride_tricks.sliding_window_view(distance_m, width), axis=1) / 0.6745
@@ -396,7 +374,8 @@ def find_outliers(time_s: Floats, position_m: Floats, *, spare_copies: bool = Fa
     is_outlier = np.zeros(n, dtype=bool)
     if n < FEWEST_POINTS + MOST_ROUNDS or not np.all(np.diff(time_s) > 0):
         return is_outlier
-    limit = float(t.isf(FALSE_ALARM_RATE / (2 * n), NOISE_DEGREES_OF_FREEDOM))
+    # Normal noise costs one track in a thousand a point; the local noise has 0.37 × 41 degrees of freedom.
+    limit = float(t.isf(1e-3 / (2 * n), 15.0))
     for _ in range(MOST_ROUNDS):
         candidates = np.flatnonzero(~is_outlier)
         if candidates.size < FEWEST_POINTS:
@@ -467,10 +446,12 @@ def _outlying(time_s: Floats, position_m: Floats, limit: float, spare_copies: bo
     step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
     lags = fit.residual_m * fit.speed_m_s < 0
     from_end = np.where(lags, np.arange(distance_m.size)[::-1], np.arange(distance_m.size))
-    allowance_m = np.where(from_end < END_POINTS, END_STEPS * (from_end + 1) * step_m, 0.0)
-    isolated = (fit.share >= LEAST_SHARE) & (fit.near >= FEWEST_NEAR)
+    # Within this many points of an end the motion may have stopped or begun between two frames.
+    allowance_m = np.where(from_end < 2, 1.5 * (from_end + 1) * step_m, 0.0)
+    isolated = (fit.share >= LEAST_SHARE) & (fit.near >= 3)
     if spare_copies:
-        isolated[1:] &= np.abs(np.diff(position_m)) >= COPY_STEPS * step_m[1:]
+        # A point nearer than 0.3 steps to the one before may be a repeated frame.
+        isolated[1:] &= np.abs(np.diff(position_m)) >= 0.3 * step_m[1:]
     return np.asarray((distance_m > limit * fit.gain * sigma_m + allowance_m) & isolated & (sigma_m > 0))
 
 
@@ -522,14 +503,6 @@ def _normal_solution(sums: Floats, right: Floats) -> Floats:
 
 FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # Weights of a fourth difference
 
-DEVIANCE_DROP = 28.0  # Fall of −2 ln L above which noise that varies is used (derived)
-
-LEAST_SD_RATIO = 1.25  # Least ratio of the largest to the smallest standard deviation of the points (chosen)
-
-WINSORISING_SIGMAS = 4.0  # Standard deviations of their surroundings to which residuals are winsorised
-
-FEWEST_DIFFERENCES = 20  # Fewest fourth differences of a trial from which its noise is estimated (chosen)
-
 # Grid points of τ, by factors of 1.19 from a thirtieth to thirty times what makes both parts equal at the higher
 # speeds, and of s, by factors of 1.12; the best τ is then refined by a parabola (derived)
 BLUR_GRID_SIZE, SCALE_GRID_SIZE = 41, 61
@@ -537,10 +510,6 @@ BLUR_GRID_SIZE, SCALE_GRID_SIZE = 41, 61
 COARSE_STEP = 5  # Every fifth value of s is tried before those between (chosen)
 
 _SCALE_GRID = np.geomspace(1 / 30, 2.0, SCALE_GRID_SIZE)
-
-UNEVEN_PART = 0.05  # Part of a frame by which spacings may differ in a fourth difference (chosen)
-
-STATED_PART = 0.9  # Least part of a trial's points whose standard deviation must be stated (chosen)
 
 
 @dataclass(frozen=True)
@@ -573,14 +542,16 @@ def noise_shape(
     if not time_s or min(times.size for times in time_s) < FEWEST_POINTS:
         return None
     differences = [_differences(t, y) for t, y in zip(time_s, position_m, strict=True)]
-    if min(int(part.use.sum()) for part in differences) < FEWEST_DIFFERENCES:
+    # The noise of a trial is estimated from 20 fourth differences or more.
+    if min(int(part.use.sum()) for part in differences) < 20:
         return None
     equal_noise = sum(_best_scale(part, np.zeros_like(part.speed_m_s))[0] for part in differences)
     shapes = [result for result in (_by_speed(differences), _as_stated(differences, stated_m)) if result is not None]
     if not shapes:
         return None
     deviance, shape = min(shapes, key=lambda result: result[0])
-    if equal_noise - deviance < DEVIANCE_DROP or _sd_ratio(shape) < LEAST_SD_RATIO:
+    # Noise that varies is used if it is far more likely and its standard deviations differ by a quarter.
+    if equal_noise - deviance < 28.0 or _sd_ratio(shape) < 1.25:
         return None
     return shape
 
@@ -603,10 +574,12 @@ def _differences(time_s: Floats, position_m: Floats) -> _Differences:
     distance_m[2:-2] = np.abs(np.convolve(position_m, FOURTH_DIFFERENCE, "valid")) / np.linalg.norm(FOURTH_DIFFERENCE)
     spacing = np.diff(time_s) / np.median(np.diff(time_s))
     even = np.zeros(time_s.size, dtype=bool)
-    even[2:-2] = np.lib.stride_tricks.sliding_window_view(np.abs(spacing - 1) < UNEVEN_PART, 4).all(axis=1)
+    # Spacings in a fourth difference may differ by 5 % of a frame.
+    even[2:-2] = np.lib.stride_tricks.sliding_window_view(np.abs(spacing - 1) < 0.05, 4).all(axis=1)
     around_m = local_noise(distance_m)
     use = even & (fit.share >= LEAST_SHARE) & (around_m > 0)
-    winsorised_m = np.minimum(distance_m, WINSORISING_SIGMAS * around_m)
+    # They are winsorised to 4 standard deviations of their surroundings.
+    winsorised_m = np.minimum(distance_m, 4.0 * around_m)
     return _Differences(winsorised_m, use, _running_median(np.abs(fit.speed_m_s)))
 
 
@@ -660,7 +633,8 @@ def _as_stated(
         if stated is None:
             return None
         is_stated = np.isfinite(stated) & (stated > 0)
-        if np.mean(is_stated) < STATED_PART:
+        # Nine tenths of a trial's points must have a stated standard deviation.
+        if np.mean(is_stated) < 0.9:
             return None
         sigma = np.where(is_stated, stated, np.median(stated[is_stated]))
         # Expected size of a fourth difference, from the noise of its five points.

@@ -20,10 +20,6 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track, Trial
 
-WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)  # Windows, in frames, of the filters that are compared (chosen)
-
-DEGREES = (0, 2)  # Degrees of the polynomials; 0 is the moving average (derived)
-
 LOWEST_FREQUENCY = 0.06  # Lowest frequency, in cycles a frame, at which the spectra are compared (chosen)
 
 FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
@@ -32,15 +28,6 @@ FEWEST_FRAMES = 40  # Fewest frames of a stretch without gaps (chosen)
 UNEVEN_PART = 0.02
 
 CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))  # Lag-one correlations of noise that was not smoothed (chosen)
-
-# Exponent with which the spectrum of a motion that is rougher than its noise falls, such as that of a tube that sticks
-# and slips and is read fifty times a second (derived)
-MOTION_POWER_LAW = 4.0
-
-LEAST_POWER = 1e-5  # Part of its power that smoothed noise keeps in a hole (derived)
-
-# Number of the longest stretches that are compared (chosen)
-MOST_STRETCHES, ROUNDS = 12, 30
 
 # Gain of ln L over noise without holes, and over every other filter, above which positions count as smoothed (chosen)
 SURE_GAIN = 30.0
@@ -89,17 +76,21 @@ def detect_smoothing(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0
     spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
     if not spectra:
         return None
-    spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:MOST_STRETCHES]
+    # The twelve longest stretches are compared.
+    spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:12]
     unsmoothed = max(_whittle(spectra, [_ar1_spectrum(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)
     ranked: list[tuple[float, Smoothing | None]] = [(unsmoothed, None)]
-    for window in WINDOWS:
-        for degree in DEGREES:
+    # Filters are compared by their windows, in frames.
+    for window in (3, 5, 7, 9, 11, 13, 15, 17, 19, 21):
+        # Degrees of the polynomials; 0 is the moving average.
+        for degree in (0, 2):
             if degree >= window - 1:
                 continue
             weights = _filter_weights(window, degree)
             # Noise averaged over N frames keeps 1/N of its variance.
             smoothing = Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
-            shapes = [np.maximum(_power_response(f, weights), LEAST_POWER) for f, _ in spectra]
+            # Part of its power that smoothed noise keeps in a hole.
+            shapes = [np.maximum(_power_response(f, weights), 1e-5) for f, _ in spectra]
             ranked.append((_whittle(spectra, shapes), smoothing))
     ranked.sort(key=lambda pair: -pair[0])
     return ranked[0][1] if ranked[0][0] > ranked[1][0] + SURE_GAIN else None
@@ -134,11 +125,10 @@ def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats])
     """
     total = 0.0
     for (frequency, power), shape in zip(spectra, shapes, strict=True):
-        bases = np.stack(
-            [shape / shape.mean(), np.ones_like(shape), (LOWEST_FREQUENCY / frequency) ** MOTION_POWER_LAW]
-        )
+        # The spectrum of a motion rougher than its noise, as of a tube that sticks and slips, falls as 1/f⁴.
+        bases = np.stack([shape / shape.mean(), np.ones_like(shape), (LOWEST_FREQUENCY / frequency) ** 4.0])
         amplitudes = power.mean() * np.array([0.8, 0.1, 0.1])
-        for _ in range(ROUNDS):
+        for _ in range(30):
             spectrum = amplitudes @ bases
             amplitudes = amplitudes * np.sqrt((bases @ (power / spectrum**2)) / (bases @ (1 / spectrum)))
         spectrum = amplitudes @ bases
