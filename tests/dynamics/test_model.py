@@ -18,7 +18,7 @@ from vinetrack.dynamics import kernel as batch
 from vinetrack.dynamics.audit import evaluate
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on, host_for, make_model, shared_host
-from vinetrack.dynamics.simulate import prepare, simulate, simulate_many
+from vinetrack.dynamics.simulate import prepare, simulate_many
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, catalogue, load_effect, own_effects
 
 
@@ -100,17 +100,6 @@ def test_terms_along_a_motion_by_hand() -> None:
         assert terms.tip_N[name][0] == pytest.approx(force, rel=1e-12)
     assert terms.tension_N[0] == pytest.approx(sum(tip.values()) / 2, rel=1e-12)
     assert terms.acceleration_m_s2[0] == pytest.approx((sum(tip.values()) / 2 + mass * 9.81) / mass, rel=1e-12)
-
-
-@pytest.mark.parametrize("more", [(), ("reservoir_depletion",)], ids=["base", "depletion"])
-def test_terms_in_plain_python_and_the_compiled_sum_agree(more: tuple[str, ...]) -> None:
-    model = make_model([*BASE_EFFECTS, *more]).with_values({"eversion_damping.B": 6.44})
-    times_s = np.linspace(0.005, 0.12, 60)
-    moved = simulate(model, TRIAL, times_s, relative_tolerance=1e-7)
-    terms = evaluate(model, TRIAL, times_s, moved.lead_position_m, moved.lead_velocity_m_s)
-    np.testing.assert_allclose(terms.acceleration_m_s2, 2 * moved.lead_acceleration_m_s2, rtol=2e-4, atol=2e-3)
-    fallen = terms.pressure_Pa[0] - terms.pressure_Pa[-1]
-    assert fallen > 1e3 if more else fallen == 0
 
 
 # ---- one compiled form for all effects of the catalogue ----

@@ -134,14 +134,6 @@ def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau: flo
     assert np.max(np.abs((slope - rate)[5:-5])) < 2e-3 * np.max(np.abs(1.4 * 129e3 * A * ydot / 3.7e-3))
 
 
-def test_mass_area_and_pressure_of_the_terms_are_those_of_the_state() -> None:
-    terms = evaluate(whole_catalogue({}), LOADED.trial(), np.array([0.1]), np.array([0.1]), np.array([2.0]))
-    # λ = 1200·π·0.024·2e-4 = 18.0956 g/m; m = 0.28 λ − ½λ·0.2 + 35.6 g = 0.18·18.0956 + 35.6 = 38.857 g
-    assert terms.mass_kg[0] == pytest.approx(38.857e-3, rel=1e-4)
-    assert terms.area_m2[0] == pytest.approx(4.5239e-4, rel=1e-4)
-    assert terms.pressure_Pa[0] == 28e3
-
-
 def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
     # At the end a bare vine's moving mass is its fold, λπt, and a quarter of the gas ρ_gas A L; nothing on top of it.
     vine = BARE

@@ -313,12 +313,6 @@ def test_without_a_fit_there_is_no_figure(draw) -> None:  # type: ignore[no-unty
     assert draw(table.iloc[:0], {}) is None
 
 
-# The figure of predictions: complete and labelled, whether vines reach their end or not.
-
-
-# Figures of designs: complete, and labelled with units.
-
-
 # The figure of one effect: its table and its drawing.
 
 

@@ -208,10 +208,6 @@ def pressure_along(
     return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa
 
 
-# The rules that a trial may violate (`RuleViolation`), with the limits that Alvarez et al. (2025) state
-DRAG_RULE, LENGTH_RULE, BEND_RULE, RESERVOIR_RULE, TENSION_RULE = "drag", "length", "bends", "reservoir", "tension"
-_LARGEST_SHARE, _LENGTH_M, _BEND_DEG = 0.05, 0.30, 30.0  # Of drag and of lost pressure; of a vine; of its bends
-
 COLUMNS = (
     "trial", "condition", "term", "size", "force_N", "share_of_drive", "shift_m", "time_s", "lead_position_m",
     "y_over_L", "slack_from_s", "note",
@@ -262,7 +258,9 @@ class AuditedMotion:
 
 @dataclass(frozen=True)
 class RuleViolation:
-    """A rule for neglecting an effect that a trial violates, such as `DRAG_RULE`, and how it does, in words."""
+    """A rule for neglecting an effect (drag, length, bends, reservoir, tension) that a trial violates, and how, in
+    words. The limits are those that Alvarez et al. (2025) state.
+    """
 
     trial: str
     rule: str
@@ -385,29 +383,29 @@ def _violated_rules(
     """Each rule that the trial violates, and how, in words."""
     trial = motion.trial
     drag = neglected.get("air_drag")
-    if drag and abs(drag["share_of_drive"]) > _LARGEST_SHARE:
+    if drag and abs(drag["share_of_drive"]) > 0.05:
         yield (
-            DRAG_RULE,
+            "drag",
             f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
-            f"({drag['size']}), above {_LARGEST_SHARE:.0%}; add air_drag to the model",
+            f"({drag['size']}), above 5%; add air_drag to the model",
         )
-    if "tail_friction" in neglected and trial.length_m >= _LENGTH_M:
+    if "tail_friction" in neglected and trial.length_m >= 0.30:
         yield (
-            LENGTH_RULE,
+            "length",
             f"friction along the length is neglected in a vine of {100 * trial.length_m:.0f} cm, which is safe below "
-            f"{100 * _LENGTH_M:.0f} cm; add tail_friction to the model",
+            "30 cm; add tail_friction to the model",
         )
     bent_deg = math.degrees(sum(bend.arc_m / bend.radius_m for bend in trial.bends))
-    if "capstan_friction" in neglected and bent_deg >= _BEND_DEG:
+    if "capstan_friction" in neglected and bent_deg >= 30:
         yield (
-            BEND_RULE,
+            "bends",
             f"the path bends by {bent_deg:.0f}° in all, which is safe to neglect below "
-            f"{_BEND_DEG:.0f}°; add capstan_friction to the model",
+            "30°; add capstan_friction to the model",
         )
     yield from _reservoir_rule(model, motion, neglected.get("reservoir_depletion"))
     if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
         yield (
-            TENSION_RULE,
+            "tension",
             f"the model predicts compression in the tail from {1e3 * tension['slack_from_s']:.0f} ms on (tension down "
             f"to {tension['force_N']:.2f} N); `tail_slack: free` lets it go slack",
         )
@@ -423,10 +421,10 @@ def _reservoir_rule(model: Model, motion: AuditedMotion, row: dict[str, Any] | N
         motion.terms(depleted.with_values({"reservoir_depletion.gamma": gamma})).pressure_Pa for gamma in (1.0, 1.4)
     )
     shares = [1 - float(np.min(along_Pa)) / pressure for along_Pa in pressures]
-    if shares[1] > _LARGEST_SHARE:
+    if shares[1] > 0.05:
         yield (
-            RESERVOIR_RULE,
+            "reservoir",
             f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
-            f"(fast) of its gauge pressure while the vine grows, above {_LARGEST_SHARE:.0%}, unless a supply refills "
+            f"(fast) of its gauge pressure while the vine grows, above 5%, unless a supply refills "
             "it; add reservoir_depletion or supply_refill to the model, or measure the pressure",
         )

@@ -46,8 +46,6 @@ MOST_STEPS = 20_000  # Maximum number of steps of a trajectory, chosen: trajecto
 
 MOVING, AT_REST, SLACK = 0, 1, 2  # Phases of a trajectory; a convention of this file
 
-ACCEPTED, REFUSED, STOPPED = 0, 1, 2  # Outcomes of a step (`_judge_step`); a convention of this file
-
 
 @merged
 def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
@@ -102,8 +100,8 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
         n_steps += 1
         if n_steps > MOST_STEPS:
             return TOO_HARD, point.time, point.v, n_steps, slack_time
-        outcome, factor = _judge_step(point, end, stages, converged, error, breakpoint_x, stop, speed_scale)
-        if outcome == STOPPED:
+        factor = _judge_step(point, end, stages, converged, error, breakpoint_x, stop, speed_scale)
+        if factor == 0:
             point = Point(
                 point.time + h, point.x + 0.5 * h * max(point.v, 0.0), point.v, point.acceleration, end.chamber
             )
@@ -112,7 +110,7 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             if row == count:
                 return STALLED, end_time, 0.0, n_steps, slack_time
             continue
-        if outcome == REFUSED:
+        if factor < 1:
             h *= factor
             previous_stages = NO_STAGES
             continue
@@ -284,23 +282,23 @@ def _cut_at_sample(h, time, sample, trial):
 
 @inlined
 def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale):
-    """Accept or reject a step, with the factor on its size for the next attempt. STOPPED: the vine stops within the
-    step, which by now is so short that the time is known.
+    """The factor on the size of the step for the next attempt: 1 if it is accepted, 0 if the vine stops within it, and
+    it is by now so short that the time is known.
     """
     h = stages.h
     if not converged:
-        return REFUSED, 0.25
+        return 0.25
     if end.v <= 0 or point.v + stages.z1 <= 0 or point.v + stages.z2 <= 0:
         if h * point.v <= 1e-9 * max(point.x, 1e-6) or point.v <= 1e-7 * scale:
-            return STOPPED, 1.0
-        return REFUSED, 0.3
+            return 0.0
+        return 0.3
     if error > 1:
-        return REFUSED, max(0.2, 0.9 * error**-0.25)
+        return max(0.2, 0.9 * error**-0.25)
     # Tolerance on reaching the breakpoint: relative to the whole travel, or to the breakpoint if there is no end.
     position_tolerance = 1e-7 * (stop if stop < np.inf else breakpoint_x)
     if breakpoint_x < stop and end.x > breakpoint_x + position_tolerance:
-        return REFUSED, _fraction_at(breakpoint_x + 0.5 * position_tolerance, h, point, end)
-    return ACCEPTED, 1.0
+        return _fraction_at(breakpoint_x + 0.5 * position_tolerance, h, point, end)
+    return 1.0
 
 
 @inlined

@@ -273,8 +273,6 @@ RELATIVE_TOLERANCE = 1e-4  # Local tolerance on the speed
 
 _NOTHING = State(*(math.nan,) * len(State._fields))
 
-SMALLEST_SHARE = 64  # Trials below which another thread costs more than it saves (chosen)
-
 Trace = tuple[Floats, Floats]  # Times since release, s, and gauge pressures, Pa, measured at them
 
 
@@ -304,7 +302,8 @@ class Batch:
         """Integrate every trial. Returns out, ends. Shape (n_times, 4)."""
         count = self.starts.size - 1
         out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
-        threads = threads or max(1, min(available_cores(), count // SMALLEST_SHARE))
+        # For fewer than 64 trials another thread costs more than it saves.
+        threads = threads or max(1, min(available_cores(), count // 64))
         edges = np.linspace(0, count, threads + 1).astype(int).tolist()
         if threads == 1:
             self._part(0, count, relative_tolerance, out, ends)

@@ -80,12 +80,4 @@ WORKED = (
         rig={"payload_mass": 0.02, "cos_angle": 1.0},
         parameters={"delta": 0.006},
     ),
-    Worked(
-        "tail_force",
-        0.0,
-        "no payload",
-        state={"lead_position": 0.1},
-        rig={"payload_mass": 0.0, "cos_angle": 1.0},
-        parameters={"delta": 0.006},
-    ),
 )

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.audit import TENSION_RULE, AuditedMotion, audit, evaluate
+from vinetrack.dynamics.audit import AuditedMotion, audit, evaluate
 from vinetrack.dynamics.model import Model, host_for
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.effects import Effect, EffectError, catalogue
@@ -479,7 +479,7 @@ def _rules(prediction: VinePrediction) -> Iterator[str]:
     keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     violations = audit(inputs.model, [motion]).violations
-    yield from (violation.words for violation in violations if violation.rule != TENSION_RULE)
+    yield from (violation.words for violation in violations if violation.rule != "tension")
 
 
 def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
